@@ -173,7 +173,7 @@ def with_effects() -> dict[str, Any]:
     nominal = nominal_parameters()
     models = {f"motion {motion.name.lower()}": nominal._replace(motion=motion) for motion in Motion}
     for effect in EFFECTS:
-        if effect.respond is None:
+        if "respond" not in effect.hooks:
             ends = zip(effect.parameters(), effect.ranges.values(), strict=True)
             values = [neutral + 0.3 * (extent.high - neutral) for neutral, extent in ends]
             models[effect.name] = nominal.with_effects(effect.parameters(*values))

@@ -119,7 +119,7 @@ def step_function(model: ModelParameters) -> casadi.Function:
     """
     effects = tuple(effect for effect in model.effects if effect_of(effect).acts_on != SENSOR)
     for effect in map(effect_of, effects):
-        if effect.start is not None:  # it has no place in the state vector
+        if effect.memory is not None:  # it has no place in the state vector
             raise ValueError(f"model: effect {effect.name}: found one with a memory, expected none")
     with jax.enable_x64(True):
         model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model._replace(effects=effects))

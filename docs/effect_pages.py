@@ -23,7 +23,7 @@ CHANNELS = {
 
 def needs_of(effect: Effect) -> str:
     """Return the channels without which a log cannot show the effect, in sentences."""
-    channels = " and ".join(f"`{name}` ({CHANNELS[name]})" for name in effect.needs)
+    channels = " and ".join(f"`{name}` ({CHANNELS[name]})" for name in effect.search.needs)
     parts = [f"The log must have {channels or '`w` or `q`'}."]
     if {"lag", "thrust", "air", "force"} & set(effect.stages):
         parts.append("Without `f`, `v`, or `a` and `q`, it shows nothing of a force.")
@@ -40,7 +40,7 @@ def arguments(values: Mapping[str, float]) -> str:
 def effect_page(effect: Effect) -> str:
     """Return the page of an effect."""
     neutral = effect.parameters()._asdict()
-    shown = effect.fitted or (effect.groups[-1] if effect.groups else effect.notable)
+    shown = effect.search.fitted or (effect.search.groups[-1] if effect.search.groups else effect.notable)
     names = [name for name in shown if name in effect.notable]
     high = {name: neutral[name] + effect.notable[name] for name in names}
     varied = [REGRESSORS[panel.regressor] for panel in EVIDENCE[effect.name].panels]

@@ -129,7 +129,7 @@ def _free_names(model: ModelParameters, log: FlightLog, fixed: Mapping[str, floa
         low, high, unit = range_of(name)
         if not (np.isfinite(value) and low <= value <= high):
             raise FitError(f"fixed: {name}: found {value}, expected {low:g} to {high:g} {unit}")
-    of_effects = [name for name in names if "." in name and not BY_NAME[name.split(".")[0]].is_setting]
+    of_effects = [name for name in names if "." in name and not BY_NAME[name.split(".")[0]].search.is_setting]
     wanted = [*base_of(model), *of_effects]
     if "v_bat" not in log:
         wanted = [name for name in wanted if name not in (*THRUST_COEFFS[4:], DRAIN)]
@@ -216,7 +216,7 @@ def what_is_fitted(
         model = with_neutral_effects(nominal_parameters() if start is None else start, effects)
     except KeyError as error:
         raise FitError(f"effects: {error.args[0]}: no effect of that name") from error
-    for name in (name for name in effects if BY_NAME[name].is_setting):
+    for name in (name for name in effects if BY_NAME[name].search.is_setting):
         raise FitError(f"effects: {name}: known from settings and not fitted; start from a model that has it")
     free = _free_names(model, log, fixed)
     model = with_values(model, fixed)

@@ -40,8 +40,8 @@ def names_of(model: ModelParameters) -> tuple[str, ...]:
 def base_of(model: ModelParameters) -> tuple[str, ...]:
     """Return what every fit frees: lags, unless an effect takes their place, thrust map, drain, the craft."""
     every = [effect_of(parameters) for parameters in model.effects]
-    taus = () if any(effect.respond for effect in every) else TAUS
-    craft = [f"{effect.name}.{field}" for effect in every for field in effect.fitted]
+    taus = () if any("respond" in effect.hooks for effect in every) else TAUS
+    craft = [f"{effect.name}.{field}" for effect in every for field in effect.search.fitted]
     return (*taus, *THRUST_COEFFS, DRAIN, *craft)
 
 

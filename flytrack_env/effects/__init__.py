@@ -110,7 +110,7 @@ def check_parameters(parameters: Any, dt: Any, delay_steps: int = USUAL_STEPS) -
     for name, bounds in effect.ranges.items():
         value = np.asarray(getattr(parameters, name))
         longest = np.inf
-        if name in effect.most_steps:  # what the other delays of the effect leave
+        if name in effect.max_steps:  # what the other delays of the effect leave
             others = lasting_s(parameters) - np.maximum(value, 0.0)
             longest = delay_steps * np.asarray(dt, float) - others
         high = np.minimum(bounds.high, longest)
@@ -128,7 +128,7 @@ def merge(present: tuple[Any, ...], *added: Any) -> tuple[Any, ...]:
 
 def lasting_s(parameters: Any) -> np.ndarray:
     """Return the longest that an effect with concrete parameters may delay anything, s: all its delays."""
-    delays = [getattr(parameters, name) for name in effect_of(parameters).most_steps]
+    delays = [getattr(parameters, name) for name in effect_of(parameters).max_steps]
     return np.sum([np.maximum(np.asarray(delay, float), 0.0) for delay in delays], axis=0)
 
 
@@ -147,9 +147,9 @@ def start_memories(effects: tuple[Any, ...], drone: Drone, delay_steps: int = US
 
     def start(parameters: Any) -> Any:
         effect = effect_of(parameters)
-        if effect.start is None:
+        if effect.memory is None:
             return None
-        return effect.start(parameters, drone, *([delay_steps] if effect.most_steps else []))
+        return effect.memory.start(parameters, drone, *([delay_steps] if effect.max_steps else []))
 
     return tuple(start(parameters) for parameters in effects)
 
@@ -161,7 +161,7 @@ def at_row(memories: tuple[Any, ...], time_s: Scalar) -> tuple[Any, ...]:
 
 def acts(effects: tuple[Any, ...], stage: str) -> bool:
     """Return whether any effect of a model acts at a stage (static)."""
-    return any(stage in effect_of(parameters).stages for parameters in effects)
+    return any(stage in effect_of(parameters).hooks for parameters in effects)
 
 
 def fold(
@@ -169,7 +169,7 @@ def fold(
 ) -> Any:
     """Return a stage's value after all effects of a model that act there, in order."""
     for parameters, memory in zip(effects, memories, strict=True):
-        hook = getattr(effect_of(parameters), stage)
+        hook = effect_of(parameters).hooks.get(stage)
         if hook is not None:
             value = hook(parameters, memory, value, context)
     return value
@@ -181,7 +181,7 @@ def respond(
     """Return the applied action at the end of a span of the step, and the memories of what makes it."""
     found = list(memories)
     for place, parameters in enumerate(effects):
-        hook = effect_of(parameters).respond
+        hook = effect_of(parameters).hooks.get("respond")
         if hook is not None:
             lagged, found[place] = hook(parameters, memories[place], lagged, context)
     return lagged, tuple(found)
@@ -219,9 +219,9 @@ def remember(
     """
     found = []
     for parameters, memory, *given in zip(effects, memories, first_inputs, inputs, strict=True):
-        update = effect_of(parameters).remember
+        kept = effect_of(parameters).memory
         seen = context._replace(first_input_b=given[0], input_b=given[1])
-        found.append(update(parameters, memory, seen) if update else memory)
+        found.append(kept.remember(parameters, memory, seen) if kept and kept.remember else memory)
     return tuple(found)
 
 
@@ -234,8 +234,9 @@ def observe(
     """
     found = []
     for parameters, memory in zip(reversed(effects), reversed(memories), strict=True):
-        hook = effect_of(parameters).observe
-        memory, offset_b = hook(parameters, memory, offset_b, dt) if hook else (memory, offset_b)
+        kept = effect_of(parameters).memory
+        if kept and kept.observe:
+            memory, offset_b = kept.observe(parameters, memory, offset_b, dt)
         found.append(memory)
     return tuple(reversed(found)), offset_b
 

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, shifted
+from flytrack_env.effects.base import Effect, Range, Search, shifted
 from flytrack_env.quaternion import Scalar
 
 
@@ -19,8 +19,8 @@ ACCELEROMETER_BIAS = Effect(
     parameters=AccelerometerBias,
     ranges={axis: Range(-2.0, 2.0, "m/s^2") for axis in AccelerometerBias._fields},
     notable={"x": 0.3, "y": 0.3, "z": 0.3},
-    needs=("f",),
     equation=r"\mathbf{f}_\text{measured} = \mathbf{f} + (x, y, z)^\top",
     source="assumption: constant within a flight",
-    accelerometer=shifted,
+    hooks={"accelerometer": shifted},
+    search=Search(needs=("f",)),
 )

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, scaled
+from flytrack_env.effects.base import Effect, Range, Search, scaled
 from flytrack_env.quaternion import Scalar
 
 
@@ -19,8 +19,8 @@ ACCELEROMETER_SCALE = Effect(
     parameters=AccelerometerScale,
     ranges={axis: Range(0.8, 1.2, "1") for axis in AccelerometerScale._fields},
     notable={"x": 0.05, "y": 0.05, "z": 0.05},
-    needs=("f",),
     equation=r"\mathbf{f}_\text{measured} = \operatorname{diag}(x, y, z)\, \mathbf{f}",
     source="assumption: linear up to the largest force, no leak between the axes",
-    accelerometer=scaled,
+    hooks={"accelerometer": scaled},
+    search=Search(needs=("f",)),
 )

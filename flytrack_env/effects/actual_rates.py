@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, on_rate_sticks
+from flytrack_env.effects.base import Effect, Range, Search, on_rate_sticks
 from flytrack_env.quaternion import Scalar
 
 
@@ -30,10 +30,8 @@ ACTUAL_RATES = Effect(
     parameters=ActualRates,
     ranges={name: Range(0.0, 1.0, "1") for name in ActualRates._fields},
     notable=dict.fromkeys(ActualRates._fields[:3], 0.05),
-    shapes=ActualRates._fields[3:],
-    follows_sticks=True,
-    is_setting=True,
     equation=r"u_i \leftarrow u_i \left( 1 - b_i + b_i |u_i| \left( e_i u_i^4 + 1 - e_i \right) \right)",
     source="applyActualRates in Betaflight 4.6, src/main/fc/rc.c, over the rate at full stick",
-    command=on_rate_sticks(_curve),
+    hooks={"command": on_rate_sticks(_curve)},
+    search=Search(shapes=ActualRates._fields[3:], follows_sticks=True, is_setting=True),
 )

@@ -146,30 +146,69 @@ def shifted(offsets: Any, memory: None, vector: Vec3, context: StepContext) -> V
 
 
 @dataclass(frozen=True)
-class Effect:
-    """One effect; at least one hook is given.
+class Memory:
+    """What an effect remembers from step to step.
 
-    name: as in model files. parameters: the NamedTuple class; its defaults are neutral. ranges: of each
-    parameter. notable: the smallest departure from neutral that matters, a judgement: less hardly
-    shows in a lap or a reading. equation: LaTeX. source: a publication, or the assumption. command,
-    lag, air, thrust, rates, force, battery, gyro, accelerometer, pose: hooks at these stages.
-    most_steps: of parameters that are delays, how many steps of time each may last.
-    needs: channels that a log has to have to be asked about it: p position, v velocity, q attitude, w gyro,
-    f accelerometer, v_bat voltage.
-    probes: values at which to look for the effect, of parameters whose slope at neutral is 0 or one-sided:
-    first all of the first values, and so on.
-    groups: parameters that are looked for together; all of them if empty. shapes: parameters that only shape
-    what others do, and do nothing while those are neutral. follows_sticks: it is a law of the rate sticks
-    without memory, which does nothing while they are centred. is_setting: it comes with the settings of a
-    craft: a model has it from the start or not at all, and fits free only its ``fitted`` numbers.
-    respond: (parameters, memory, lagged action, context) -> applied action and memory at the end of the span.
-    start: (parameters, drone) -> memory of an episode that begins; no memory if None. With ``most_steps`` it
-    also takes how many steps to remember.
-    remember: (parameters, memory, context) -> memory after a step.
-    observe: (parameters, memory, offset_b, dt) -> memory that has taken up how far measured body rates are
-    from those of the model, rad/s, and what of that it does not hold. dt: since the last measurement, s.
-    static: the field that is no number but a structure, the last; written: its JSON values; read: from those,
-    raising ValueError that begins with the field. Such an effect is learnt, not looked for.
+    Attributes:
+        start: (parameters, drone) -> memory at the beginning of an episode. An effect with
+            ``max_steps`` also takes the number of steps to remember.
+        remember: (parameters, memory, context) -> memory after a step.
+        observe: (parameters, memory, offset_b, dt) -> memory corrected by measured body rates, and
+            the part of the offset that it does not explain. offset_b: measured minus modelled rates,
+            rad/s. dt: time since the last measurement, s.
+    """
+
+    start: Callable[..., Any]
+    remember: Callable[[Any, Any, StepContext], Any] | None = None
+    observe: Callable[[Any, Any, Vec3, Scalar], tuple[Any, Vec3]] | None = None
+
+
+@dataclass(frozen=True)
+class Search:
+    """How identification and diagnosis look for an effect in a log.
+
+    Attributes:
+        needs: channels that the log must have: p position, v velocity, q attitude, w gyro,
+            f accelerometer, v_bat voltage.
+        probes: values of parameters whose slope at neutral is 0 or one-sided; the first values of
+            all parameters are tried together, then the second ones.
+        groups: parameters that are looked for together; all of them if empty.
+        shapes: parameters that change nothing while the others are neutral.
+        follows_sticks: a law of the rate sticks without memory, neutral while they are centred.
+        is_setting: comes with the settings of a craft, so that a model has it from the start or not
+            at all; fits free only the parameters in ``fitted``.
+        fitted: parameters that a fit of the craft frees.
+    """
+
+    needs: tuple[str, ...] = ()
+    probes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    groups: tuple[tuple[str, ...], ...] = ()
+    shapes: tuple[str, ...] = ()
+    follows_sticks: bool = False
+    is_setting: bool = False
+    fitted: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect: its parameters, how they act, and how a log shows them.
+
+    Attributes:
+        name: as in model files.
+        parameters: NamedTuple class whose defaults are neutral.
+        ranges: bounds of each parameter.
+        notable: smallest departure from neutral that shows in a lap or a reading, a judgement.
+        equation: LaTeX.
+        source: a publication, or the assumption.
+        hooks: by stage (``STAGES``). The hook of the stage respond is (parameters, memory, lagged
+            action, context) -> applied action and memory at the end of the span.
+        memory: None if the effect has none.
+        search: how identification looks for it.
+        max_steps: of parameters that are delays, the number of time steps that each may last.
+        static: the last field, if it is a structure and no number. Such an effect is learnt, not
+            looked for.
+        written: static field -> its JSON values.
+        read: JSON values -> static field; raises ValueError that begins with the field.
     """
 
     name: str
@@ -178,28 +217,10 @@ class Effect:
     notable: Mapping[str, float]
     equation: str
     source: str
-    most_steps: Mapping[str, int] = field(default_factory=dict)
-    needs: tuple[str, ...] = ()
-    probes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    groups: tuple[tuple[str, ...], ...] = ()
-    shapes: tuple[str, ...] = ()
-    follows_sticks: bool = False
-    is_setting: bool = False
-    fitted: tuple[str, ...] = ()
-    command: Hook | None = None
-    lag: Hook | None = None
-    respond: Hook | None = None
-    air: Hook | None = None
-    thrust: Hook | None = None
-    rates: Hook | None = None
-    force: Hook | None = None
-    battery: Hook | None = None
-    gyro: Hook | None = None
-    accelerometer: Hook | None = None
-    pose: Hook | None = None
-    start: Callable[..., Any] | None = None
-    remember: Callable[[Any, Any, StepContext], Any] | None = None
-    observe: Callable[[Any, Any, Vec3, Scalar], tuple[Any, Vec3]] | None = None
+    hooks: Mapping[str, Hook]
+    memory: Memory | None = None
+    search: Search = Search()
+    max_steps: Mapping[str, int] = field(default_factory=dict)
     static: str = ""
     written: Callable[[Any], Any] | None = None
     read: Callable[[Any], Any] | None = None
@@ -207,7 +228,7 @@ class Effect:
     @property
     def stages(self) -> tuple[str, ...]:
         """The stages at which the effect acts."""
-        return tuple(stage for stage in STAGES if getattr(self, stage) is not None)
+        return tuple(stage for stage in STAGES if stage in self.hooks)
 
     @property
     def acts_on(self) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Memory, Range, Search, StepContext
 from flytrack_env.fusion import one_kernel
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Action, Drone
@@ -468,18 +468,26 @@ BETAFLIGHT_LOOP = Effect(
         "motor_idle": Range(0.0, 2000.0, "%/100"),
     },
     notable=NOTABLE,
-    shapes=tuple(name for name in BetaflightLoop._fields if name not in NOTABLE),
-    # A weak motor, or those of a side or a diagonal; all four are the thrust map.
-    groups=(GAINS, (LATE,), CENTER, *((motor,) for motor in MOTORS), MOTORS[:2], MOTORS[::2], MOTORS[::3]),
-    is_setting=True,
-    fitted=CRAFT,
     equation=r"c = \text{mix}\left(u_t, P e + I \int e\, dt - D \dot{\omega} + F \dot{u}\right), \quad "
     r"\text{motor}\, \dot{s}_k + s_k = c_k, \quad "
     r"\dot{\omega}_i = \text{arm}_i \sum_k \pm \tfrac{1}{4} T(s_k, V)",
     source="pidController and mixTable of Betaflight 4.6 with legacy mixer, airmode and PT1 filters "
     "(src/main/flight/pid.c, mixer.c, src/main/fc/rc.c), a frame of the receiver at each step, and motors "
     "that each give a quarter of the thrust curve",
-    respond=_respond,
-    start=start,
-    observe=observe,
+    hooks={"respond": _respond},
+    memory=Memory(start=start, observe=observe),
+    search=Search(
+        shapes=tuple(name for name in BetaflightLoop._fields if name not in NOTABLE),
+        groups=(
+            GAINS,
+            (LATE,),
+            CENTER,
+            *((motor,) for motor in MOTORS),
+            MOTORS[:2],
+            MOTORS[::2],
+            MOTORS[::3],
+        ),
+        is_setting=True,
+        fitted=CRAFT,
+    ),
 )

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, on_rate_sticks
+from flytrack_env.effects.base import Effect, Range, Search, on_rate_sticks
 from flytrack_env.quaternion import Scalar
 
 
@@ -30,9 +30,8 @@ BETAFLIGHT_RATES = Effect(
     parameters=BetaflightRates,
     ranges={name: Range(0.0, 0.99, "1") for name in BetaflightRates._fields},
     notable=dict.fromkeys(BetaflightRates._fields, 0.05),
-    follows_sticks=True,
-    is_setting=True,
     equation=r"u_i \leftarrow u_i \left( 1 - e_i + e_i |u_i|^3 \right) \frac{1 - s_i}{1 - s_i |u_i|}",
     source="applyBetaflightRates in Betaflight 4.6, src/main/fc/rc.c, over the rate at full stick",
-    command=on_rate_sticks(_curve),
+    hooks={"command": on_rate_sticks(_curve)},
+    search=Search(follows_sticks=True, is_setting=True),
 )

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Memory, Range, Search, StepContext
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action, Drone
 
@@ -91,14 +91,15 @@ COMMAND_DELAY = Effect(
     r"\quad \text{delay}_i = \max(0, \text{delay} + \text{extra}_i)",
     source="assumption: constant within a flight; the link comes first, then what the flight controller "
     "makes of the sticks",
-    most_steps=dict.fromkeys(CommandDelay._fields, LONGEST_STEPS),
-    probes={
-        "delay_s": (0.005, 0.01, 0.02, 0.03, 0.05),
-        "yaw_extra_s": (0.01, 0.01, 0.03, 0.03, 0.05),
-        "thrust_extra_s": (0.01, 0.01, 0.03, 0.03, 0.03),
-    },
-    groups=(("delay_s",), CommandDelay._fields),
-    command=delayed,
-    start=start,
-    remember=remember,
+    max_steps=dict.fromkeys(CommandDelay._fields, LONGEST_STEPS),
+    hooks={"command": delayed},
+    memory=Memory(start=start, remember=remember),
+    search=Search(
+        probes={
+            "delay_s": (0.005, 0.01, 0.02, 0.03, 0.05),
+            "yaw_extra_s": (0.01, 0.01, 0.03, 0.03, 0.05),
+            "thrust_extra_s": (0.01, 0.01, 0.03, 0.03, 0.03),
+        },
+        groups=(("delay_s",), CommandDelay._fields),
+    ),
 )

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, shifted
+from flytrack_env.effects.base import Effect, Range, Search, shifted
 from flytrack_env.quaternion import Scalar
 
 
@@ -19,8 +19,8 @@ GYRO_BIAS = Effect(
     parameters=GyroBias,
     ranges={axis: Range(-0.5, 0.5, "rad/s") for axis in GyroBias._fields},
     notable={"x": 0.02, "y": 0.02, "z": 0.02},
-    needs=("w",),
     equation=r"\boldsymbol{\omega}_\text{measured} = \boldsymbol{\omega} + (x, y, z)^\top",
     source="assumption: constant within a flight; the rate loop flies by the true rates",
-    gyro=shifted,
+    hooks={"gyro": shifted},
+    search=Search(needs=("w",)),
 )

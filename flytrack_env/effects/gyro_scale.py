@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, scaled
+from flytrack_env.effects.base import Effect, Range, Search, scaled
 from flytrack_env.quaternion import Scalar
 
 
@@ -19,9 +19,8 @@ GYRO_SCALE = Effect(
     parameters=GyroScale,
     ranges={axis: Range(0.8, 1.2, "1") for axis in GyroScale._fields},
     notable={"x": 0.02, "y": 0.02, "z": 0.02},
-    follows_sticks=True,
-    needs=("w",),
     equation=r"\boldsymbol{\omega}_\text{measured} = \operatorname{diag}(x, y, z)\, \boldsymbol{\omega}",
     source="assumption: linear up to the fastest turn, no leak between the axes",
-    gyro=scaled,
+    hooks={"gyro": scaled},
+    search=Search(follows_sticks=True, needs=("w",)),
 )

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Memory, Range, Search, StepContext
 from flytrack_env.effects.command_delay import USUAL_STEPS, late
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Scalar, Vec3
@@ -96,10 +96,8 @@ IMU_LATENCY = Effect(
     equation=r"\boldsymbol{\omega}_\text{measured}(t) = \boldsymbol{\omega}(t - \text{latency}), \quad "
     r"\mathbf{f}_\text{measured}(t) = \mathbf{f}(t - \text{latency})",
     source="assumption: the same for both sensors; what imu_offset adds is not late",
-    most_steps={"latency_s": USUAL_STEPS},
-    probes={"latency_s": (0.005, 0.01, 0.02, 0.03)},
-    gyro=_gyro,
-    accelerometer=_accelerometer,
-    start=start,
-    remember=remember,
+    max_steps={"latency_s": USUAL_STEPS},
+    hooks={"gyro": _gyro, "accelerometer": _accelerometer},
+    memory=Memory(start=start, remember=remember),
+    search=Search(probes={"latency_s": (0.005, 0.01, 0.02, 0.03)}),
 )

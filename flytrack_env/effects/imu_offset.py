@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Range, Search, StepContext
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Scalar, Vec3
 
@@ -34,9 +34,9 @@ IMU_OFFSET = Effect(
     parameters=ImuOffset,
     ranges={axis: Range(-0.2, 0.2, "m") for axis in ImuOffset._fields},
     notable={"x": 0.02, "y": 0.02, "z": 0.02},
-    needs=("f",),
     equation=r"\mathbf{f}_\text{measured} = \mathbf{f} + \boldsymbol{\omega} \times (\boldsymbol{\omega} "
     r"\times \mathbf{r}) + \dot{\boldsymbol{\omega}} \times \mathbf{r}",
     source="acceleration of a point of a rigid body; assumption: rates change evenly within the step",
-    accelerometer=_accelerometer,
+    hooks={"accelerometer": _accelerometer},
+    search=Search(needs=("f",)),
 )

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Memory, Range, Search, StepContext
 from flytrack_env.effects.grammar import Flight, Law, law_from_json, moment_of
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Drone
@@ -51,12 +51,16 @@ LEARNED_LAW = Effect(
     equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b + s \sum_k \mathbf{c}_k\, g_k h_k",
     source="the log that it was learnt from; sums of products of given functions: S. Brunton et al., "
     '"Discovering governing equations from data by sparse identification", 2016',
-    shapes=("spread",),
-    needs=("q",),
-    force=lambda parameters, flight, value, context: _add_terms(parameters, "force", flight, value, context),
-    rates=lambda parameters, flight, value, context: _add_terms(parameters, "rate", flight, value, context),
-    start=_start,
-    remember=_remember,
+    hooks={
+        "force": lambda parameters, flight, value, context: _add_terms(
+            parameters, "force", flight, value, context
+        ),
+        "rates": lambda parameters, flight, value, context: _add_terms(
+            parameters, "rate", flight, value, context
+        ),
+    },
+    memory=Memory(start=_start, remember=_remember),
+    search=Search(needs=("q",), shapes=("spread",)),
     static="law",
     written=lambda law: law.as_json(),
     read=law_from_json,

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Range, Search, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -24,9 +24,9 @@ LINEAR_DRAG = Effect(
     parameters=LinearDrag,
     ranges={axis: Range(-3.0, 3.0, "1/s") for axis in LinearDrag._fields},
     notable={"d_x": 0.05, "d_y": 0.05, "d_z": 0.05},
-    needs=("v", "q"),
     equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b - \operatorname{diag}(d_x, d_y, d_z)\, R^\top "
     r"(\mathbf{v} - \mathbf{v}_\text{air})",
     source='M. Faessler et al., "Differential flatness of quadrotor dynamics subject to rotor drag", eq. 2',
-    force=_force,
+    hooks={"force": _force},
+    search=Search(needs=("v", "q")),
 )

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Pose, Range, StepContext
+from flytrack_env.effects.base import Effect, Memory, Pose, Range, Search, StepContext
 from flytrack_env.effects.command_delay import MOST_STEPS, late
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import Drone
@@ -62,10 +62,8 @@ MOCAP_LATENCY = Effect(
     equation=r"(\mathbf{p}, \mathbf{v}, \mathbf{q})_\text{measured}(t) = "
     r"(\mathbf{p}, \mathbf{v}, \mathbf{q})(t - \text{latency})",
     source="assumption: the same for all three, linear between steps",
-    most_steps={"latency_s": MOST_STEPS},
-    needs=("q", "w"),
-    probes={"latency_s": (0.005, 0.01, 0.02, 0.03)},
-    pose=_pose,
-    start=start,
-    remember=remember,
+    max_steps={"latency_s": MOST_STEPS},
+    hooks={"pose": _pose},
+    memory=Memory(start=start, remember=remember),
+    search=Search(needs=("q", "w"), probes={"latency_s": (0.005, 0.01, 0.02, 0.03)}),
 )

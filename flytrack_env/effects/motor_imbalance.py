@@ -26,5 +26,5 @@ MOTOR_IMBALANCE = Effect(
     equation=r"\omega_x \leftarrow \omega_x + \text{roll}\, \frac{T}{m}, \quad \omega_y \leftarrow \omega_y "
     r"+ \text{pitch}\, \frac{T}{m}",
     source="assumption: a torque in proportion to thrust, which a rate loop without integral part leaves",
-    rates=_rates,
+    hooks={"rates": _rates},
 )

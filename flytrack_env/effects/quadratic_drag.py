@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Range, Search, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -33,11 +33,10 @@ QUADRATIC_DRAG = Effect(
         "shared": Range(0.0, 1.0, "1"),
     },
     notable={"k_x": 0.005, "k_y": 0.005, "k_z": 0.005},
-    needs=("v", "q"),
     equation=r"f_i \leftarrow f_i - k_i \left( s \lVert \mathbf{v}_b \rVert + (1 - s) |v_{b,i}| \right) "
     r"v_{b,i}, \quad \mathbf{v}_b = R^\top (\mathbf{v} - \mathbf{v}_\text{air}), \quad s = "
     r"\text{shared}",
     source="the drag equation, f = c_d A rho v^2 / 2m: of one body (shared 1), or of each axis by itself (0)",
-    shapes=("shared",),
-    force=_force,
+    hooks={"force": _force},
+    search=Search(needs=("v", "q"), shapes=("shared",)),
 )

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Range, Search, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -23,9 +23,9 @@ RATE_CROSS_COUPLING = Effect(
     parameters=RateCrossCoupling,
     ranges={axis: Range(-0.3, 0.3, "1") for axis in RateCrossCoupling._fields},
     notable={"from_roll": 0.03, "from_pitch": 0.03},
-    follows_sticks=True,
     equation=r"\omega_z \leftarrow \omega_z + \text{from roll} \cdot \omega_x + \text{from pitch} \cdot "
     r"\omega_y",
     source="assumption: in proportion, and into yaw only, the axis with the least authority",
-    rates=_rates,
+    hooks={"rates": _rates},
+    search=Search(follows_sticks=True),
 )

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, on_rate_sticks
+from flytrack_env.effects.base import Effect, Range, Search, on_rate_sticks
 from flytrack_env.quaternion import Scalar
 
 
@@ -23,9 +23,9 @@ RATE_EXPO = Effect(
     parameters=RateExpo,
     ranges={axis: Range(-0.9, 0.9, "1") for axis in RateExpo._fields},
     notable={axis: 0.05 for axis in RateExpo._fields},
-    follows_sticks=True,
     equation=r"u_i \leftarrow (1 - \text{expo}_i)\, u_i + \text{expo}_i\, u_i^3",
     source='the "expo" of radio transmitters, and of KISS and RaceFlight rates in Betaflight '
     "(src/main/fc/rc.c): the curve makes the setpoint of the rate loop, before any lag",
-    command=on_rate_sticks(_curve),
+    hooks={"command": on_rate_sticks(_curve)},
+    search=Search(follows_sticks=True),
 )

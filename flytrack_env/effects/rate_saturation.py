@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Range, Search, StepContext
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action
 
@@ -40,12 +40,12 @@ RATE_SATURATION = Effect(
     parameters=RateSaturation,
     ranges={**{axis: Range(0.0, 0.9, "1") for axis in AXES}, "softness": Range(0.0, 1.0, "1")},
     notable={axis: 0.05 for axis in AXES},
-    follows_sticks=True,
     equation=r"u_i \leftarrow (1 - s) \operatorname{clip}(u_i, -L_i, L_i) + \frac{s\, u_i}"
     r"{\sqrt{1 + (L_i^{-2} - 1)\, u_i^2}}, \quad L_i = 1 - \text{lost}_i, \quad s = \text{softness}",
     source="a corner: the rate limits of Betaflight (src/main/fc/rc.c), which clip the setpoint that the "
     "stick's curve makes; assumption: gradual limits give full stick as much as the corner does",
-    shapes=("softness",),
-    probes={axis: (0.03, 0.1, 0.3) for axis in AXES},
-    command=_command,
+    hooks={"command": _command},
+    search=Search(
+        follows_sticks=True, shapes=("softness",), probes={axis: (0.03, 0.1, 0.3) for axis in AXES}
+    ),
 )

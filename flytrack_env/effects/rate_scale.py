@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, scaled
+from flytrack_env.effects.base import Effect, Range, Search, scaled
 from flytrack_env.quaternion import Scalar
 
 
@@ -19,9 +19,9 @@ RATE_SCALE = Effect(
     parameters=RateScale,
     ranges={axis: Range(0.5, 1.5, "1") for axis in RateScale._fields},
     notable={"roll": 0.03, "pitch": 0.03, "yaw": 0.03},
-    follows_sticks=True,
     equation=r"\boldsymbol{\omega} \leftarrow \operatorname{diag}(\text{roll}, \text{pitch}, \text{yaw})\, "
     r"\boldsymbol{\omega}",
     source="assumption: the stick's curve stays linear",
-    rates=scaled,
+    hooks={"rates": scaled},
+    search=Search(follows_sticks=True),
 )

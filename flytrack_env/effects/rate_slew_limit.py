@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Memory, Range, Search, StepContext
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action, Drone
@@ -84,9 +84,9 @@ RATE_SLEW_LIMIT = Effect(
     equation=r"|u_i(t + \Delta t) - u_i(t)| \le \frac{\Delta t}{T_i}",
     source="the acceleration limit of Betaflight (src/main/flight/pid.c), which the setpoint passes between "
     "the stick's curve and the controller",
-    # A limit on the acceleration of all axes is a shorter time on the axis with the lower rates.
-    probes={"roll_s": (0.03, 0.1, 0.3), "pitch_s": (0.03, 0.1, 0.3), "yaw_s": (0.015, 0.05, 0.15)},
-    command=_command,
-    start=start,
-    remember=remember,
+    hooks={"command": _command},
+    memory=Memory(start=start, remember=remember),
+    search=Search(
+        probes={"roll_s": (0.03, 0.1, 0.3), "pitch_s": (0.03, 0.1, 0.3), "yaw_s": (0.015, 0.05, 0.15)}
+    ),
 )

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Range, Search, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -23,9 +23,9 @@ ROTOR_DRAG = Effect(
     parameters=RotorDrag,
     ranges={"h": Range(-0.2, 0.2, "s/m")},
     notable={"h": 0.005},
-    needs=("v", "q"),
     equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b - h\, \frac{T}{m} \operatorname{diag}(1, 1, 0)\, R^\top "
     r"(\mathbf{v} - \mathbf{v}_\text{air})",
     source='R. Mahony, V. Kumar, P. Corke, "Multirotor aerial vehicles", 2012, eq. 12: blade flapping',
-    force=_force,
+    hooks={"force": _force},
+    search=Search(needs=("v", "q")),
 )

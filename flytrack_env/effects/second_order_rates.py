@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Memory, Range, Search, StepContext
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Drone
@@ -134,10 +134,10 @@ SECOND_ORDER_RATES = Effect(
     r"\omega_{i,\text{lagged stick}}, \quad \omega_{n,i} = \frac{2\, \text{damping}_i}{\text{lag}_i}",
     source="a second-order servo, as a rate loop with a PID controller is near its bandwidth; exact for an "
     "input that is held over the step or changes evenly in it",
-    probes={f"{axis}_s": (0.003, 0.01, 0.03) for axis in AXES},
-    shapes=tuple(f"{axis}_damping" for axis in AXES),
-    rates=_rates,
-    start=start,
-    remember=remember,
-    observe=observe,
+    hooks={"rates": _rates},
+    memory=Memory(start=start, remember=remember, observe=observe),
+    search=Search(
+        probes={f"{axis}_s": (0.003, 0.01, 0.03) for axis in AXES},
+        shapes=tuple(f"{axis}_damping" for axis in AXES),
+    ),
 )

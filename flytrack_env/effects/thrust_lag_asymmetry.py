@@ -28,5 +28,5 @@ THRUST_LAG_ASYMMETRY = Effect(
     equation=r"\tau_\text{thrust} \leftarrow \text{ratio} \cdot \tau_\text{thrust} \quad \text{where the "
     r"command is below the applied thrust}",
     source="assumption: one ratio at any thrust; motors are driven up, and coast down",
-    lag=_lag,
+    hooks={"lag": _lag},
 )

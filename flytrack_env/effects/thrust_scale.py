@@ -23,5 +23,5 @@ THRUST_SCALE = Effect(
     notable={"factor": 0.02},
     equation=r"T \leftarrow \text{factor} \cdot T",
     source="assumption: the shape of the thrust curve stays",
-    thrust=_thrust,
+    hooks={"thrust": _thrust},
 )

@@ -26,5 +26,5 @@ THRUST_TILT = Effect(
     equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b + \frac{T}{m} (\text{towards}_x, \text{towards}_y, "
     r"0)^\top",
     source="assumption: small angles, the same at any thrust",
-    force=_force,
+    hooks={"force": _force},
 )

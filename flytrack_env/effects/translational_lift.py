@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Range, Search, StepContext
 from flytrack_env.quaternion import Scalar
 
 # m/s, airspeed at which half of the gain is there: about the velocity that a racing quadcopter's rotors
@@ -27,9 +27,9 @@ TRANSLATIONAL_LIFT = Effect(
     parameters=TranslationalLift,
     ranges={"gain": Range(-0.5, 0.5, "1")},
     notable={"gain": 0.05},
-    needs=("v", "q"),
     equation=r"T \leftarrow T \left( 1 + \text{gain}\, \frac{s^2}{s^2 + (7\,\text{m/s})^2} \right), \quad s "
     r"= \sqrt{v_{b,x}^2 + v_{b,y}^2}",
     source="J. G. Leishman, Principles of Helicopter Aerodynamics, section 2.14, as a saturating curve",
-    thrust=_thrust,
+    hooks={"thrust": _thrust},
+    search=Search(needs=("v", "q")),
 )

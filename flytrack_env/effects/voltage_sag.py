@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Range, Search, StepContext
 from flytrack_env.quaternion import Scalar
 
 
@@ -32,8 +32,8 @@ VOLTAGE_SAG = Effect(
     parameters=VoltageSag,
     ranges={"at_full_v": Range(-3.0, 6.0, "V")},
     notable={"at_full_v": 0.3},
-    needs=("v_bat",),
     equation=r"V = V_\text{open} - \text{at full} \cdot \left( \frac{1 + u}{2} \right)^2",
     source="assumption: a resistance without dynamics, current with the square of the stick",
-    battery=_battery,
+    hooks={"battery": _battery},
+    search=Search(needs=("v_bat",)),
 )

@@ -6,7 +6,7 @@ parameters are apart because their units are.
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Range, Search, StepContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -38,11 +38,9 @@ WIND = Effect(
         **{name: Range(-5.0, 5.0, "m/s^2") for name in ("a_x", "a_y", "a_z")},
     },
     notable={"a_x": 0.2, "a_y": 0.2, "a_z": 0.2, "v_x": 1.0, "v_y": 1.0, "v_z": 1.0},
-    needs=("q",),
     equation=r"\mathbf{v}_\text{air} \leftarrow \mathbf{v}_\text{air} + \mathbf{v}, \quad \mathbf{f}_b "
     r"\leftarrow \mathbf{f}_b + R^\top \mathbf{a}",
     source="assumption: uniform and steady within a flight",
-    groups=(("a_x", "a_y", "a_z"), ("v_x", "v_y", "v_z")),
-    air=_air,
-    force=_force,
+    hooks={"air": _air, "force": _force},
+    search=Search(needs=("q",), groups=(("a_x", "a_y", "a_z"), ("v_x", "v_y", "v_z"))),
 )

@@ -28,5 +28,5 @@ YAW_REACTION = Effect(
     notable={"angle": 0.02},
     equation=r"\omega_z \leftarrow \omega_z + \text{angle}\, \frac{du}{dt}",
     source="assumption: unequal spin-up of the two directions of rotation, in proportion to its speed",
-    rates=_rates,
+    hooks={"rates": _rates},
 )

@@ -70,7 +70,7 @@ class Question:
     ):
         self.linearization, self.effect = linearization, effect
         self.given = linearization.columns_at(model.places)
-        way, shapes = _typical_candidate(effect), BY_NAME[effect].shapes
+        way, shapes = _typical_candidate(effect), BY_NAME[effect].search.shapes
         notable = BY_NAME[effect].notable
         fields = [field for field in way.other_fields if field.split(".")[1] not in shapes]
         # The columns of probes come first, in shares of the way to them.

@@ -336,7 +336,7 @@ def is_determined(state: SearchState, model: FittedModel, fields: Sequence[str])
     problem = state.problem
     places = problem.index(fields)
     change = np.abs(model.vector[places] - problem.start[places])
-    acting = [field.split(".")[1] not in BY_NAME[field.split(".")[0]].shapes for field in fields]
+    acting = [field.split(".")[1] not in BY_NAME[field.split(".")[0]].search.shapes for field in fields]
     state, linearization = state.linearized(model.vector)
     half_widths = Marginal(linearization, model, fields).half_widths()
     return state, bool(np.any((change > half_widths) & acting))

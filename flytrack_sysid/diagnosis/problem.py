@@ -36,7 +36,7 @@ from flytrack_sysid.replay import Step, replay
 
 # What a replay can show, whatever the craft: it is fed with poses, so that how late these are has to be known
 # before.
-SEARCHED = tuple(effect for effect in EFFECTS if effect.pose is None and not effect.is_setting)
+SEARCHED = tuple(effect for effect in EFFECTS if "pose" not in effect.hooks and not effect.search.is_setting)
 BATCH, SMALL_BATCH = 20, 4
 RELATIVE_STEP = 1e-6  # of a parameter's scale, for slopes
 
@@ -287,7 +287,7 @@ def _size_for(values: np.ndarray) -> int:
 
 def as_replayed(model: ModelParameters) -> ModelParameters:
     """Return a model without the effects on poses."""
-    return model._replace(effects=tuple(one for one in model.effects if effect_of(one).pose is None))
+    return model._replace(effects=tuple(one for one in model.effects if "pose" not in effect_of(one).hooks))
 
 
 def vector_of(model: ModelParameters) -> np.ndarray:
@@ -299,9 +299,7 @@ def _longest(names: Sequence[str], lanes: Lanes) -> np.ndarray:
     """Return the longest delays, s, for the steps that effects remember; infinity for other parameters."""
     step_s = float(np.median(lanes.record.step_s))
     fields = [name.partition(".") for name in names]
-    steps = [
-        BY_NAME[effect].most_steps.get(field, np.inf) if field else np.inf for effect, _, field in fields
-    ]
+    steps = [BY_NAME[effect].max_steps.get(field, np.inf) if field else np.inf for effect, _, field in fields]
     return np.array(steps) * step_s
 
 

@@ -368,7 +368,7 @@ def at_bounds(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> li
         effect, _, field = problem.names[place].partition(".")
         low, high, value = problem.low[place], problem.high[place], vector[place]
         room = 1e-6 * max(abs(value), 1.0)
-        is_shape = bool(field) and field in BY_NAME[effect].shapes
+        is_shape = bool(field) and field in BY_NAME[effect].search.shapes
         is_neutral = bool(field) and abs(value - problem.start[place]) <= room
         if not (is_shape or is_neutral) and not low + room < value < high - room:
             found.append(problem.names[place])
@@ -383,7 +383,7 @@ def widened(problem: Problem, fields: Sequence[str]) -> Problem:
     low, high = problem.low.copy(), problem.high.copy()
     for name, place in zip(fields, problem.index(fields), strict=True):
         effect, _, field = name.partition(".")
-        if not field or field in BY_NAME[effect].most_steps:
+        if not field or field in BY_NAME[effect].max_steps:
             continue
         width = high[place] - low[place]
         if low[place] < problem.start[place]:
@@ -521,7 +521,7 @@ def _acting(
 
 def _is_neutral(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> bool:
     """Return whether parameters are as in the nominal model, those apart that only shape what others do."""
-    own = [name for name in fields if name.split(".")[1] not in BY_NAME[name.split(".")[0]].shapes]
+    own = [name for name in fields if name.split(".")[1] not in BY_NAME[name.split(".")[0]].search.shapes]
     places = problem.index(own)
     return bool(np.all(np.abs(vector - problem.start)[places] < NEUTRAL * problem.scale[places]))
 

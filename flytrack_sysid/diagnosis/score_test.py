@@ -65,7 +65,7 @@ class Candidate(NamedTuple):
     @property
     def num_priced(self) -> int:
         """How many of its parameters count against it: not those that only shape what others do."""
-        shapes = [f"{self.effect}.{field}" for field in BY_NAME[self.effect].shapes]
+        shapes = [f"{self.effect}.{field}" for field in BY_NAME[self.effect].search.shapes]
         return sum(field not in shapes for field in self.fields)
 
     @property
@@ -74,11 +74,11 @@ class Candidate(NamedTuple):
         fields = set(self.fields)
         own = [one.fields for one in candidates_of(BY_NAME[self.effect]) if fields.issuperset(one.fields)]
         largest = [one for one in own if not any(set(one) < set(other) for other in own)]
-        return largest if BY_NAME[self.effect].is_setting else [self.fields]
+        return largest if BY_NAME[self.effect].search.is_setting else [self.fields]
 
     def excludes(self, other: "Candidate") -> bool:
         """Return whether a model has either: ways of one effect, but for settings that no group connects."""
-        if self.effect != other.effect or not BY_NAME[self.effect].is_setting:
+        if self.effect != other.effect or not BY_NAME[self.effect].search.is_setting:
             return self.effect == other.effect
         own, theirs = {*self.fields}, {*other.fields}
         return any(own & family and theirs & family for family in families_of(BY_NAME[self.effect]))
@@ -92,12 +92,12 @@ class Candidate(NamedTuple):
 def candidates_of(effect: Effect) -> list[Candidate]:
     """Return the ways in which an effect is looked for."""
     found = []
-    for group in effect.groups or (tuple(effect.ranges),):
+    for group in effect.search.groups or (tuple(effect.ranges),):
         fields = tuple(f"{effect.name}.{field}" for field in group)
         probed = [
-            [Probe(f"{effect.name}.{field}", value) for value in effect.probes[field]]
+            [Probe(f"{effect.name}.{field}", value) for value in effect.search.probes[field]]
             for field in group
-            if field in effect.probes
+            if field in effect.search.probes
         ]
         ways = zip(*probed, strict=True) if probed else [()]
         found += [Candidate(effect.name, fields, probes) for probes in ways]
@@ -119,8 +119,8 @@ CANDIDATES = [candidate for effect in SEARCHED for candidate in candidates_of(ef
 
 def candidates_for(problem: Problem) -> list[Candidate]:
     """Return the ways to look for effects: of the list, and what settings of the craft may be changed."""
-    given = [BY_NAME[name] for name in problem.given_effects if BY_NAME[name].is_setting]
-    return [*CANDIDATES, *(one for effect in given if effect.groups for one in candidates_of(effect))]
+    given = [BY_NAME[name] for name in problem.given_effects if BY_NAME[name].search.is_setting]
+    return [*CANDIDATES, *(one for effect in given if effect.search.groups for one in candidates_of(effect))]
 
 
 def threshold(num_parameters: int) -> float:

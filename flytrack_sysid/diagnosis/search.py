@@ -99,7 +99,7 @@ class SearchState:
         """
         noise = noises.first_guess(problem.lanes, problem.residuals(problem.start[None])[0])
         channels = {*log.channels, *problem.lanes.measured}
-        lacking = tuple(effect.name for effect in SEARCHED if not set(effect.needs) <= channels)
+        lacking = tuple(effect.name for effect in SEARCHED if not set(effect.search.needs) <= channels)
         # The replay's voltage is then assumed at every row; what falls within a step would pass for thrust.
         held = () if voltages_of(problem.lanes) else (Held(DRAIN, ""),)
         return cls(problem.with_noise(noise), unobservable=lacking, held=held)

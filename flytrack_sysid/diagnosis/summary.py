@@ -157,7 +157,7 @@ def effect_causes(selection: vetoes.Selection, test: Problem, linearization: Lin
             alike += tuple(
                 name
                 for name in selection.state.unobservable
-                if vetoes.is_force_law(name) and not {"v", "q"}.isdisjoint(BY_NAME[name].needs)
+                if vetoes.is_force_law(name) and not {"v", "q"}.isdisjoint(BY_NAME[name].search.needs)
             )
         causes.append(
             Cause(
@@ -266,7 +266,7 @@ def not_identifiable(
             twins[cause.effect] = (*twins.get(cause.effect, ()), *cause.equivalent)
             twins |= {name: (*twins.get(name, ()), cause.effect) for name in cause.equivalent}
     wanted = {name: limit.confused_with for name, limit in limits.items()} | twins
-    flights = {name: TO_LOG + " and ".join(BY_NAME[name].needs) for name in state.unobservable}
+    flights = {name: TO_LOG + " and ".join(BY_NAME[name].search.needs) for name in state.unobservable}
     asked = {name: alike for name, alike in wanted.items() if name not in state.unobservable}
     flights |= advise(state.problem, model, linearization, asked)
     result = []
@@ -392,7 +392,7 @@ def causes_at_end(selection: vetoes.Selection, refined: Refined, test: Problem) 
     ranges = dict(zip(problem.names, problem.high - problem.low, strict=True))
     stuck: dict[str, str] = {}
     for one in refined.kept:
-        steps = [f"{one.effect}.{field}" for field in BY_NAME[one.effect].most_steps]
+        steps = [f"{one.effect}.{field}" for field in BY_NAME[one.effect].max_steps]
         fields = [field for field in at_bounds(searched, vector, one.fields) if field not in steps]
         if not fields:
             continue
@@ -569,7 +569,7 @@ def _at_bound(cause: Cause) -> str:
     why = "its law may stand in for something else"
     if cause.effect in BY_NAME:
         why += ", and is not in the extended model"
-    if cause.effect in BY_NAME and any(name in cause.beyond for name in BY_NAME[cause.effect].most_steps):
+    if cause.effect in BY_NAME and any(name in cause.beyond for name in BY_NAME[cause.effect].max_steps):
         why = "only so many rows of the log are remembered; import it with fewer rows per second"
     return f"{cause.effect} is beyond the list: {cause.beyond}, the end of what is searched; {why}"
 

@@ -230,9 +230,9 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
     Where turns are left unexplained, laws that this log never shows at rest are rejected, too.
     """
     state, model = selection.state, selection.model
-    laws = [name for name in selection.ablations if BY_NAME[name].follows_sticks]
+    laws = [name for name in selection.ablations if BY_NAME[name].search.follows_sticks]
     if state.problem.counts[..., AXES[0], 1].any():  # attitude tells a gyro from any rate loop
-        laws = [name for name in laws if BY_NAME[name].gyro is None]
+        laws = [name for name in laws if "gyro" not in BY_NAME[name].hooks]
     if not laws:
         return []
     at_rest = rests(state.problem.lanes.record)
@@ -258,9 +258,8 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
 
 def is_force_law(effect: str) -> bool:
     """Return whether an effect is a law of a force, which may be wrong in form; a scale of thrust is not."""
-    one = BY_NAME[effect]
-    acts = one.thrust is not None or one.air is not None or one.force is not None
-    return acts and effect != "thrust_scale"
+    acts_on_force = not {"thrust", "air", "force"}.isdisjoint(BY_NAME[effect].hooks)
+    return acts_on_force and effect != "thrust_scale"
 
 
 def remainder_of_force_law(selection: Selection, test: Problem) -> list[str]:

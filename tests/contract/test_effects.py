@@ -49,15 +49,15 @@ RACER = BetaflightLoop(20.0, 21.0, 2.0, 2.0, 0.02, 0.5, **SHOWING, thrust_linear
 def inside_ranges(effect: Effect, fraction: float) -> Any:
     """Return parameters that lie that far from neutral towards the upper end of their ranges."""
     neutral = effect.parameters()
-    if effect.respond is not None and fraction > 0.0:
+    if "respond" in effect.hooks and fraction > 0.0:
         return RACER
     values = (n + fraction * (r.high - n) for n, r in zip(neutral, effect.ranges.values(), strict=True))
     return effect.parameters(*values)
 
 
 # A loop takes the place of lags, so that it is alone; others that act at one stage are in different groups.
-WITHOUT_LOOP = [effect for effect in EFFECTS if effect.respond is None]
-GROUPS = {"all": EFFECTS, "loop": [effect for effect in EFFECTS if effect.respond is not None]}
+WITHOUT_LOOP = [effect for effect in EFFECTS if "respond" not in effect.hooks]
+GROUPS = {"all": EFFECTS, "loop": [effect for effect in EFFECTS if "respond" in effect.hooks]}
 GROUPS |= {f"every fifth from {first}": WITHOUT_LOOP[first::5] for first in range(5)}
 
 
@@ -75,16 +75,17 @@ def test_declaration_is_consistent(effect: Effect) -> None:
     neutral = effect.parameters()
     assert tuple(effect.ranges) == neutral._fields
     assert effect.stages and effect.equation and effect.source
-    assert (effect.start is None) == (effect.remember is None and effect.respond is None)
-    assert set(effect.notable) == set(effect.ranges) - set(effect.shapes)
+    is_used = "respond" in effect.hooks or (effect.memory and effect.memory.remember)
+    assert bool(effect.memory) == bool(is_used)
+    assert set(effect.notable) == set(effect.ranges) - set(effect.search.shapes)
     for name, bounds in effect.ranges.items():
         value = getattr(neutral, name)
         assert bounds.low <= value <= bounds.high and bounds.low < bounds.high and bounds.unit
-        assert all(bounds.low <= probe <= bounds.high for probe in effect.probes.get(name, ()))
+        assert all(bounds.low <= probe <= bounds.high for probe in effect.search.probes.get(name, ()))
         if name in effect.notable:
             assert effect.notable[name] > 0.0 and value + effect.notable[name] <= bounds.high
     for stage, channel in (("gyro", "w"), ("accelerometer", "f"), ("battery", "v_bat")):
-        assert effect.stages != (stage,) or channel in effect.needs
+        assert effect.stages != (stage,) or channel in effect.search.needs
 
 
 def test_every_file_of_the_folder_is_in_the_list() -> None:
@@ -99,9 +100,9 @@ def test_every_file_of_the_folder_is_in_the_list() -> None:
 def test_probes_show_the_effect(effect: Effect) -> None:
     full_stick, drone = np.ones((20, 4)), random_drone(0)
     plain = flown((), full_stick, drone)
-    for name, values in effect.probes.items():
+    for name, values in effect.search.probes.items():
         for value in values:
-            start = effect.parameters() if effect.respond is None else RACER
+            start = effect.parameters() if "respond" not in effect.hooks else RACER
             assert not np.array_equal(flown(start._replace(**{name: value}), full_stick, drone), plain)
 
 
@@ -155,12 +156,12 @@ def test_gradients_are_finite_and_right(effect: Effect, fraction: float) -> None
         tangent = only(effect, name)
         here, slope = map(np.asarray, final_and_slope(parameters, tangent))
         assert np.isfinite(slope).all()
-        if fraction == 0.0 and (effect.probes or effect.respond):
+        if fraction == 0.0 and (effect.search.probes or "respond" in effect.hooks):
             continue  # no slope there, or not the same on both sides
-        if fraction == 0.0 and name in effect.shapes:
+        if fraction == 0.0 and name in effect.search.shapes:
             assert not slope.any()
             continue
-        size = bounds.high - bounds.low if effect.respond is None else getattr(RACER, name)
+        size = bounds.high - bounds.low if "respond" not in effect.hooks else getattr(RACER, name)
         change = 2e-3 * size
         shift = jax.tree.map(partial(jnp.multiply, change), tangent)
         moved = jax.tree.map(jnp.add, parameters, shift)
@@ -170,7 +171,7 @@ def test_gradients_are_finite_and_right(effect: Effect, fraction: float) -> None
 
 
 @pytest.mark.parametrize(
-    "effect", [effect for effect in EFFECTS if effect.rates is not None], ids=lambda effect: effect.name
+    "effect", [effect for effect in EFFECTS if "rates" in effect.hooks], ids=lambda effect: effect.name
 )
 def test_rates_of_a_start_stay_while_its_sticks_are_held(effect: Effect) -> None:
     drone, parameters = random_drone(5), inside_ranges(effect, 0.5)

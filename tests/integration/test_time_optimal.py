@@ -24,7 +24,7 @@ def test_the_symbolic_step_is_the_simulators() -> None:
     symbolic = pytest.importorskip("benchmarks.optimal", exc_type=ImportError)
     rng, model = np.random.default_rng(0), nominal_parameters()
     for effect in EFFECTS:
-        if effect.start is None:  # no memory
+        if effect.memory is None:  # no memory
             neutral = effect.parameters()._asdict()
             sizes = {name: neutral[name] + effect.notable.get(name, 0.0) * rng.uniform() for name in neutral}
             model = model.with_effects(effect.parameters(**sizes))
