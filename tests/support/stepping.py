@@ -14,7 +14,6 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import flytrack_env  # noqa: F401, registers the ids
-from flytrack_env.registration import RACES
 
 NUM_DEVICES, NUM_ENVS, NUM_STEPS = 4, 8, 5
 XLA_FLAGS = f"--xla_force_host_platform_device_count={NUM_DEVICES}"  # of the environment of the process
@@ -57,10 +56,13 @@ def inputs(env: Any) -> tuple[jax.Array, jax.Array, Any]:
 def _by_named_sharding(fly: Any, keys: jax.Array, actions: jax.Array, params: Any, mesh: Mesh) -> Any:
     placed = jax.device_put((keys, actions), NamedSharding(mesh, PartitionSpec("batch")))
     program = jax.jit(fly).lower(*placed, params).compile()
-    assert "xla_cpu_small_call" in program.as_text(), "the fast path is off"
-    found = program(*placed, params)
-    assert not found[0][0].sharding.is_fully_replicated
-    return found
+    text = program.as_text()
+    assert "xla_cpu_small_call" in text, "the fast path is off"
+    # The rounds of a race's resets are outside of the kernel and gather the random words.
+    assert hasattr(params, "race") or " all-gather(" not in text, "the batch is gathered"
+    flown = program(*placed, params)
+    assert not flown[0][0].sharding.is_fully_replicated
+    return flown
 
 
 def _by_shard_map(fly: Any, keys: jax.Array, actions: jax.Array, params: Any, mesh: Mesh) -> Any:
@@ -79,13 +81,6 @@ def _by_pmap(fly: Any, keys: jax.Array, actions: jax.Array, params: Any, mesh: M
 WAYS = (_by_named_sharding, _by_shard_map, _by_pmap)
 
 
-def has_gathers(env: Any, mesh: Mesh) -> bool:
-    """Return whether a flight by ``NamedSharding`` sends parts of the batch between the devices."""
-    keys, actions, params = inputs(env)
-    placed = jax.device_put((keys, actions), NamedSharding(mesh, PartitionSpec("batch")))
-    return " all-gather(" in jax.jit(flight(env)).lower(*placed, params).compile().as_text()
-
-
 def main(env_ids: list[str]) -> None:
     """Fly each id in every way; raise AssertionError where one differs from a flight on one device."""
     assert len(jax.devices()) == NUM_DEVICES
@@ -101,8 +96,6 @@ def main(env_ids: list[str]) -> None:
             for path, leaf, one in leaves:
                 name, numbers = f"{env_id}{way.__name__}{path}", (np.asarray(x, float) for x in (leaf, one))
                 np.testing.assert_allclose(*numbers, rtol=TOLERANCE, atol=TOLERANCE, err_msg=name)
-        # Of races, the rounds of resets are outside of the kernel, and gather the random words.
-        assert env_id in RACES or not has_gathers(env, mesh), f"{env_id}: the batch is gathered"
         print(env_id, "flown in", len(WAYS), "ways")
 
 

@@ -21,7 +21,6 @@ from flytrack_sysid.log_voltage import battery_of_craft, fitted_battery, flown_v
 from flytrack_sysid.parameters import DRAIN
 from flytrack_sysid.record import fill_gaps, make_record
 from flytrack_sysid.sensors import measure
-from tests.support.made_flight import TIME_S, flight
 from tests.support.written_logs import NUM_ROWS, SUFFIXES, columns_of, make_log, read_mapping, write
 
 FOUR_CELLS = (14.0, 16.8)
@@ -49,13 +48,12 @@ OPERATIONS = {
 }
 
 
-@pytest.mark.parametrize("origin", ["measured", "simulated", None])
 @pytest.mark.parametrize("operation", OPERATIONS)
-def test_what_is_stated_survives(operation, origin, tmp_path):
-    for voltages in (None, FOUR_CELLS):
-        log = replace(flight(TIME_S).without("v_bat"), origin=origin, stated_voltage_v=voltages)
-        found = OPERATIONS[operation](log, tmp_path)
-        assert (found.origin, found.stated_voltage_v) == (origin, voltages)
+def test_what_is_stated_survives(operation, truth, tmp_path):
+    for origin, voltages in (("measured", FOUR_CELLS), ("simulated", None), (None, FOUR_CELLS)):
+        log = replace(truth.without("v_bat"), origin=origin, stated_voltage_v=voltages)
+        result = OPERATIONS[operation](log, tmp_path)
+        assert (result.origin, result.stated_voltage_v) == (origin, voltages)
 
 
 def test_the_hash_is_of_the_rows_alone():
@@ -126,8 +124,8 @@ def test_contradictions_on_the_motion_are_noted(origin, of_model, requested, exp
         assert part in note
 
 
-def test_measured_logs_are_replayed_continuously():
-    log = replace(flight(TIME_S), origin="measured")
+def test_measured_logs_are_replayed_continuously(truth):
+    log = replace(truth, origin="measured")
     assert motion_of(log, NOMINAL) is Motion.CONTINUOUS
     assert what_is_fitted(log, NOMINAL)[0].motion is Motion.CONTINUOUS
     assert what_is_fitted(log, NOMINAL, motion=Motion.HANDOUT)[0].motion is Motion.HANDOUT
@@ -221,8 +219,8 @@ def test_validation_and_diagnosis_name_both_ranges(tmp_path):
 @pytest.mark.parametrize(
     ("battery", "drain", "sag_v"), [(Battery(), 0.2, 0.3), (Battery(4.2, 3.2, 3.2, 4.2), 0.1, 0.0525)]
 )
-def test_what_matters_is_a_share_of_the_battery(battery, drain, sag_v):
-    log = flight(TIME_S).without("v_bat")
+def test_what_matters_is_a_share_of_the_battery(battery, drain, sag_v, truth):
+    log = truth.without("v_bat")
     problem = split(log, NOMINAL._replace(battery=battery), None, Motion.CONTINUOUS).train
     for cause, field, size in (
         ("battery_drain", DRAIN, drain),
