@@ -54,6 +54,7 @@ class CheckpointError(ValueError):
 class _Description(msgspec.Struct):
     """What every checkpoint says."""
 
+    format: str
     env_id: str
     track: str
     missed_gate: str
@@ -249,43 +250,32 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         files = ", ".join(sorted(file.name for file in path.glob(f"*{SUFFIX}"))) or "there is none"
         raise CheckpointError(f"{path}: found a folder, expected a checkpoint file in it: {files}")
     try:
-        return _build(path, *_read_file(path))
-    except CheckpointError:
-        raise
-    except (TypeError, ValueError) as error:
-        raise CheckpointError(f"{path}: damaged description or parameters: {error_text(error)}") from error
-
-
-def _read_file(path: Path) -> tuple[dict[str, Any], Arrays]:
-    """Return the description and the arrays in a file, with the checksum verified."""
-    try:
         content = read_at_most(path, MAX_BYTES)
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read: {error_text(error)}") from error
     try:
-        size = int.from_bytes(content[:8], "little")
-        if size > MAX_HEADER_BYTES:
-            raise ValueError(f"found a header of {size} bytes, expected at most {MAX_HEADER_BYTES}")
-        arrays = safetensors.numpy.load(content)
-        header = json.loads(content[8 : 8 + size])["__metadata__"]
-        if checksum(header["meta"], arrays) != header["sha256"]:
-            raise ValueError("the checksum does not match the content")
-        meta = json.loads(header["meta"])
-        if not isinstance(meta, dict) or "format" not in meta:
-            raise ValueError("found no description")
+        return _decode(path, content)
+    except CheckpointError:
+        raise
     except (safetensors.SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{path}: not a checkpoint, or damaged: {error_text(error)}") from error
-    return meta, arrays
 
 
-def _build(path: Path, meta: dict[str, Any], arrays: Arrays) -> Checkpoint:
-    """Return the checkpoint of a file's description and arrays, checked against each other."""
-    if meta["format"] != FORMAT:
-        raise CheckpointError(f"{path}: format: found {quote_value(meta['format'])}, expected {FORMAT!r}")
-    config = read_config("config", meta.get("config")).check()
+def _decode(path: Path, content: bytes) -> Checkpoint:
+    """Return the checkpoint of a file's content, its parts checked against each other."""
+    size = int.from_bytes(content[:8], "little")
+    if size > MAX_HEADER_BYTES:
+        raise ValueError(f"found a header of {size} bytes, expected at most {MAX_HEADER_BYTES}")
+    arrays = safetensors.numpy.load(content)
+    header = json.loads(content[8 : 8 + size])["__metadata__"]
+    if checksum(header["meta"], arrays) != header["sha256"]:
+        raise ValueError("the checksum does not match the content")
+    meta = json.loads(header["meta"])
     description = convert("", meta, _Description)
-    size = description.observation_size
-    observation = jax.ShapeDtypeStruct((1, size), jnp.float32)
+    if description.format != FORMAT:
+        raise ValueError(f"format: found {quote_value(description.format)}, expected {FORMAT!r}")
+    config = read_config("config", meta["config"]).check()
+    observation = jax.ShapeDtypeStruct((1, description.observation_size), jnp.float32)
     target = jax.eval_shape(make_network(config).init, jax.random.key(0), observation)
     policy, training = (
         {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
@@ -293,10 +283,17 @@ def _build(path: Path, meta: dict[str, Any], arrays: Arrays) -> Checkpoint:
     )
     for name, array in policy.items():
         if not np.isfinite(array).all():
-            raise CheckpointError(f"{path}: {quote_name(name)}: found values that are not finite")
-    params = from_named_arrays(path, policy, target)
-    rest = (size, meta, training or None, path)
-    return Checkpoint(params, config, description.env_id, description.track, *rest)
+            raise ValueError(f"{quote_name(name)}: found values that are not finite")
+    return Checkpoint(
+        params=from_named_arrays(path, policy, target),
+        config=config,
+        env_id=description.env_id,
+        track=description.track,
+        observation_size=description.observation_size,
+        meta=meta,
+        training=training or None,
+        path=path,
+    )
 
 
 def step_file(steps: int) -> str:

@@ -84,15 +84,11 @@ class Tracker:
 
     def __init__(self, folder: Path, uri: str, name: str, description: dict[str, Any]):
         self._folder, self._name, self._description = folder, name, description
-        self._uri, self.run_id = uri, ""
         path = folder / RUN_FILE
-        if uri and path.exists():
-            known = json.loads(path.read_bytes())
-            has_moved = known["uri"].startswith(SQLITE) and not Path(known["uri"][len(SQLITE) :]).exists()
-            if uri in (LOCAL, known["uri"]):
-                self.run_id, self._uri = known["run_id"], LOCAL if has_moved else known["uri"]
-        if self._uri == LOCAL:
-            self._uri = local_uri(folder)
+        known = json.loads(path.read_bytes()) if path.exists() else {"uri": LOCAL, "run_id": ""}
+        is_known = uri in (LOCAL, known["uri"])
+        self._asked, self.run_id = (known["uri"], known["run_id"]) if is_known else (uri, "")
+        self._uri = local_uri(folder) if self._asked == LOCAL else self._asked
         self._client: Any = None
         self._last_step = -1  # that the store has
         self._pending: list[Record] = []
@@ -169,7 +165,7 @@ class Tracker:
         self.run_id = client.create_run(experiment_id, run_name=self._name).info.run_id
         params = [Param(*pair) for pair in describe_params(self._description).items()]
         client.log_batch(self.run_id, params=params)
-        content = json.dumps({"uri": self._uri, "run_id": self.run_id})
+        content = json.dumps({"uri": self._asked, "run_id": self.run_id})
         write_atomically(self._folder / RUN_FILE, content.encode())
 
     def _send(self, records: list[Record]) -> None:

@@ -195,9 +195,8 @@ class Trainer:
         options = convert("options", msgspec.to_builtins(options), Options)
         start = files.newest_intact(resume) if isinstance(resume, Path) else resume
         description = files.describe_run(self.env, self.env_id, self.track, self.config, seed)
-        self._check(out, start, description)
         with locked_folder(out):
-            self._check(out, start, description)  # another process may have written meanwhile
+            self._check(out, start, description)
             if start is not None and start.path == out / files.FINAL:
                 if start.steps == self.config.num_updates * self.config.batch_size:
                     return start, {}

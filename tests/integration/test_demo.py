@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
-from baselines.purejaxrl_ppo.monitor import count_positions, draw_position_density
+from baselines.purejaxrl_ppo import monitor
 from flytrack.cli import main
 from flytrack_env import load_model, load_track
 
@@ -31,11 +32,11 @@ def test_demo_writes_everything(tmp_path: Path) -> None:
         main(arguments)  # it does not overwrite a run
 
 
-def test_density_counts_positions_in_bins(tmp_path: Path) -> None:
-    positions = np.array([[10.02, 10.03, 1.0]] * 50 + [[10.02, 10.13, 2.0]] * 7 + [[1e3, 0.0, 1.0]])
-    density, x_edges, y_edges = count_positions(positions, load_track("flytrack"))
-    assert np.allclose(np.diff(x_edges), 0.1) and np.allclose(np.diff(y_edges), 0.1)
-    column, row = np.searchsorted(x_edges, 10.02) - 1, np.searchsorted(y_edges, 10.03) - 1
-    assert (density[column, row], density[column, row + 1], density.sum()) == (50, 7, 57)
-    draw_position_density(tmp_path / "density.png", positions, load_track("flytrack"), 4)
-    assert (tmp_path / "density.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+def test_density_is_time_per_flight_in_bins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    figures: list[Figure] = []
+    monkeypatch.setattr(monitor, "png_of", lambda figure, dpi: figures.append(figure) or b"png")
+    positions = np.array([[10.02, 10.03, 1.0]] * 40 + [[10.02, 10.13, 2.0]] * 8 + [[1e3, 0.0, 1.0]])
+    monitor.draw_position_density(tmp_path / "density.png", positions, load_track("flytrack"), 4)
+    assert (tmp_path / "density.png").read_bytes() == b"png"
+    times_ms = figures[0].axes[0].collections[0].get_array().compressed()
+    assert sorted(times_ms) == pytest.approx([20.0, 100.0])
