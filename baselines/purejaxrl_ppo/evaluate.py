@@ -9,8 +9,6 @@ import jax
 import numpy as np
 
 import flytrack_env
-from baselines.purejaxrl_ppo import flights as flying
-from baselines.purejaxrl_ppo import report as words
 from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint_env import (
     Plants,
@@ -20,7 +18,27 @@ from baselines.purejaxrl_ppo.checkpoint_env import (
     with_model_as_given,
 )
 from baselines.purejaxrl_ppo.config import OptionalInt, OptionalName, OptionalPath
-from baselines.purejaxrl_ppo.flights import CANNOT_RECORD, Outcomes, Rollout, can_record, record_flights
+from baselines.purejaxrl_ppo.flights import (
+    CANNOT_RECORD,
+    Outcomes,
+    Rollout,
+    can_record,
+    fly_episode,
+    outcomes_of,
+    race_many,
+    record_flights,
+    save_flight,
+    start_keys,
+    start_pose_params,
+)
+from baselines.purejaxrl_ppo.report import (
+    compare_with_optimum,
+    compute_time_lost,
+    describe_flight,
+    describe_report,
+    summarize,
+    summarize_plants,
+)
 from flytrack_env import EnvParams, blackbox
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.files import fresh_folder, write_atomically
@@ -119,15 +137,25 @@ def ghost_path(rollout: Path) -> Path:
 class Report:
     """An evaluation of a checkpoint, as settings ask for it.
 
-    env, params, plants, references: what is flown; plants None: a black box; references None: there are none.
-    rollout: the first flight step by step. numbers: as JSON values; docs/baseline.md describes each.
+    Args:
+        settings: what is flown and written.
+
+    Attributes:
+        env: that is flown in.
+        params: of the environment.
+        plants: that are flown; None: a black box.
+        references: time-optimal flights; None: there are none.
+        rollout: the first flight, step by step.
+        numbers: as JSON values; docs/baseline.md describes each.
+
+    Raises:
+        ValueError, OSError: settings or files that cannot be used; nothing is flown yet.
     """
 
     rollout: Rollout
     numbers: dict[str, Any]
 
     def __init__(self, settings: EvaluationSettings):
-        """Raise ValueError or OSError for settings or files that cannot be used; nothing is flown yet."""
         settings.check()
         self.settings, self.checkpoint = settings, load_checkpoint(settings.checkpoint)
         self.plants: Plants | None = None
@@ -157,21 +185,21 @@ class Report:
         num_laps = settings.num_laps or settings.steps
         if settings.is_single:
             one = jax.tree.map(lambda leaf: leaf[None], self.rollout)
-            return flying.outcomes_of(one, num_laps, len(self.env.track.gates))
+            return outcomes_of(one, num_laps, len(self.env.track.gates))
         models = None if plants is None else plants.repeated(settings.episodes)
         rest = (settings.steps, num_laps, self.params, models, ProgressBar("flights"))
-        return flying.race_many(self.env, self.checkpoint.policy, self._keys(), *rest)
+        return race_many(self.env, self.checkpoint.policy, self._keys(), *rest)
 
     def _keys(self) -> jax.Array:
-        return flying.start_keys(self.settings.seed, self.settings.episodes * (self.settings.plants or 1))
+        return start_keys(self.settings.seed, self.settings.episodes * (self.settings.plants or 1))
 
     def _fly_first(self, env: EpisodicEnvironment, params: EnvParams) -> Rollout:
         """Return the first flight of the evaluation in an environment."""
         settings = self.settings
         key = jax.random.key(settings.seed) if settings.is_single else self._keys()[0]
-        params = flying.start_pose_params(params, settings.steps)
+        params = start_pose_params(params, settings.steps)
         num_laps = settings.num_laps or settings.steps
-        return flying.fly_episode(env, self.checkpoint.policy, key, params, settings.steps, num_laps)
+        return fly_episode(env, self.checkpoint.policy, key, params, settings.steps, num_laps)
 
     def count(self, outcomes: Outcomes) -> None:
         """Set the numbers of the evaluation."""
@@ -188,7 +216,7 @@ class Report:
             "steps_limit": settings.steps,
             "laps": settings.num_laps,
             "episodes": settings.episodes,
-            **words.summarize(outcomes, is_limited=settings.num_laps is not None),
+            **summarize(outcomes, is_limited=settings.num_laps is not None),
             "plants": None,
             "optimal": None,
             "time_lost_s": None,
@@ -203,12 +231,12 @@ class Report:
             is_complete = outcomes.is_complete().reshape(-1, settings.episodes)
             if settings.episodes > 1:  # flights of one plant are not independent
                 numbers["success"] |= {"low": None, "high": None}
-            numbers["plants"] = words.summarize_plants(plants.drawn, is_complete)
+            numbers["plants"] = summarize_plants(plants.drawn, is_complete)
         if references is not None:
-            numbers["optimal"] = words.compare_with_optimum(numbers, references)
+            numbers["optimal"] = compare_with_optimum(numbers, references)
             if settings.ghost:
                 gate_ids = [gate.id for gate in self.env.track.gates]
-                numbers["time_lost_s"] = words.compute_time_lost(outcomes, references, gate_ids)
+                numbers["time_lost_s"] = compute_time_lost(outcomes, references, gate_ids)
         self.numbers = numbers
 
     @property
@@ -216,9 +244,9 @@ class Report:
         """The report for a terminal."""
         settings, text = self.settings, ""
         if settings.is_single:
-            text += words.describe_flight(self.numbers["first_flight"], float(self.params.dt))
+            text += describe_flight(self.numbers["first_flight"], float(self.params.dt))
         if settings.num_laps is not None or settings.ghost:
-            text += words.describe_report(self.numbers)
+            text += describe_report(self.numbers)
         return text
 
     def write(self) -> list[str]:
@@ -229,7 +257,7 @@ class Report:
         """
         settings, ghost = self.settings, None
         rollout = settings.out or fresh_folder(DEFAULT_OUT) / "rollout.npy"
-        flying.save_flight(rollout, self.rollout)
+        save_flight(rollout, self.rollout)
         lines = [f"rollout: {rollout}"]
         if settings.ghost and self.references is not None:
             ghost = ghost_path(rollout)
@@ -250,7 +278,11 @@ class Report:
         """Write a Rerun recording of the first flight, and return the names of the flights in it.
 
         Beside it is the flight from the same start in the simulator with the model that the policy was
-        trained on: it shows what that simulator gets wrong. with_ghost: the time-optimal flight as well.
+        trained on: it shows what that simulator gets wrong.
+
+        Args:
+            path: of the recording.
+            with_ghost: whether the time-optimal flight is in it as well.
         """
         flights = {"black box" if self.plants is None else "first plant": self.rollout}
         if "model" in self.checkpoint.meta:

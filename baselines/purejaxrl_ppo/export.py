@@ -72,12 +72,19 @@ SENTENCES = {
 class ExportedPolicy(NamedTuple):
     """A policy as arrays, float64, and what its files say about it.
 
-    centres: (gates, 3), world, m. frames: (gates, 3, 3), rows forward, left, up, world. free: (gates,), m,
-    half of the opening less the drone's radius. next_rows: (gates, 6), the observation of the gate after.
-    offsets, factors, limits: (23,), of the rows before these: clip((quantity - offset) * factor, +-limit).
-    past: the entries of earlier actions, behind them. layers: kernel (inputs, outputs) and bias, tanh
-    between. blend: (4,), how much of the way to the command the lags of the checkpoint's model go in a step.
-    about: sentences. meanings: of inputs and output, by name.
+    Attributes:
+        centres: of the gates, world, (num_gates, 3), m.
+        frames: of the gates, rows forward, left, up, world, (num_gates, 3, 3).
+        free: half of the opening less the drone's radius, (num_gates,), m.
+        next_rows: rows of the observation about the gate after the next, (num_gates, 6).
+        offsets: of the rows before these, (23,): clip((quantity - offset) * factor, -limit, limit).
+        factors: as ``offsets``.
+        limits: as ``offsets``.
+        past: entries of earlier actions, behind ``next_rows``.
+        layers: kernel (num_inputs, num_outputs) and bias; tanh between layers.
+        blend: share of the way to the command that the lags of the checkpoint's model go in a step, (4,).
+        about: sentences about the policy.
+        meanings: of inputs and output, by name.
     """
 
     centres: np.ndarray

@@ -32,10 +32,17 @@ BATCH = 1024  # flights side by side: more exceed a core's cache, fewer leave it
 class Rollout(NamedTuple):
     """One episode; leaves (num_steps, ...), or (num_episodes, num_steps, ...) for many.
 
-    states: (21,) before the step. actions: (4,), clipped as commanded. is_flying: whether the step was
-    flown; what follows the end is padding. gates_passed, laps, lap_completed, lap_time_s: after the
-    step. gate_time_s: of the gate passed in the step, s since the reset, interpolated; 0 without one, of the
-    first where two are passed in one step. causes: of termination, in the step that ended the episode.
+    Attributes:
+        states: before the step, (21,).
+        actions: clipped as commanded, (4,).
+        is_flying: whether the step was flown; what follows the end is padding.
+        gates_passed: number, after the step.
+        laps: number, after the step.
+        lap_completed: whether the step completed a lap.
+        lap_time_s: of that lap.
+        gate_time_s: when the step passed a gate, s since the reset, interpolated; 0 without one, of the first
+            where two are passed in one step.
+        causes: of termination, in the step that ended the episode.
     """
 
     states: jax.Array
@@ -67,9 +74,13 @@ class Rollout(NamedTuple):
 class Outcomes(NamedTuple):
     """Outcomes of flights; leaves (num_flights, ...), or without the first axis for one.
 
-    steps: flown. gates_passed, laps: counts. lap_times_s: (num_laps,), the first from standstill.
-    gate_times_s: (num_laps * num_gates,), s since the reset. Both are NaN where not reached. causes: of
-    termination.
+    Attributes:
+        steps: number flown.
+        gates_passed: number.
+        laps: number completed.
+        lap_times_s: (num_laps,), the first from standstill; NaN where not reached.
+        gate_times_s: s since the reset, (num_laps * num_gates,); NaN where not reached.
+        causes: of termination.
     """
 
     steps: Any
@@ -104,8 +115,11 @@ class Outcomes(NamedTuple):
 class Score(NamedTuple):
     """Score of many episodes.
 
-    success: share that completed the laps. gates: mean number passed. first_lap_s, flying_lap_s: mean
-    time of the first lap, from standstill, and of the later ones; NaN where there was none.
+    Attributes:
+        success: share that completed the laps.
+        gates: mean number passed.
+        first_lap_s: mean time of the first lap, from standstill; NaN where there was none.
+        flying_lap_s: mean time of the later laps; NaN where there was none.
     """
 
     success: float
@@ -138,7 +152,12 @@ def record_flights(
 ) -> None:
     """Write flights by name on one timeline as a Rerun recording; the first is in the foreground.
 
-    num_laps: laps to complete, if limited. references: the time-optimal flights of the track, shown as ghost.
+    Args:
+        path: of the recording.
+        flights: by name.
+        track: that is shown.
+        num_laps: laps to complete, if limited.
+        references: the time-optimal flights of the track, shown as ghost.
 
     Raises:
         ImportError: Rerun is not installed; the message says how to install it.
@@ -181,10 +200,10 @@ Step = Callable[..., tuple[Any, ...]]
 
 
 def make_step(env: EpisodicEnvironment, policy: Policy, params: EnvParams, num_laps: Any) -> Step:
-    """Return ``step(memory, observation, state, index)``: one step of the mean action.
+    """Return one step of the mean action as a function ``step(memory, observation, state, index)``.
 
-    It returns the next memory, observation and state, whether the flight is over, and the step as a
-    ``Rollout`` without its axis of steps. index: of the step, from 0.
+    ``index`` counts steps from 0. The function returns the next memory, observation and state, whether the
+    flight is over, and the step as a ``Rollout`` without its axis of steps.
     """
 
     def step(memory: Memory, observation: jax.Array, state: Any, index: jax.Array) -> tuple[Any, ...]:
@@ -345,9 +364,16 @@ def race_many(
 ) -> Outcomes:
     """Return the outcomes of flights from noisy start poses, one per key, as NumPy arrays.
 
-    num_steps: time limit of each. params: of the environment, its default if None. models: a simulated
-    drone for each flight, leaves (num_flights, ...); None: that of the parameters, or a black box. report:
-    called with the flights flown and all of them.
+    Args:
+        env: that is flown in.
+        policy: whose mean action flies.
+        keys: of the flights, (num_flights,).
+        num_steps: time limit of a flight.
+        num_laps: laps to complete.
+        params: of the environment, its default if None.
+        models: a simulated drone for each flight, leaves (num_flights, ...); None: that of the parameters, or
+            a black box.
+        report: called with the number of flights flown and of all.
     """
     params = start_pose_params(env.default_params if params is None else params, num_steps)
     num_flights = len(keys)

@@ -12,7 +12,8 @@ NOT_PER_EPISODE = ("done", "last_return", "lap_time_s")  # a lap time is zero at
 def summarize_episodes(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
     """Return how many episodes ended in an update, and means over them, 0 if none did.
 
-    ``log`` holds (num_steps, num_envs) arrays: done, episode_return and the environment's info.
+    Args:
+        log: (num_steps, num_envs) arrays: done, episode_return and the environment's info.
     """
     done = log["done"]
     num_ended = done.sum()
@@ -25,9 +26,11 @@ def summarize_episodes(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
 
 
 def summarize_race(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """Return laps and mean gate distance of an update; nothing for an environment without a race.
+    """Return metrics of the race in an update; nothing for an environment without a race.
 
-    laps_completed: their number. lap_time_s: mean, 0 without a lap. gate_distance_m: mean over all steps.
+    Returns:
+        ``laps_completed``: number. ``lap_time_s``: mean, 0 without a lap. ``gate_distance_m``: mean over all
+        steps.
     """
     if "lap_completed" not in log:
         return {}
@@ -41,10 +44,13 @@ def summarize_race(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
 
 
 def summarize_updates(metrics: dict[str, np.ndarray]) -> dict[str, float]:
-    """Return one value per metric, each (num_updates,), over several updates.
+    """Return one value per metric for several updates.
 
-    Means over nothing are left out. Means per episode are weighted by episodes, lap
-    times by laps; counts are summed.
+    Counts are summed; means per episode are weighted by episodes, and lap times by laps. Means over nothing
+    are left out.
+
+    Args:
+        metrics: by name, (num_updates,) each.
     """
     summary = {}
     for name, values in metrics.items():

@@ -18,7 +18,8 @@ Memory = Any  # what a policy remembers of an episode, a pytree; () of one that 
 class _Gru(nn.Module):
     """A gated recurrent unit over steps that forgets where an episode ends (K. Cho et al., arXiv 1406.1078).
 
-    size: of its memory.
+    Attributes:
+        size: of its memory.
     """
 
     size: int
@@ -34,8 +35,10 @@ class _Gru(nn.Module):
 class ActorCritic(nn.Module):
     """Policy and value of what is known: an observation, and what is remembered of the episode, if anything.
 
-    hidden_sizes, initial_action, initial_std, min_std, memory_size: as in ``Config``. num_choices: number of
-    discrete actions; 0 for continuous ones.
+    The attributes are the fields of ``Config`` of the same names.
+
+    Attributes:
+        num_choices: number of discrete actions; 0 for continuous ones.
     """
 
     hidden_sizes: Sequence[int]
@@ -100,8 +103,10 @@ class ActorCritic(nn.Module):
     ) -> tuple[distrax.Distribution, jax.Array]:
         """Return policy and value of steps: in any order, or with a memory in their order.
 
-        memory: (num_envs, num_steps, memory_size), of which the first counts. observation, done: (num_envs,
-        num_steps, ...) then. done: an episode ends after it.
+        Args:
+            memory: (num_envs, num_steps, memory_size), of which that of the first step counts; or ().
+            observation: (num_envs, num_steps, size) with a memory, else (num_rows, size).
+            done: whether an episode ends after the step, (num_envs, num_steps).
         """
         if self.memory_size:
             remembered = self.gru(memory[:, 0], (observation, done))[1]

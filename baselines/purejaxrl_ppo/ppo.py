@@ -37,10 +37,7 @@ Metrics = dict[str, jax.Array]
 
 
 class Batch(NamedTuple):
-    """One update's experience; leaves (num_steps, num_envs, ...).
-
-    memory: before the step.
-    """
+    """One update's experience; leaves (num_steps, num_envs, ...); memory and observation before the step."""
 
     memory: Memory
     observation: jax.Array
@@ -52,7 +49,13 @@ class Batch(NamedTuple):
 
 
 class Episodes(NamedTuple):
-    """Every environment's episode, (num_envs,): return and length so far, return of the last that ended."""
+    """Every environment's episode.
+
+    Attributes:
+        so_far: return so far, (num_envs,).
+        length: number of steps so far, (num_envs,).
+        last_return: return of the last episode that ended, (num_envs,).
+    """
 
     so_far: jax.Array
     length: jax.Array
@@ -73,8 +76,9 @@ class Runner(NamedTuple):
 class Algorithm(NamedTuple):
     """PPO on one environment, as two functions to be jitted.
 
-    start: key -> runner, before the first update. update: runner -> (runner, metrics), one update; metrics
-    are scalars.
+    Attributes:
+        start: key -> runner, before the first update.
+        update: runner -> (runner, metrics), one update; metrics are scalars.
     """
 
     start: Callable[[jax.Array], Runner]
