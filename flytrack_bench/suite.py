@@ -4,7 +4,9 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from flytrack_bench.hidden import HiddenPlant, Truth
 from flytrack_env import Track, TrackError, load_track
@@ -12,10 +14,12 @@ from flytrack_env.files import read_at_most
 from flytrack_env.messages import error_text
 from flytrack_env.plants import Plant, Simulator
 from flytrack_env.references import track_digest
+from flytrack_env.validation import Fields, Positive, Text, convert
 
 FOLDER = Path(__file__).parent / "suites"
 MOST_BYTES = 2**20
 CRAFT_FIELDS = ("tau", "coeffs", "max_rate", "drain", "mass", "gravity", "effects")
+Count = Annotated[int, Meta(ge=0)]
 
 
 class SuiteError(ValueError):
@@ -83,27 +87,43 @@ def load_suite(name_or_path: str | Path) -> Suite:
             raise SuiteError(f"suite: found {str(name_or_path)!r}, expected {expected}")
     try:
         content = json.loads(read_at_most(path, MOST_BYTES))
-        if digest_of(content) != content["digest"]:
-            raise ValueError("digest: does not belong to the content, so that the file was changed")
-        tasks = tuple(_task(path, one) for one in content["tasks"])
-        numbers = {name: int(content[name]) for name in ("seed", "starts", "laps", "steps")}
-        return Suite(content["name"], content["digest"], tasks=tasks, **numbers)
     except OSError as error:
         raise SuiteError(f"{path}: cannot be read: {error_text(error)}") from error
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
-        raise SuiteError(f"{path}: not a suite, or changed: {error_text(error)}") from error
+    except (ValueError, RecursionError) as error:
+        raise SuiteError(f"{path}: not a suite: {error_text(error)}") from error
+    file = convert(str(path), content, _SuiteFile, SuiteError)
+    if digest_of(content) != file.digest:
+        raise SuiteError(f"{path}: digest: does not belong to the content, so that the file was changed")
+    tasks = tuple(_task(path, task) for task in file.tasks)
+    return Suite(file.name, file.digest, file.seed, file.starts, file.laps, file.steps, tasks)
 
 
-def _task(path: Path, one: dict[str, Any]) -> Task:
-    name = one["track"]
-    track = load_track(path.parent / name if name.endswith(".toml") else name)
-    if track_digest(track) != one["track_sha256"]:
-        raise TrackError(f"{name}: the track was changed")
-    numbers: Any = one["craft"]
-    if numbers is not None:
-        numbers = {name: tuple(v) if isinstance(v, list) else v for name, v in numbers.items()}
-    craft = None if numbers is None else Truth(**numbers)
-    return Task(one["id"], track, craft, float(one["optimal_lap_s"]))
+class _TaskFields(Fields):
+    id: Text
+    track: Text
+    track_sha256: Text
+    craft: Truth | None
+    optimal_lap_s: Positive
+
+
+class _SuiteFile(Fields):
+    name: Text
+    digest: Text
+    seed: Count
+    starts: Count
+    laps: Count
+    steps: Count
+    tasks: tuple[_TaskFields, ...]
+
+
+def _task(path: Path, task: _TaskFields) -> Task:
+    try:
+        track = load_track(path.parent / task.track if task.track.endswith(".toml") else task.track)
+    except TrackError as error:
+        raise SuiteError(f"{path}: {error}") from error
+    if track_digest(track) != task.track_sha256:
+        raise SuiteError(f"{path}: {task.track}: the track was changed")
+    return Task(task.id, track, task.craft, task.optimal_lap_s)
 
 
 def craft_as_json(craft: Truth) -> dict[str, Any]:

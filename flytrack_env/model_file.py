@@ -2,11 +2,12 @@
 
 import json
 import warnings
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from flytrack_env import effects
 from flytrack_env.battery import Battery, BatteryWarning
@@ -14,9 +15,9 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.files import read_at_most, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.motion import Motion
+from flytrack_env.validation import Fields, convert
 
 MODEL_FILE_VERSION = 1
-SIZES = {"tau": 4, "thrust_coeffs": 6, "max_rate": 3, "m": 0, "g": 0, "battery_drain_v_per_min": 0}
 UNITS = {
     "tau": "s",
     "thrust_coeffs": "N, N, N, N, N/V, N/V",
@@ -26,17 +27,12 @@ UNITS = {
     "battery_drain_v_per_min": "V/min",
 }
 LARGEST_BYTES = 4 * 2**20
-LARGEST = float(np.finfo(np.float32).max)
 BATTERY = "battery"
-MUST_BE_POSITIVE = ("tau", "max_rate", "m")
+BESIDE = ("effects", "motion", BATTERY)  # parameters, or among them
 
 
 class ModelFileError(ValueError):
     """A model file that cannot be used; the message names file, field, what was found and expected."""
-
-
-def _is_number(value: Any, low: float = -LARGEST, high: float = LARGEST) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high
 
 
 def _object(where: str, value: Any) -> dict[str, Any]:
@@ -46,66 +42,66 @@ def _object(where: str, value: Any) -> dict[str, Any]:
     return value
 
 
-def _known(where: str, name: str, names: Iterable[str]) -> str:
-    """Return a name that must be one of some; raises ModelFileError."""
-    if name not in names:
-        raise ModelFileError(f"{where}: {quote_name(name)}: unknown; expected one of {', '.join(names)}")
-    return name
+LARGEST = float(np.finfo(np.float32).max)
+Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+Above0 = Annotated[float, Meta(gt=1e-45, le=LARGEST)]  # what is smaller is 0 in float32
 
 
-def _read_field(path: Path, name: str, value: Any, dtype: Any) -> Any:
-    size = SIZES[name]
-    values = value if isinstance(value, list) else [value]
-    is_right_shape = isinstance(value, list) == (size > 0) and len(values) == max(size, 1)
-    if not is_right_shape or not all(map(_is_number, values)):
-        expected = f"{size} finite numbers" if size else "a finite number"
-        raise ModelFileError(f"{path}: {name}: found {quote_value(value)}, expected {expected} (float32)")
-    if name in MUST_BE_POSITIVE and min(map(np.float32, values)) <= 0.0:  # 1e-50 is 0 in float32
-        raise ModelFileError(f"{path}: {name}: found {quote_value(value)}, expected > 0")
-    return np.array(value, dtype) if size else float(value)
+class _BatteryFields(Fields):
+    full_v: Number = float(Battery().full_v)
+    empty_v: Number = float(Battery().empty_v)
+    fitted_low_v: Number | None = None
+    fitted_high_v: Number | None = None
+
+    def battery(self) -> Battery:
+        """Return the battery, by default fitted over its whole range; raises ValueError."""
+        low_v = self.empty_v if self.fitted_low_v is None else self.fitted_low_v
+        high_v = self.full_v if self.fitted_high_v is None else self.fitted_high_v
+        battery = Battery(self.full_v, self.empty_v, low_v, high_v)
+        battery.check()
+        return battery
 
 
-def _read_effect(path: Path, name: str, values: Any) -> Any:
+class _ModelFields(Fields):
+    tau: tuple[Above0, Above0, Above0, Above0]
+    thrust_coeffs: tuple[Number, Number, Number, Number, Number, Number]
+    max_rate: tuple[Above0, Above0, Above0]
+    m: Above0
+    g: Number
+    battery_drain_v_per_min: Number
+    effects: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
+    motion: Motion = Motion.HANDOUT
+    battery: _BatteryFields = msgspec.field(default_factory=_BatteryFields)
+
+
+def _read_effect(source: str, name: str, values: dict[str, Any]) -> Any:
     """Return the parameters of one effect; those that are not in the file are neutral."""
+    field = f"effects.{name}"
     if name == "learned_residual":
         raise ModelFileError(
-            f"{path}: effects: learned_residual: networks are no longer part of a model, expected other "
-            "effects only; diagnose the log again"
+            f"{source}: {field}: networks are no longer part of a model, expected other effects only; "
+            "diagnose the log again"
         )
-    effect = effects.BY_NAME[_known(f"{path}: effects", name, effects.BY_NAME)]
-    where, static = f"{path}: effects: {name}", {}
-    values = dict(_object(where, values))
-    if effect.static and effect.static in values and effect.read is not None:
+    if name not in effects.BY_NAME:
+        known = ", ".join(effects.BY_NAME)
+        raise ModelFileError(f"{source}: effects.{quote_name(name)}: unknown; expected one of {known}")
+    effect = effects.BY_NAME[name]
+    kinds: dict[str, Any] = {
+        parameter: Annotated[float, Meta(ge=bounds.low, le=bounds.high)]
+        for parameter, bounds in effect.ranges.items()
+    }
+    if effect.static:
+        kinds[effect.static] = Any
+    neutral = effect.parameters()._asdict()
+    members = [(parameter, kind, neutral[parameter]) for parameter, kind in kinds.items()]
+    fields = convert(source, values, msgspec.defstruct(name, members, bases=(Fields,)), ModelFileError, field)
+    found = msgspec.structs.asdict(fields)
+    if effect.static in values and effect.read is not None:
         try:
-            static[effect.static] = effect.read(values.pop(effect.static))
+            found[effect.static] = effect.read(values[effect.static])
         except ValueError as error:
-            raise ModelFileError(f"{where}: {error}") from error
-    for field, value in values.items():
-        bounds = effect.ranges[_known(where, field, effect.ranges)]
-        if not _is_number(value, bounds.low, bounds.high):
-            expected = f"{bounds.low:g} to {bounds.high:g} {bounds.unit}"
-            raise ModelFileError(f"{where}: {field}: found {quote_value(value)}, expected {expected}")
-    return effect.parameters(**{field: float(value) for field, value in values.items()}, **static)
-
-
-def _read_battery(path: Path, value: Any) -> Battery:
-    """Return a battery; voltages that are not in the file are the handout's, or those of the battery."""
-    where = f"{path}: {BATTERY}"
-    values = _object(where, value)
-    for name, volts in values.items():
-        _known(where, name, Battery._fields)
-        if not _is_number(volts):
-            raise ModelFileError(f"{where}: {name}: found {quote_value(volts)}, expected a voltage")
-    battery = Battery(**{name: float(volts) for name, volts in values.items()})
-    battery = battery._replace(
-        fitted_low_v=values.get("fitted_low_v", battery.empty_v),
-        fitted_high_v=values.get("fitted_high_v", battery.full_v),
-    )
-    try:
-        battery.check()
-    except ValueError as error:
-        raise ModelFileError(f"{path}: {error}") from error
-    return battery
+            raise ModelFileError(f"{source}: {field}.{error}") from error
+    return effect.parameters(**found)
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -159,22 +155,28 @@ def model_from_json(data: dict[str, Any], path: str | Path, dtype: Any = np.floa
             f"{path}: version: found {quote_value(version)}, expected {MODEL_FILE_VERSION}{why}"
         )
     values = _object(f"{path}: parameters", data.get("parameters", data))
-    if not SIZES.keys() & values.keys():
+    if not UNITS.keys() & values.keys():
         fields = ", ".join(map(quote_name, [*data][:4])) or "nothing"
         expected = "a model file, as `flytrack fit` and `flytrack diagnose` write it"
         raise ModelFileError(f"{path}: found other JSON ({fields}), expected {expected}")
-    for name in SIZES:
-        if name not in values:
-            raise ModelFileError(f"{path}: {name}: missing")
-    for name in values:
-        _known(str(path), name, (*SIZES, "effects", "motion", BATTERY, "version"))
-    by_name = _object(f"{path}: effects", data.get("effects", values.get("effects", {})))
-    motion = data.get("motion", values.get("motion", Motion.HANDOUT.value))
-    motion = Motion(_known(f"{path}: motion", motion, [one.value for one in Motion]))
-    read = {name: _read_field(path, name, values[name], dtype) for name in SIZES}
-    battery = _read_battery(path, data.get(BATTERY, values.get(BATTERY, {})))
-    base = ModelParameters(**read, motion=motion, battery=battery)
-    return base.with_effects(*(_read_effect(path, name, by_name[name]) for name in by_name))
+    beside = {name: data[name] for name in BESIDE if name in data}
+    content = {name: value for name, value in {**values, **beside}.items() if name != "version"}
+    file = convert(str(path), content, _ModelFields, ModelFileError)
+    try:
+        battery = file.battery.battery()
+    except ValueError as error:
+        raise ModelFileError(f"{path}: {error}") from error
+    base = ModelParameters(
+        tau=np.array(file.tau, dtype),
+        thrust_coeffs=np.array(file.thrust_coeffs, dtype),
+        max_rate=np.array(file.max_rate, dtype),
+        m=file.m,
+        g=file.g,
+        battery_drain_v_per_min=file.battery_drain_v_per_min,
+        motion=file.motion,
+        battery=battery,
+    )
+    return base.with_effects(*(_read_effect(str(path), *item) for item in file.effects.items()))
 
 
 def load_provenance(path: str | Path) -> dict[str, Any]:
@@ -194,7 +196,7 @@ def model_as_json(model: ModelParameters) -> dict[str, Any]:
         for name in by_name
     }
     return {
-        "parameters": {name: np.asarray(getattr(model, name), float).tolist() for name in SIZES},
+        "parameters": {name: np.asarray(getattr(model, name), float).tolist() for name in UNITS},
         "effects": {name: _effect_as_json(name, parameters) for name, parameters in by_name.items()},
         "units": {**UNITS, **effect_units},
         "motion": model.motion.value,

@@ -6,22 +6,23 @@ tables below. A law is a static part of a model: what is compiled computes its t
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from flytrack_env.effects.base import StepContext
-from flytrack_env.messages import quote_value
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Action
+from flytrack_env.validation import Fields, choose, convert
 
 TINY_SPEED = 0.3  # m/s: slower flight has no direction
 MOST_TERMS, MOST_FACTORS = 6, 2
-ACTS, FRAMES = ("force", "rate"), ("body", "world", "air")
 LARGEST = 1e6  # of any number in a law
 XYZ = 3
 
@@ -157,6 +158,7 @@ class Shape(NamedTuple):
 
 
 SCALARS = tuple(QUANTITIES)
+ORDERS = (1.0, 2.0, 3.0, 4.0)  # of waves
 EXPONENTS = (-2.0, -1.0, 0.5, 1.0, 1.5, 2.0, 3.0)
 SHAPES: dict[str, Shape] = {
     "power": Shape(("exponent", "offset"), "({q} + {offset})^{exponent}", SCALARS, _power),
@@ -305,76 +307,48 @@ def law_from_json(values: Any) -> Law:
         ValueError: what is not in the grammar, numbers that are not finite, a pole within the envelope; the
             message begins with the field.
     """
-    listed_terms = listed("terms", values, MOST_TERMS)
-    return Law(tuple(_term(f"terms[{place}]", one) for place, one in enumerate(listed_terms)))
+    kind = Annotated[tuple[_TermFields, ...], Meta(min_length=1, max_length=MOST_TERMS)]
+    terms = convert("", values, kind, field="law")
+    return Law(tuple(_term(f"law[{index}]", term) for index, term in enumerate(terms)))
 
 
-def listed(where: str, value: Any, most: int) -> list[Any]:
-    """Return a value that must be a list of 1 to ``most``; where: the field, for the ValueError."""
-    if not isinstance(value, list) or not 1 <= len(value) <= most:
-        raise ValueError(f"{where}: found {quote_value(value)}, expected a list of 1 to {most}")
-    return value
+Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+StandardError = Annotated[float, Meta(ge=0.0, le=LARGEST)]
 
 
-def fields_of(where: str, value: Any, names: tuple[str, ...]) -> Mapping[str, Any]:
-    """Return a value that must be an object with exactly these fields."""
-    if not isinstance(value, dict) or set(value) != set(names):
-        found = sorted(value) if isinstance(value, dict) else value
-        raise ValueError(f"{where}: found {quote_value(found)}, expected exactly {', '.join(names)}")
-    return value
+class _TermFields(Fields):
+    acts: Literal["force", "rate"]
+    frame: Literal["body", "world", "air"]
+    coefficients: tuple[Number, Number, Number]
+    standard_errors: tuple[StandardError, StandardError, StandardError]
+    factors: Annotated[tuple[dict[str, Any], ...], Meta(min_length=1, max_length=MOST_FACTORS)]
+
+    def __post_init__(self) -> None:
+        if self.frame == "air" and any(self.coefficients[1:]):
+            raise ValueError(
+                f"coefficients: found {self.coefficients}, expected only the first in the frame air"
+            )
 
 
-def chosen(where: str, value: Any, choices: Any) -> str:
-    """Return a value that must be one of some names."""
-    if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{where}: found {quote_value(value)}, expected one of {', '.join(choices)}")
-    return value
+def _term(where: str, term: _TermFields) -> Term:
+    factors = (_factor(f"{where}.factors[{index}]", value) for index, value in enumerate(term.factors))
+    return Term(term.acts, term.frame, tuple(factors), term.coefficients, term.standard_errors)
 
 
-def number(where: str, value: Any) -> float:
-    """Return a value that must be a finite number of at most LARGEST."""
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not is_number or not abs(value) <= LARGEST:
-        raise ValueError(f"{where}: found {quote_value(value)}, expected a number of at most {LARGEST:g}")
-    return float(value)
-
-
-def _term(where: str, value: Any) -> Term:
-    names = ("acts", "frame", "coefficients", "standard_errors", "factors")
-    fields = fields_of(where, value, names)
-    numbers = []
-    for name in ("coefficients", "standard_errors"):
-        own = listed(f"{where}.{name}", fields[name], XYZ)
-        if len(own) != XYZ:
-            raise ValueError(f"{where}.{name}: found {len(own)} numbers, expected {XYZ}")
-        numbers.append(tuple(number(f"{where}.{name}", one) for one in own))
-    if min(numbers[1]) < 0.0:
-        raise ValueError(f"{where}.standard_errors: found {quote_value(numbers[1])}, expected 0 or more")
-    frame = chosen(f"{where}.frame", fields["frame"], FRAMES)
-    if frame == "air" and any(numbers[0][1:]):
-        raise ValueError(
-            f"{where}.coefficients: found {numbers[0]}, expected only the first in the frame air"
-        )
-    listed_factors = listed(f"{where}.factors", fields["factors"], MOST_FACTORS)
-    factors = tuple(_factor(f"{where}.factors[{place}]", one) for place, one in enumerate(listed_factors))
-    return Term(chosen(f"{where}.acts", fields["acts"], ACTS), frame, factors, *numbers)
-
-
-def _factor(where: str, value: Any) -> Factor:
-    name = chosen(f"{where}.shape", value.get("shape") if isinstance(value, dict) else value, SHAPES)
+def _factor(where: str, value: dict[str, Any]) -> Factor:
+    name = choose(f"{where}.shape", value.get("shape"), SHAPES)
     shape = SHAPES[name]
-    fields = fields_of(where, value, ("quantity", "shape", *shape.numbers))
-    quantity = chosen(f"{where}.quantity", fields["quantity"], shape.quantities)
-    numbers = tuple(number(f"{where}.{one}", fields[one]) for one in shape.numbers)
-    by_name = dict(zip(shape.numbers, numbers, strict=True))
-    for one in shape.positive:
-        if not by_name[one] > 0.0:
-            raise ValueError(f"{where}.{one}: found {by_name[one]:g}, expected more than 0")
-    if name == "wave" and by_name["order"] not in (1.0, 2.0, 3.0, 4.0):
-        raise ValueError(f"{where}.order: found {by_name['order']:g}, expected 1, 2, 3 or 4")
+    positive = Annotated[float, Meta(gt=0.0, le=LARGEST)]
+    numbers = [(number, positive if number in shape.positive else Number) for number in shape.numbers]
+    kind = msgspec.defstruct(name, [("quantity", str), ("shape", str), *numbers], bases=(Fields,))
+    fields = convert("", value, kind, field=where)
+    quantity = choose(f"{where}.quantity", value["quantity"], shape.quantities)
+    factor = Factor(quantity, name, tuple(getattr(fields, number) for number in shape.numbers))
+    if name == "wave" and factor.numbers[0] not in ORDERS:
+        raise ValueError(f"{where}.order: found {factor.numbers[0]:g}, expected 1, 2, 3 or 4")
     if name == "power":
-        _check_power(where, quantity, by_name["exponent"], by_name["offset"])
-    return Factor(quantity, name, numbers)
+        _check_power(where, quantity, *factor.numbers)
+    return factor
 
 
 def _check_power(where: str, quantity: str, exponent: float, offset: float) -> None:

@@ -8,13 +8,15 @@ import dataclasses
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
 import numpy as np
+from msgspec import Meta
 
 from flytrack_env.files import write_atomically
-from flytrack_env.messages import error_text, quote_name, quote_value
+from flytrack_env.messages import error_text
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
+from flytrack_env.validation import Fields, Finite, Text, convert
 
 TRACK_FOLDER = Path(__file__).parent
 DIRECTIONS = {"+y": 1.0, "-y": -1.0}
@@ -25,7 +27,7 @@ LARGEST = 1e6  # m: beyond that, float32 positions are coarser than a drone
 
 
 class TrackError(ValueError):
-    """A track that cannot be flown; the message names file, line, field and reason."""
+    """A track that cannot be flown; the message names file, field, what was found and expected."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,8 +75,7 @@ def load_track(name_or_path: str | Path) -> Track:
     """Return a shipped track by name, or the track in a ``.toml`` file by path.
 
     Raises:
-        TrackError: unknown name, missing file, or a file that cannot be flown (with line, field
-            and reason).
+        TrackError: unknown name, missing file, or a file that cannot be flown.
     """
     path = Path(name_or_path)
     if path.suffix != ".toml":
@@ -147,110 +148,73 @@ def _parse(path: Path, text: str) -> Track:
         data = parse_toml(text)
     except TomlError as error:
         raise TrackError(f"{path}: not a TOML file: {error_text(error)}") from error
-    file = _Table(path, text.splitlines(), data, "", {"name", "start", "bounds", "gates"})
-    if not isinstance(data["name"], str) or not data["name"]:
-        raise file.error("name", f"found {quote_value(data['name'])}, expected a non-empty string")
-    if not isinstance(data["gates"], list) or len(data["gates"]) < 2:
-        raise file.error("gates", "expected at least two [[gates]] tables")
-    start = file.inner(data["start"], "[start]", {"position", "quaternion"})
-    bounds = file.inner(data["bounds"], "[bounds]", {"low", "high"})
-    low, high = bounds.numbers("low", 3), bounds.numbers("high", 3)
-    if not all(a < b for a, b in zip(low, high, strict=True)):
-        raise bounds.error("high", f"found {high}, expected more than low, {low}")
-
-    def position(table: _Table) -> tuple[Any, ...]:
-        found = table.numbers("position", 3)
-        if not all(a < p < b for a, p, b in zip(low, found, high, strict=True)):
-            raise table.error("position", f"found {found}, expected inside the bounds {low} to {high}")
-        return found
-
-    fields = {field.name for field in dataclasses.fields(Gate)}
-    tables = [file.inner(gate, "[[gates]]", fields, index) for index, gate in enumerate(data["gates"])]
-    gates = tuple(_gate(table, position(table)) for table in tables)
-    for index, table in enumerate(tables):
-        if gates[index].id in {gate.id for gate in gates[:index]}:
-            raise table.error("id", f"{gates[index].id} is used twice")
-    return Track(data["name"], gates, position(start), start.quaternion(), low, high)
+    file = convert(str(path), data, _TrackFile, TrackError)
+    gates = tuple(
+        Gate(gate.id, gate.position, gate.unit(), DIRECTIONS[gate.direction], gate.opening, gate.frame)
+        for gate in file.gates
+    )
+    return Track(file.name, gates, file.start.position, file.start.unit(), file.bounds.low, file.bounds.high)
 
 
-class _Table:
-    """A table of a parsed file, checked to have its fields and no others; header: as in the file."""
-
-    def __init__(
-        self, path: Path, lines: list[str], data: Any, header: str, fields: set[str], index: int = 0
-    ):
-        self.path, self.lines, self.data, self.header, self.index = path, lines, data, header, index
-        if not isinstance(data, dict):
-            raise self.error(header.strip("[]"), "expected a table")
-        for field in sorted(fields - set(data)):
-            raise self.error(field, "missing")
-        for field in sorted(set(data) - fields):
-            raise self.error(field, f"unknown; expected {', '.join(sorted(fields))}")
-
-    def inner(self, data: Any, header: str, fields: set[str], index: int = 0) -> "_Table":
-        """Return the index-th table of a header of the same file."""
-        return _Table(self.path, self.lines, data, header, fields, index)
-
-    def _line_of(self, field: str) -> int:
-        """Return the 1-based line of a field, else that of the table's header."""
-        starts = [n for n, line in enumerate(self.lines) if line.lstrip().startswith(self.header)]
-        start = (starts[self.index] if self.index < len(starts) else 0) if self.header else -1
-        for number in range(start + 1, len(self.lines)):
-            line = self.lines[number].lstrip()
-            if line.startswith("["):
-                break
-            if line.startswith(field) and line[len(field) :].lstrip().startswith("="):
-                return number + 1
-        return max(start, 0) + 1
-
-    def error(self, field: str, reason: str) -> TrackError:
-        """Return the error that names file, line, table and field."""
-        number = f"[{self.index}]" if self.header == "[[gates]]" else ""
-        where = f"{self.header}{number} " if self.header else ""
-        return TrackError(f"{self.path}, line {self._line_of(field)}: {where}{quote_name(field)}: {reason}")
-
-    def numbers(self, field: str, size: int) -> tuple[Any, ...]:
-        """Return a list of that many finite numbers."""
-        value = self.data[field]
-        if not isinstance(value, list) or len(value) != size:
-            raise self.error(field, f"found {quote_value(value)}, expected {size} numbers")
-        return tuple(self._finite(field, number) for number in value)
-
-    def number(self, field: str) -> float:
-        """Return a finite number."""
-        return self._finite(field, self.data[field])
-
-    def _finite(self, field: str, number: Any) -> float:
-        if isinstance(number, bool) or not isinstance(number, (int, float)):
-            raise self.error(field, f"found {quote_value(number)}, expected a number")
-        if not -LARGEST < number < LARGEST:  # false for NaN too
-            found = number if isinstance(number, float) else f"an integer of {number.bit_length()} bits"
-            raise self.error(field, f"found {found}, expected a finite number within +-{LARGEST:g}")
-        return float(number)
-
-    def quaternion(self) -> tuple[Any, ...]:
-        """Return a unit quaternion, renormalised if its digits were rounded."""
-        value = self.numbers("quaternion", 4)
-        norm = math.sqrt(sum(q * q for q in value))
-        if abs(norm - 1.0) > UNIT_NORM_TOLERANCE:
-            raise self.error("quaternion", f"found norm {norm:.6g}, expected 1")
-        return value if abs(norm - 1.0) <= ROUNDING else tuple(q / norm for q in value)
+Coordinate = Annotated[float, Meta(gt=-LARGEST, lt=LARGEST)]
+Position = tuple[Coordinate, Coordinate, Coordinate]
 
 
-def _gate(table: _Table, position: tuple[Any, ...]) -> Gate:
-    """Return the gate of a table; raises TrackError."""
-    gate_id, direction = table.data["id"], table.data["direction"]
-    if isinstance(gate_id, bool) or not isinstance(gate_id, int):
-        raise table.error("id", f"found {quote_value(gate_id)}, expected an integer")
-    if not -LARGEST_ID < gate_id < LARGEST_ID:
-        raise table.error("id", f"found {quote_value(gate_id)}, expected less than 2^53")
-    if not isinstance(direction, str) or direction not in DIRECTIONS:
-        raise table.error(
-            "direction", f"found {quote_value(direction)}, expected one of {', '.join(DIRECTIONS)}"
-        )
-    opening, frame = table.number("opening"), table.number("frame")
-    if opening <= 0.0:
-        raise table.error("opening", f"found {opening}, expected > 0")
-    if frame <= opening:
-        raise table.error("frame", f"found {frame}, expected more than the opening, {opening}")
-    return Gate(gate_id, position, table.quaternion(), DIRECTIONS[direction], opening, frame)
+class _Pose(Fields):
+    position: Position
+    quaternion: tuple[Finite, Finite, Finite, Finite]
+
+    def __post_init__(self) -> None:
+        norm = math.hypot(*self.quaternion)
+        if not abs(norm - 1.0) <= UNIT_NORM_TOLERANCE:
+            raise ValueError(f"quaternion: found norm {norm:.6g}, expected 1")
+
+    def unit(self) -> tuple[float, float, float, float]:
+        """Return the quaternion, renormalised if its digits were rounded."""
+        w, x, y, z = self.quaternion
+        norm = math.sqrt(w * w + x * x + y * y + z * z)
+        return self.quaternion if abs(norm - 1.0) <= ROUNDING else (w / norm, x / norm, y / norm, z / norm)
+
+
+class _Bounds(Fields):
+    low: Position
+    high: Position
+
+    def __post_init__(self) -> None:
+        if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
+            raise ValueError(f"high: found {self.high}, expected more than low, {self.low}")
+
+    def check(self, field: str, position: Position) -> None:
+        """Raise ValueError for a position that is not within the bounds."""
+        ranges = zip(self.low, position, self.high, strict=True)
+        if not all(low < value < high for low, value, high in ranges):
+            raise ValueError(
+                f"{field}: found {position}, expected inside the bounds {self.low} to {self.high}"
+            )
+
+
+class _GateFields(_Pose):
+    id: Annotated[int, Meta(gt=-LARGEST_ID, lt=LARGEST_ID)]
+    direction: Literal["+y", "-y"]
+    opening: Annotated[float, Meta(gt=0.0, lt=LARGEST)]
+    frame: Coordinate
+
+    def __post_init__(self) -> None:
+        _Pose.__post_init__(self)
+        if self.frame <= self.opening:
+            raise ValueError(f"frame: found {self.frame}, expected more than the opening, {self.opening}")
+
+
+class _TrackFile(Fields):
+    name: Text
+    start: _Pose
+    bounds: _Bounds
+    gates: Annotated[tuple[_GateFields, ...], Meta(min_length=2)]
+
+    def __post_init__(self) -> None:
+        self.bounds.check("start.position", self.start.position)
+        ids = [gate.id for gate in self.gates]
+        for index, gate in enumerate(self.gates):
+            self.bounds.check(f"gates[{index}].position", gate.position)
+            if gate.id in ids[:index]:
+                raise ValueError(f"gates[{index}].id: found {gate.id} twice, expected another number")

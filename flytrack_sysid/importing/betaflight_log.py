@@ -252,7 +252,7 @@ def _thrust_of_motors(table: Table, headers: _Headers) -> np.ndarray:
 
 def _chosen_logs(path: Path, num_logs: int, mapping: Mapping) -> list[int]:
     """Return the numbers of a file's logs that the mapping selects, from 1."""
-    numbers = list(mapping.rows.logs) or list(range(1, num_logs + 1))
+    numbers = list(mapping.rows.logs or ()) or list(range(1, num_logs + 1))
     for number in numbers:
         if number > num_logs:
             raise LogError(f"{mapping.source}: rows.logs: found {number}, expected 1 to {num_logs} of {path}")

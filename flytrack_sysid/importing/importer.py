@@ -156,7 +156,7 @@ def _flights_in_the_air(
         if flight.is_landed is not None:
             is_ground = is_ground | flight.is_landed
         num_used, num_ground = is_used.sum(), np.sum(is_used & is_ground)
-        if mapping.rows.keep_ground:
+        if mapping.rows.on_ground == "keep":
             kept = is_used
         elif num_ground == num_used:
             left_out.append(f"{source}: nothing flies: on the ground in all {num_used} rows")
@@ -235,17 +235,15 @@ def _count_of(path: Path, wanted: Manifest) -> int:
         rows = list(csv.DictReader(lines, strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise LogError(f"{where}: cannot be read as a manifest: {error_text(error)}") from error
-    text = next(
-        (row.get(wanted.count_column) for row in rows if row.get(wanted.name_column) == path.name), None
-    )
+    text = next((row.get(wanted.count) for row in rows if row.get(wanted.key) == path.name), None)
     if text is None:
-        columns = f"columns {quote_name(wanted.name_column)} and {quote_name(wanted.count_column)}"
+        columns = f"columns {quote_name(wanted.key)} and {quote_name(wanted.count)}"
         raise LogError(f"{where}: {columns}: {path.name}: missing")
     try:
         return int(text)
     except ValueError as error:
         found = f"found {quote_value(text)}, expected a whole number"
-        raise LogError(f"{where}: {path.name}: {quote_name(wanted.count_column)}: {found}") from error
+        raise LogError(f"{where}: {path.name}: {quote_name(wanted.count)}: {found}") from error
 
 
 def _concatenate(logs: list[FlightLog], sources: list[str]) -> FlightLog:

@@ -5,17 +5,27 @@ apply to logs of every format. Columns are those of a CSV file, variables of a C
 topics.
 """
 
-import sys
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
+from flytrack_env.validation import (
+    Fields,
+    Finite,
+    Positive,
+    Text,
+    check_different,
+    choose,
+    convert,
+    join_text,
+)
 from flytrack_sysid.importing.commands import CommandRules
 from flytrack_sysid.importing.flight import Craft
 from flytrack_sysid.importing.units import TURNED, UNITS, quaternion_from, vector_from
@@ -23,20 +33,15 @@ from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Table
 
 SHIPPED = Path(__file__).parent.parent / "mappings"
-# Table of the file: channel of the log, dimension, frame of the axes.
-VECTORS = {
-    "position": ("p", "length", "world"),
-    "velocity": ("v", "speed", "world"),
-    "acceleration": ("a", "acceleration", "world"),
-    "specific_force": ("f", "acceleration", "body"),
-    "rates": ("w", "rate", "body"),
-}
-NUM_AXES, NUM_STICKS, NUM_QUATERNION = 3, 4, 4
-DIRECTIONS = ("body_to_world", "world_to_body")
-LARGEST_COUNT = 2**53
-LARGEST_NUMBER = sys.float_info.max  # integers in TOML are unbounded
-REQUIRED: Any = object()  # the default of a field that has none
-T = TypeVar("T")
+NUM_AXES = 3
+UNSIGNED = (1.0, 1.0, 1.0)
+Count = Annotated[int, Meta(ge=1, le=10**9)]
+ThreeNumbers = tuple[Finite, Finite, Finite]
+ThreePositive = tuple[Positive, Positive, Positive]
+FourNumbers = tuple[Finite, Finite, Finite, Finite]
+ThreeNames = tuple[Text, Text, Text]
+FourNames = tuple[Text, Text, Text, Text]
+NineNames = tuple[Text, Text, Text, Text, Text, Text, Text, Text, Text]
 
 
 class Channel(NamedTuple):
@@ -54,47 +59,382 @@ class Channel(NamedTuple):
     is_optional: bool = False
 
 
-class Manifest(NamedTuple):
-    """A CSV file beside the logs: its columns of file names and of how many rows to use."""
+class Manifest(Fields):
+    """A CSV file beside the logs; key, count: its columns of file names and of how many rows to use."""
 
-    file: str
-    name_column: str
-    count_column: str
+    file: Text
+    key: Text
+    count: Text
 
 
-class UsedRows(NamedTuple):
+class UsedRows(Fields):
     """Which rows to use: every n-th from ``from_s`` to ``to_s`` after the first; a manifest limits them.
 
     above_m: only the longest stretch of rows that are that much higher than the first. ranges_s: only what is
     in one of these, s after the first row; all if none. logs: numbers, from 1, of the logs in a file that
-    holds several; all if none. keep_ground: rows on the ground are used, too.
+    holds several; all if none. on_ground: whether rows on the ground are used, too.
     """
 
-    every: int = 1
-    above_m: float | None = None
-    from_s: float = 0.0
-    to_s: float | None = None
+    every: Count = 1
+    above_m: Positive | None = None
+    from_s: Finite = 0.0
+    to_s: Positive | None = None
     manifest: Manifest | None = None
-    ranges_s: tuple[tuple[float, float], ...] = ()
-    logs: tuple[int, ...] = ()
-    keep_ground: bool = False
+    ranges_s: Annotated[tuple[tuple[Finite, Finite], ...], Meta(min_length=1)] | None = None
+    logs: Annotated[tuple[Count, ...], Meta(min_length=1)] | None = None
+    on_ground: Literal["drop", "keep"] = "drop"
+
+    def __post_init__(self) -> None:
+        if any(low >= high for low, high in self.ranges_s or ()):
+            raise ValueError(f"ranges_s: found {quote_value(self.ranges_s)}, expected the lower one first")
+        check_different("logs", self.logs or ())
 
 
-class CsvFile(NamedTuple):
+class CraftFields(Fields):
+    """What is known of the craft; ``Craft`` describes the fields."""
+
+    max_rate_deg_s: ThreePositive | None = None
+    mass_kg: Positive | None = None
+    voltage_v: tuple[Positive, Positive] | None = None
+
+    def __post_init__(self) -> None:
+        if self.voltage_v is not None and self.voltage_v[0] >= self.voltage_v[1]:
+            raise ValueError(f"voltage_v: found {list(self.voltage_v)}, expected the lower one first")
+
+
+class ScaledFields(Fields, kw_only=True):
+    """A table of columns in a unit: a known one, or one of so many SI units."""
+
+    unit: str | None = None
+    scale: Positive | None = None
+
+    def si_per_unit(self, dimension: str) -> float:
+        """Return how many SI units the columns' unit is; raises ValueError."""
+        if self.scale is not None:
+            if self.unit is not None:
+                raise ValueError("scale: found together with unit, expected one of them")
+            return self.scale
+        return UNITS[dimension][choose("unit", self.unit, UNITS[dimension])]
+
+
+class SignedFields(ScaledFields, kw_only=True):
+    """A table of columns of three axes, some of which may point the other way."""
+
+    signs: ThreeNumbers = UNSIGNED
+
+    def signed_scales(self, dimension: str) -> np.ndarray:
+        """Return SI units per unit of each axis; raises ValueError."""
+        signs = np.array(self.signs)
+        if np.any(np.abs(signs) != 1.0):
+            raise ValueError(f"signs: found {signs.tolist()}, expected 1 or -1 each")
+        return self.si_per_unit(dimension) * signs
+
+
+class CsvFile(ScaledFields):
     """One of several CSV files of a log, with a clock of its own.
 
-    pattern: of its name, in the folder of the log. time: the column of its times, which begin at ``offset_s``
-    of the log's clock; scale: s per unit of it.
+    file: pattern of its name, in the folder of the log. time: the column of its times, which begin at
+    ``offset_s`` of the log's clock.
     """
 
-    pattern: str
-    time: str
-    scale: float
-    offset_s: float = 0.0
+    file: Text
+    time: Text
+    offset_s: Finite = 0.0
+
+    def __post_init__(self) -> None:
+        if Path(self.file).name != self.file:
+            expected = "the name of a file in the log's folder, * for any text"
+            raise ValueError(f"file: found {quote_value(self.file)}, expected {expected}")
+        self.si_per_unit("time")
+
+
+class Time(ScaledFields):
+    """Times as they are stamped, or of rows that are ``step_s`` apart."""
+
+    column: Text | None = None
+    step_s: Positive | None = None
+
+    def channels(self, table: str) -> list[Channel]:
+        """Return the channel of times, s."""
+        column, step_s = self.column, self.step_s
+        if column is not None and step_s is None:
+            return [_scaled(table, "t", (column,), self.si_per_unit("time"))]
+        if column is not None or step_s is None or self.unit is not None or self.scale is not None:
+            raise ValueError("expected either column, with its unit, or step_s, of one row")
+
+        def by_row(found: Table) -> np.ndarray:
+            num_rows = len(next(iter(found.columns.values())))
+            return np.arange(num_rows)[:, None] * step_s
+
+        return [Channel(table, "t", (), by_row)]
+
+
+class Battery(ScaledFields):
+    """The battery's voltage."""
+
+    column: Text
+
+    def channels(self, table: str) -> list[Channel]:
+        """Return the channel of voltages."""
+        return [_scaled(table, "v_bat", (self.column,), self.si_per_unit("voltage"))]
+
+
+class Command(Fields):
+    """Commands, of which ``low`` and ``high`` are -1 and 1."""
+
+    columns: FourNames
+    low: FourNumbers = (-1.0, -1.0, -1.0, -1.0)
+    high: FourNumbers = (1.0, 1.0, 1.0, 1.0)
+    clip: bool = False
+
+    def channels(self, table: str) -> list[Channel]:
+        """Return the channel of commands."""
+        check_different("columns", self.columns)
+        low, high = np.array(self.low), np.array(self.high)
+        if np.any(low == high):
+            raise ValueError(f"high: found {high.tolist()}, expected other values than low")
+        least, most = np.minimum(low, high), np.maximum(low, high)
+
+        def scale(found: Table) -> np.ndarray:
+            values = found.matrix(self.columns)
+            is_past = ((values < least) | (values > most)) & (not self.clip)  # else ``commands_of`` clips
+            for row, stick in np.argwhere(is_past)[:1]:
+                text = f"found {values[row, stick]:g}, expected {low[stick]:g} to {high[stick]:g} by "
+                text += "command.low and command.high; clip = true limits it"
+                raise found.error(row, quote_name(self.columns[stick]), text)
+            return 2.0 * (values - low) / (high - low) - 1.0
+
+        return [Channel(table, "u", self.columns, scale)]
+
+
+class Vector(SignedFields):
+    """A measured vector."""
+
+    columns: ThreeNames
+    frame: str
+    optional: bool = False
+
+    def channels(self, table: str) -> list[Channel]:
+        """Return the channel that the table is for."""
+        name, dimension, frames = VECTORS[table]
+        check_different("columns", self.columns)
+        scales = self.signed_scales(dimension)
+        is_turned = TURNED[frames][choose("frame", self.frame, TURNED[frames])]
+
+        def turn(found: Table) -> np.ndarray:
+            return vector_from(found.matrix(self.columns) * scales, is_turned)
+
+        return [Channel(table, name, self.columns, turn, self.optional)]
+
+
+# Table of the file: channel of the log, dimension, frame of the axes.
+VECTORS = {
+    "position": ("p", "length", "world"),
+    "velocity": ("v", "speed", "world"),
+    "acceleration": ("a", "acceleration", "world"),
+    "specific_force": ("f", "acceleration", "body"),
+    "rates": ("w", "rate", "body"),
+}
+
+
+class Attitude(SignedFields):
+    """Measured attitude; Euler angles turn by yaw, then pitch, then roll, about moving axes."""
+
+    body: str
+    world: str
+    quaternion: FourNames | None = None
+    euler: ThreeNames | None = None
+    matrix: NineNames | None = None
+    order: str | None = None
+    direction: Literal["body_to_world", "world_to_body"] = "body_to_world"
+
+    def channels(self, table: str) -> list[Channel]:
+        """Return the channel of quaternions."""
+        given = [columns for columns in (self.quaternion, self.euler, self.matrix) if columns is not None]
+        is_scaled = (self.unit, self.scale, self.signs) != (None, None, UNSIGNED)
+        if len(given) != 1 or (self.euler is None and is_scaled):
+            raise ValueError("expected quaternion, with its order, or euler, with its unit, or matrix")
+        check_different("euler, matrix or quaternion", given[0])
+        rotate = self._rotate()
+        is_body_turned = TURNED["body"][choose("body", self.body, TURNED["body"])]
+        is_world_turned = TURNED["world"][choose("world", self.world, TURNED["world"])]
+
+        def turn(found: Table) -> np.ndarray:
+            rotation = rotate(found)
+            rotation = rotation.inv() if self.direction == "world_to_body" else rotation
+            return quaternion_from(rotation, is_body_turned, is_world_turned)
+
+        return [Channel(table, "q", given[0], turn)]
+
+    def _rotate(self) -> Callable[[Table], Rotation]:
+        """Return what makes rotations of the columns as they are."""
+        euler, matrix, quaternion = self.euler, self.matrix, self.quaternion
+        if euler is not None:
+            if self.order is not None:
+                raise ValueError("order: found together with euler, expected none")
+            scales = self.signed_scales("angle")
+            return lambda found: Rotation.from_euler("ZYX", (found.matrix(euler) * scales)[:, ::-1])
+        if matrix is not None:
+            is_transposed = choose("order", self.order, ("by_rows", "by_columns")) == "by_columns"
+
+            def from_matrix(found: Table) -> Rotation:
+                matrices = found.matrix(matrix).reshape(-1, NUM_AXES, NUM_AXES)
+                _check_one(found, matrix[:1], "matrix of determinant", np.linalg.det(matrices))
+                rotation = Rotation.from_matrix(matrices)
+                return rotation.inv() if is_transposed else rotation
+
+            return from_matrix
+        assert quaternion is not None
+        is_scalar_first = choose("order", self.order, ("wxyz", "xyzw")) == "wxyz"
+
+        def from_quaternion(found: Table) -> Rotation:
+            values = found.matrix(quaternion)
+            _check_one(found, quaternion, "quaternion of norm", np.linalg.norm(values, axis=1))
+            return Rotation.from_quat(values, scalar_first=is_scalar_first)
+
+        return from_quaternion
+
+
+def _check_one(table: Table, columns: tuple[str, ...], what: str, sizes: np.ndarray) -> None:
+    for row in np.flatnonzero(np.abs(sizes - 1.0) > LARGEST_NORM_ERROR)[:1]:
+        text = f"found a {what} {sizes[row]:.4g}, expected 1"
+        raise table.error(row, ", ".join(map(quote_name, columns)), text)
+
+
+class ThrustCommand(Fields):
+    """The thrust command, of which ``low`` and ``high`` are -1 and 1."""
+
+    column: Text
+    low: Finite
+    high: Finite
+
+    def channels(self, table: str) -> list[Channel]:
+        """Return the channel of the thrust command."""
+        low, high = self.low, self.high
+        if low == high:
+            raise ValueError(f"high: found {high:g}, expected another value than low")
+
+        def scale(found: Table) -> np.ndarray:
+            return 2.0 * (found.matrix([self.column]) - low) / (high - low) - 1.0
+
+        return [Channel(table, "thrust_command", (self.column,), scale)]
+
+
+class AttitudeCommand(SignedFields):
+    """Setpoints of roll, pitch, yaw, the autopilot's estimate of them, and its gains, 0 to identify them."""
+
+    columns: ThreeNames
+    own: ThreeNames | None = None
+    gain: ThreeNumbers = (0.0, 0.0, 0.0)
+
+    def channels(self, table: str) -> list[Channel]:
+        """Return the channels of setpoints and estimate."""
+        if min(self.gain) < 0.0:
+            raise ValueError(f"gain: found {list(self.gain)}, expected 0, to identify it, or more")
+        scales = self.signed_scales("angle")
+        found = [_scaled(table, "attitude_command", self.columns, scales)]
+        return found + ([_scaled(table, "own_attitude", self.own, scales)] if self.own else [])
+
+
+class RateGainFields(Fields, kw_only=True):
+    """The gains of the rate loop: stated, N m per rad/s, or by inertia and lag."""
+
+    rate_gain: ThreePositive | None = None
+    inertia_kg_m2: ThreePositive | None = None
+    lag_s: ThreePositive | None = None
+
+    def __post_init__(self) -> None:
+        has_inertia, has_lag = self.inertia_kg_m2 is not None, self.lag_s is not None
+        if has_inertia != has_lag or (self.rate_gain is not None and has_inertia):
+            raise ValueError("expected rate_gain, or inertia_kg_m2 with lag_s, or none of them")
+
+    @property
+    def stated_gain(self) -> tuple[float, ...] | None:
+        """The gains, N m per rad/s; None if nothing states them."""
+        if self.inertia_kg_m2 is None:
+            return self.rate_gain
+        return tuple(np.array(self.inertia_kg_m2) / np.array(self.lag_s))
+
+
+class TorqueCommand(RateGainFields):
+    """Torque setpoints about the body's axes (FLU), and the rates that they are to reach."""
+
+    columns: ThreeNames
+    reference_rates: ThreeNames | None = None
+
+    def channels(self, table: str) -> list[Channel]:
+        """Return the channels of setpoints and rates."""
+        found = [_scaled(table, "torque_command", self.columns, 1.0)]
+        rates = self.reference_rates
+        return found + ([_scaled(table, "reference_rates", rates, 1.0)] if rates else [])
+
+
+class Motors(RateGainFields):
+    """The motors' outputs, and what follows from them; ``CommandRules`` describes the fields."""
+
+    columns: tuple[Text, ...] = ()
+    low: Finite | None = None
+    high: Finite | None = None
+    as_thrust: bool = False
+    torque_n_m: tuple[tuple[Finite, ...], tuple[Finite, ...], tuple[Finite, ...]] | None = None
+
+    def channels(self, table: str) -> list[Channel]:
+        """Return the channel of outputs, 0 to 1, if there are columns."""
+        low, high = self.low, self.high
+        if self.torque_n_m is not None and {len(row) for row in self.torque_n_m} != {len(self.columns)}:
+            raise ValueError(f"torque_n_m: found {quote_value(self.torque_n_m)}, expected a row an axis")
+        if not self.columns:
+            return []
+        check_different("columns", self.columns)
+        if low is None or high is None:
+            raise ValueError("expected low and high with columns")
+        if low >= high:
+            raise ValueError(f"high: found {high:g}, expected more than low")
+
+        def scale(found: Table) -> np.ndarray:
+            return np.clip((found.matrix(self.columns) - low) / (high - low), 0.0, 1.0)
+
+        return [Channel(table, "motors", self.columns, scale)]
+
+
+class MappingFile(Fields):
+    """A mapping file; the tables from ``time`` to ``motors`` are of columns."""
+
+    time: Time | None = None
+    command: Command | None = None
+    position: Vector | None = None
+    velocity: Vector | None = None
+    acceleration: Vector | None = None
+    specific_force: Vector | None = None
+    rates: Vector | None = None
+    attitude: Attitude | None = None
+    battery: Battery | None = None
+    thrust_command: ThrustCommand | None = None
+    attitude_command: AttitudeCommand | None = None
+    torque_command: TorqueCommand | None = None
+    motors: Motors | None = None
+    rows: UsedRows = msgspec.field(default_factory=UsedRows)
+    craft: CraftFields = msgspec.field(default_factory=CraftFields)
+    files: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
+    delimiter: Annotated[str, Meta(min_length=1, max_length=1)] = ","
+
+    def rules(self) -> CommandRules:
+        """Return how commands follow from setpoints and motors."""
+        motors, torque = self.motors or Motors(), self.torque_command
+        rate_gain = torque.stated_gain if torque else None
+        return CommandRules(
+            attitude_gain=self.attitude_command.gain if self.attitude_command else (0.0, 0.0, 0.0),
+            rate_gain=rate_gain or motors.stated_gain,
+            motors_as_thrust=motors.as_thrust,
+            motor_torque=motors.torque_n_m,
+        )
+
+
+TABLES = MappingFile.__struct_fields__[: MappingFile.__struct_fields__.index("motors") + 1]
 
 
 class Mapping(NamedTuple):
-    """A mapping file: ``channels`` are of its tables of columns; none if it has none.
+    """A mapping: ``channels`` are of its tables of columns; none if it has none.
 
     files: of a log of several CSV files, by the names that columns begin with.
     """
@@ -108,103 +448,6 @@ class Mapping(NamedTuple):
     files: dict[str, CsvFile] = {}  # noqa: RUF012, not written to
 
 
-class Fields:
-    """One table of a TOML file; fields are taken by name, and what is left at the end is refused."""
-
-    def __init__(self, source: str, name: str, table: Any):
-        self.source, self.name = source, name
-        if not isinstance(table, dict):
-            raise self.error("", f"found {quote_value(table)}, expected a table")
-        self.left, self.known = dict(table), list[str]()
-
-    def error(self, field: str, text: str) -> LogError:
-        """Return the error about one field, or about the table itself."""
-        where = ".".join(part for part in (self.name, field) if part)
-        return LogError(f"{self.source}: {where}: {text}")
-
-    def __contains__(self, field: str) -> bool:
-        return field in self.left
-
-    def take(
-        self, field: str, is_valid: Callable[[Any], bool], expected: str, default: Any = REQUIRED
-    ) -> Any:
-        """Return the valid value of a field, or the default of an absent one."""
-        self.known.append(field)
-        if field not in self.left:
-            if default is REQUIRED:
-                raise self.error(field, f"missing, expected {expected}")
-            return default
-        value = self.left.pop(field)
-        if not is_valid(value):
-            raise self.error(field, f"found {quote_value(value)}, expected {expected}")
-        return value
-
-    def table(self, field: str, read: Callable[["Fields"], T]) -> T | None:
-        """Return what a function reads from a sub-table, all of whose fields it must take; None if absent."""
-        content = self.take(field, lambda value: True, "a table", None)
-        if content is None:
-            return None
-        fields = Fields(self.source, f"{self.name}.{field}" if self.name else field, content)
-        found = read(fields)
-        fields.check_empty()
-        return found
-
-    def check_empty(self) -> None:
-        """Raise LogError for a field that was not taken."""
-        for field in self.left:
-            raise self.error(quote_name(field), f"unknown; expected one of {', '.join(self.known)}")
-
-    def text(self, field: str) -> str:
-        """Return a text that is not empty."""
-        return str(self.take(field, _is_text, "a text"))
-
-    def choice(self, field: str, choices: Iterable[str], default: Any = REQUIRED) -> str:
-        """Return one of several words."""
-        words = tuple(choices)
-        return str(self.take(field, words.__contains__, f"one of {', '.join(words)}", default))
-
-    def number(self, field: str, default: Any = REQUIRED, above: float = -LARGEST_NUMBER) -> Any:
-        """Return a finite number above a bound, as a float, or the default."""
-        value = self.take(field, partial(_is_number, above=above), f"a number{_bound(above)}", default)
-        return value if value is default else float(value)
-
-    def numbers(self, field: str, size: int, default: Any = REQUIRED, above: float = -LARGEST_NUMBER) -> Any:
-        """Return a tuple of finite numbers above a bound, or the default."""
-        is_valid = partial(_are_numbers, size=size, above=above)
-        value = self.take(field, is_valid, f"{size} numbers{_bound(above)}", default)
-        return value if value is default else tuple(map(float, value))
-
-    def names(self, field: str, size: int, default: Any = REQUIRED) -> tuple[str, ...]:
-        """Return a tuple of different names, or the default."""
-
-        def is_valid(value: Any) -> bool:
-            are_texts = isinstance(value, list) and all(map(_is_text, value))
-            return are_texts and len(set(value)) == len(value) == size
-
-        return tuple(self.take(field, is_valid, f"{size} different names of columns", default))
-
-    def flag(self, field: str) -> bool:
-        """Return true or false; an absent one is false."""
-        return bool(self.take(field, lambda value: isinstance(value, bool), "true or false", False))
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and bool(value)
-
-
-def _is_number(value: Any, above: float) -> bool:
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return is_number and above < value <= LARGEST_NUMBER  # false for NaN too
-
-
-def _are_numbers(value: Any, size: int, above: float = -LARGEST_NUMBER) -> bool:
-    return isinstance(value, list) and len(value) == size and all(_is_number(one, above) for one in value)
-
-
-def _bound(above: float) -> str:
-    return f" above {above:g}" if above > -LARGEST_NUMBER else ""
-
-
 def load_mapping(where: str | Path) -> Mapping:
     """Return the mapping in a TOML file, or the shipped one of that name (without ``.toml``).
 
@@ -216,28 +459,36 @@ def load_mapping(where: str | Path) -> Mapping:
             names = ", ".join(shipped)
             raise LogError(f"{path}: found no such mapping file; shipped ones are {names}")
         path = SHIPPED / f"{where}.toml"
-    content = _load(path)
+    content, source = _load(path), str(path)
     base = content.pop("extends", None)
     if base is not None:
-        if base not in shipped:
-            found = f"found {quote_value(base)}, expected one of {', '.join(shipped)}"
-            raise LogError(f"{path}: extends: {found}")
-        content = _merged(_load(SHIPPED / f"{base}.toml"), content)
-    top = Fields(str(path), "", content)
-    channels, rules = _channels(top)
-    mapping = Mapping(
-        source=str(path),
-        rows=top.table("rows", _rows) or UsedRows(),
-        craft=top.table("craft", _craft) or Craft(),
-        channels=channels,
-        rules=rules,
-        files=top.table("files", _files) or {},
-        delimiter=top.take(
-            "delimiter", lambda value: _is_text(value) and len(value) == 1, "one character", ","
-        ),
+        try:
+            content = _merged(_load(SHIPPED / f"{choose('extends', base, shipped)}.toml"), content)
+        except ValueError as error:
+            raise LogError(f"{source}: {error}") from error
+    file = convert(source, content, MappingFile, LogError)
+    if file.command is not None and (file.attitude_command or file.torque_command):
+        text = "found together with setpoints of attitude or torque, expected one kind"
+        raise LogError(f"{source}: command: {text}")
+    channels: list[Channel] = []
+    for name in TABLES:
+        table = getattr(file, name)
+        try:
+            channels += table.channels(name) if table is not None else []
+        except ValueError as error:
+            raise LogError(f"{source}: {join_text(name, str(error))}") from error
+    return Mapping(
+        source=source,
+        rows=file.rows,
+        craft=Craft(file.craft.max_rate_deg_s, file.craft.mass_kg, file.craft.voltage_v),
+        channels=tuple(channels),
+        rules=file.rules(),
+        files={
+            name: convert(source, table, CsvFile, LogError, f"files.{name}")
+            for name, table in file.files.items()
+        },
+        delimiter=file.delimiter,
     )
-    top.check_empty()
-    return mapping
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -257,263 +508,6 @@ def _merged(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _channels(top: Fields) -> tuple[tuple[Channel, ...], CommandRules]:
-    """Return what the tables of columns say, nothing if there are none, and the rules of the commands."""
-    found = [top.table("time", _time), top.table("command", _command)]
-    for table, (name, dimension, frame) in VECTORS.items():
-        found.append(top.table(table, partial(_vector, name=name, dimension=dimension, frame=frame)))
-    found += [top.table("attitude", _attitude), top.table("battery", _battery)]
-    found.append(top.table("thrust_command", _thrust_command))
-    motors, rules = top.table("motors", _motors) or ((), CommandRules())
-    attitudes, gain = top.table("attitude_command", _attitude_command) or ((), rules.attitude_gain)
-    torques, rate_gain = top.table("torque_command", _torque_command) or ((), None)
-    present = [channel for channel in found if channel is not None]
-    if any(channel.name == "u" for channel in present) and (attitudes or torques):
-        raise top.error("command", "found together with setpoints of attitude or torque, expected one kind")
-    rules = rules._replace(attitude_gain=gain, rate_gain=rate_gain or rules.rate_gain)
-    return (*present, *attitudes, *torques, *motors), rules
-
-
-def _files(fields: Fields) -> dict[str, CsvFile]:
-    """Return the files of a log of several, by name."""
-    files = {}
-    for name in list(fields.left):
-        found = fields.table(name, _file)
-        assert found is not None
-        files[name] = found
-    return files
-
-
-def _file(fields: Fields) -> CsvFile:
-    def is_pattern(value: Any) -> bool:
-        return _is_text(value) and Path(value).name == value
-
-    pattern = fields.take("file", is_pattern, "the name of a file in the log's folder, * for any text")
-    scale = _scale(fields, "time")
-    return CsvFile(str(pattern), fields.text("time"), scale, fields.number("offset_s", 0.0))
-
-
-def _rows(fields: Fields) -> UsedRows:
-    def is_step(value: Any) -> bool:
-        return isinstance(value, int) and not isinstance(value, bool) and 1 <= value < LARGEST_COUNT
-
-    def is_range(value: Any) -> bool:
-        return _are_numbers(value, 2) and bool(value[0] < value[1])
-
-    def are_ranges(value: Any) -> bool:
-        return isinstance(value, list) and bool(value) and all(map(is_range, value))
-
-    def are_log_numbers(value: Any) -> bool:
-        numbers = value if isinstance(value, list) and value else [None]
-        return all(map(is_step, numbers)) and len(set(numbers)) == len(numbers)
-
-    ranges = fields.take("ranges_s", are_ranges, "a list of [from, to] in s, the lower one first", ())
-    return UsedRows(
-        ranges_s=tuple((float(low), float(high)) for low, high in ranges),
-        logs=tuple(fields.take("logs", are_log_numbers, "different whole numbers of at least 1", ())),
-        keep_ground=fields.choice("on_ground", ("drop", "keep"), "drop") == "keep",
-        every=fields.take("every", is_step, "a whole number of at least 1, below 2^53", 1),
-        above_m=fields.number("above_m", None, above=0.0),
-        from_s=fields.number("from_s", 0.0),
-        to_s=fields.number("to_s", None, above=0.0),
-        manifest=fields.table(
-            "manifest", lambda table: Manifest(table.text("file"), table.text("key"), table.text("count"))
-        ),
-    )
-
-
-def _craft(fields: Fields) -> Craft:
-    found = Craft(
-        max_rate_deg_s=fields.numbers("max_rate_deg_s", NUM_AXES, None, above=0.0),
-        mass_kg=fields.number("mass_kg", None, above=0.0),
-        voltage_v=fields.numbers("voltage_v", 2, None, above=0.0),
-    )
-    if found.voltage_v is not None and found.voltage_v[0] >= found.voltage_v[1]:
-        raise fields.error("voltage_v", f"found {list(found.voltage_v)}, expected the lower one first")
-    return found
-
-
-def _scale(fields: Fields, dimension: str) -> float:
-    """Return SI units per unit, by ``unit`` (a known one) or ``scale`` (a number)."""
-    if "scale" in fields and "unit" in fields:
-        raise fields.error("scale", "found together with unit, expected one of them")
-    if "scale" in fields:
-        return float(fields.number("scale", above=0.0))
-    return UNITS[dimension][fields.choice("unit", UNITS[dimension])]
-
-
-def _signed_scales(fields: Fields, dimension: str) -> np.ndarray:
-    scale, signs = _scale(fields, dimension), np.array(fields.numbers("signs", NUM_AXES, (1.0,) * NUM_AXES))
-    if np.any(np.abs(signs) != 1.0):
-        raise fields.error("signs", f"found {signs.tolist()}, expected 1 or -1 each")
-    return scale * signs
-
-
-def _time(fields: Fields) -> Channel:
-    """Return the channel of times, s, as they are stamped."""
-    if ("column" in fields) == ("step_s" in fields):
-        raise fields.error("", "expected either column, with its unit, or step_s, of one row")
-    if "step_s" in fields:
-        step_s = fields.number("step_s", above=0.0)
-
-        def by_row(table: Table) -> np.ndarray:
-            num_rows = len(next(iter(table.columns.values())))
-            return np.arange(num_rows)[:, None] * step_s
-
-        return Channel(fields.name, "t", (), by_row)
-    column, scale = fields.text("column"), _scale(fields, "time")
-
-    def convert(table: Table) -> np.ndarray:
-        return table.matrix([column]) * scale
-
-    return Channel(fields.name, "t", (column,), convert)
-
-
-def _battery(fields: Fields) -> Channel:
-    column, scale = fields.text("column"), _scale(fields, "voltage")
-    return Channel(fields.name, "v_bat", (column,), lambda table: table.matrix([column]) * scale)
-
-
-def _command(fields: Fields) -> Channel:
-    """Return the commands, scaled so that ``low`` and ``high`` are -1 and 1."""
-    columns = fields.names("columns", NUM_STICKS)
-    low = np.array(fields.numbers("low", NUM_STICKS, (-1.0,) * NUM_STICKS))
-    high = np.array(fields.numbers("high", NUM_STICKS, (1.0,) * NUM_STICKS))
-    is_clipped = fields.flag("clip")
-    if np.any(low == high):
-        raise fields.error("high", f"found {high.tolist()}, expected other values than low")
-    least, most = np.minimum(low, high), np.maximum(low, high)
-
-    def convert(table: Table) -> np.ndarray:
-        values = table.matrix(columns)
-        is_past = ((values < least) | (values > most)) & (not is_clipped)  # else ``commands_of`` clips them
-        for row, stick in np.argwhere(is_past)[:1]:
-            text = f"found {values[row, stick]:g}, expected {low[stick]:g} to {high[stick]:g} by command.low"
-            text += " and command.high; clip = true limits it"
-            raise table.error(row, quote_name(columns[stick]), text)
-        return 2.0 * (values - low) / (high - low) - 1.0
-
-    return Channel(fields.name, "u", columns, convert)
-
-
-def _vector(fields: Fields, name: str, dimension: str, frame: str) -> Channel:
-    columns = fields.names("columns", NUM_AXES)
-    scales = _signed_scales(fields, dimension)
-    is_turned = TURNED[frame][fields.choice("frame", TURNED[frame])]
-    is_optional = fields.flag("optional")
-
-    def convert(table: Table) -> np.ndarray:
-        return vector_from(table.matrix(columns) * scales, is_turned)
-
-    return Channel(fields.name, name, columns, convert, is_optional)
-
-
 def _scaled(table: str, name: str, columns: tuple[str, ...], scales: np.ndarray | float) -> Channel:
+    check_different("columns", columns)
     return Channel(table, name, columns, lambda found: found.matrix(columns) * scales)
-
-
-def _attitude_command(fields: Fields) -> tuple[tuple[Channel, ...], tuple[float, ...]]:
-    """Return setpoints of roll, pitch, yaw, the autopilot's own estimate of them, and its gains."""
-    columns, own = fields.names("columns", NUM_AXES), fields.names("own", NUM_AXES, ())
-    scales = _signed_scales(fields, "angle")
-    found = [_scaled(fields.name, "attitude_command", columns, scales)]
-    if own:
-        found.append(_scaled(fields.name, "own_attitude", own, scales))
-    gain = fields.numbers("gain", NUM_AXES, (0.0,) * NUM_AXES)
-    if min(gain) < 0.0:
-        raise fields.error("gain", f"found {list(gain)}, expected 0, to identify it, or more")
-    return tuple(found), gain
-
-
-def _torque_command(fields: Fields) -> tuple[tuple[Channel, ...], tuple[float, ...] | None]:
-    """Return torque setpoints about the body's axes (FLU), the rates they are to reach, and the gains."""
-    columns, reference = fields.names("columns", NUM_AXES), fields.names("reference_rates", NUM_AXES, ())
-    found = [_scaled(fields.name, "torque_command", columns, 1.0)]
-    if reference:
-        found.append(_scaled(fields.name, "reference_rates", reference, 1.0))
-    return tuple(found), _rate_gain(fields)
-
-
-def _rate_gain(fields: Fields) -> tuple[float, ...] | None:
-    """Return the gains of the rate loop, N m per rad/s: stated, or of inertia and lag; None if neither."""
-    gain = fields.numbers("rate_gain", NUM_AXES, None, above=0.0)
-    inertia = fields.numbers("inertia_kg_m2", NUM_AXES, None, above=0.0)
-    lag_s = fields.numbers("lag_s", NUM_AXES, None, above=0.0)
-    if (inertia is None) != (lag_s is None) or (gain is not None and inertia is not None):
-        raise fields.error("", "expected rate_gain, or inertia_kg_m2 with lag_s, or none of them")
-    return gain if inertia is None else tuple(np.array(inertia) / np.array(lag_s))
-
-
-def _thrust_command(fields: Fields) -> Channel:
-    """Return the thrust command, scaled so that ``low`` and ``high`` are -1 and 1."""
-    column, low, high = fields.text("column"), fields.number("low"), fields.number("high")
-    if low == high:
-        raise fields.error("high", f"found {high:g}, expected another value than low")
-    convert = lambda table: 2 * (table.matrix([column]) - low) / (high - low) - 1  # noqa: E731
-    return Channel(fields.name, "thrust_command", (column,), convert)
-
-
-def _motors(fields: Fields) -> tuple[tuple[Channel, ...], CommandRules]:
-    """Return the motors' outputs, 0 to 1, and what follows from them."""
-    listed = fields.left.get("columns")
-    num_motors = len(listed) if isinstance(listed, list) else 0
-    columns = fields.names("columns", num_motors, ())
-
-    def is_matrix(value: Any) -> bool:
-        rows = value if isinstance(value, list) else []
-        return len(rows) == NUM_AXES and all(_are_numbers(row, num_motors) for row in rows)
-
-    rows = fields.take("torque_n_m", is_matrix, "a row an axis", None)
-    rules = CommandRules(
-        motors_as_thrust=fields.flag("as_thrust"),
-        motor_torque=None if rows is None else tuple(tuple(map(float, row)) for row in rows),
-        rate_gain=_rate_gain(fields),
-    )
-    if not columns:
-        return (), rules
-    low, high = fields.number("low"), fields.number("high")
-    if low >= high:
-        raise fields.error("high", f"found {high:g}, expected more than low")
-    convert = lambda table: np.clip((table.matrix(columns) - low) / (high - low), 0.0, 1.0)  # noqa: E731
-    return (Channel(fields.name, "motors", columns, convert),), rules
-
-
-def _attitude(fields: Fields) -> Channel:
-    """Return the quaternions; Euler angles turn by yaw, then pitch, then roll, about moving axes."""
-    if sum(name in fields for name in ("quaternion", "euler", "matrix")) != 1:
-        raise fields.error("", "expected quaternion, with its order, or euler, with its unit, or matrix")
-    if "euler" in fields:
-        columns, order = fields.names("euler", NUM_AXES), "euler"
-        scales = _signed_scales(fields, "angle")
-    elif "matrix" in fields:
-        columns, scales = fields.names("matrix", NUM_AXES**2), np.ones(NUM_AXES**2)
-        order = fields.choice("order", ("by_rows", "by_columns"))
-    else:
-        columns, scales = fields.names("quaternion", NUM_QUATERNION), np.ones(NUM_QUATERNION)
-        order = fields.choice("order", ("wxyz", "xyzw"))
-    is_inverted = fields.choice("direction", DIRECTIONS, DIRECTIONS[0]) == DIRECTIONS[1]
-    is_body_turned = TURNED["body"][fields.choice("body", TURNED["body"])]
-    is_world_turned = TURNED["world"][fields.choice("world", TURNED["world"])]
-
-    def convert(table: Table) -> np.ndarray:
-        values = table.matrix(columns) * scales
-        if order == "euler":
-            rotation = Rotation.from_euler("ZYX", values[:, ::-1])
-        elif order.startswith("by_"):
-            matrices = values.reshape(-1, NUM_AXES, NUM_AXES)
-            size = np.linalg.det(matrices)
-            for row in np.flatnonzero(np.abs(size - 1.0) > LARGEST_NORM_ERROR)[:1]:
-                text = f"found a matrix of determinant {size[row]:.4g}, expected 1"
-                raise table.error(row, quote_name(columns[0]), text)
-            rotation = Rotation.from_matrix(matrices)
-            rotation = rotation.inv() if order == "by_columns" else rotation
-        else:
-            norm = np.linalg.norm(values, axis=1)
-            for row in np.flatnonzero(np.abs(norm - 1.0) > LARGEST_NORM_ERROR)[:1]:
-                text = f"found a quaternion of norm {norm[row]:.4g}, expected 1"
-                raise table.error(row, ", ".join(map(quote_name, columns)), text)
-            rotation = Rotation.from_quat(values, scalar_first=order == "wxyz")
-        rotation = rotation.inv() if is_inverted else rotation
-        return quaternion_from(rotation, is_body_turned, is_world_turned)
-
-    return Channel(fields.name, "q", columns, convert)

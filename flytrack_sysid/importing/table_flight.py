@@ -93,10 +93,10 @@ def _read_files(folder: Path, mapping: Mapping) -> ImportedFlight:
     tables = []
     for name, fields in wanted.items():
         file = mapping.files[name]
-        paths = sorted(folder.glob(file.pattern))
+        paths = sorted(folder.glob(file.file))
         if len(paths) != 1:
             listed = ", ".join(quote_name(path.name) for path in sorted(folder.iterdir()))[:LONGEST_LIST]
-            found = f"found {len(paths)} files of the name {quote_name(file.pattern)} among {listed}"
+            found = f"found {len(paths)} files of the name {quote_name(file.file)} among {listed}"
             raise LogError(f"{folder}: {found}; expected one by {mapping.source}: files.{name}")
         tables.append(_read_file(paths[0], name, file, list(fields), mapping))
     return flight_of_topics(str(folder), tables, mapping)
@@ -115,7 +115,7 @@ def _read_file(path: Path, name: str, file: CsvFile, fields: list[str], mapping:
                 raise LogError(f"{found}; expected once by {mapping.source}: files.{name}")
         table = read_columns(path, rows, header, dict.fromkeys((file.time, *fields)))
     columns = {f"{name}:{field}": table.columns[field] for field in fields}
-    times = table.columns[file.time] * file.scale + file.offset_s
+    times = table.columns[file.time] * file.si_per_unit("time") + file.offset_s
     return Table(str(path), {TIMESTAMP: times, **columns}, table.lines)
 
 

@@ -41,7 +41,10 @@ def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
         (["--track", "split_s"], "track_data.name: found 'flytrack', expected 'split_s'"),
         (["--seed", "7"], "seed: found 3, expected 7"),
         (["--total-timesteps", "384"], "steps: found 2688, expected at most 384"),
-        (["--evaluation-episodes", "0"], "options: evaluation_episodes: found 0, expected int >= 1"),
+        (
+            ["--evaluation-episodes", "0"],
+            "options: evaluation_episodes: found 0, expected a whole number from 1",
+        ),
     ],
 )
 def test_what_does_not_fit_a_run_is_refused(whole, tmp_path, monkeypatch, capsys, arguments, message):
@@ -66,7 +69,7 @@ def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole):
     [
         ({"environment": {"reward.gate_pass": "a lot"}}, "environment: gate_pass: found 'a lot'"),
         ({"env_id": "Hover-v0"}, "with its settings and the flags: env_id: found 'Hover-v0'"),
-        ({"seed": "x"}, "seed: found 'x', expected int"),
+        ({"seed": "x"}, "seed: found 'x', expected a whole number"),
         ({"steps": 5}, "steps: found 5"),
     ],
 )

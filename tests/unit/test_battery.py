@@ -101,9 +101,9 @@ def test_a_model_file_without_a_battery_is_warned_of(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("battery", "reason"),
     [
-        ([1], "battery: found .*expected an object"),
-        ({"full": 4.2}, "battery: full: unknown; expected one of full_v"),
-        ({"full_v": "4.2"}, "battery: full_v: found .*expected a voltage"),
+        ([1], "battery: found .*expected a table of fields"),
+        ({"full": 4.2}, r"battery\.full: unknown; expected one of full_v"),
+        ({"full_v": "4.2"}, r"battery\.full_v: found .*expected a number"),
         ({"full_v": 3.4, "empty_v": 4.2}, "model.battery: found empty_v 4.2, full_v 3.4, expected"),
         ({"full_v": 24, "empty_v": 22, "fitted_low_v": 14, "fitted_high_v": 16.8}, "14 to 16.8 V.*22 to 24"),
     ],

@@ -140,7 +140,7 @@ def test_what_is_not_in_the_grammar_is_refused(
     path.write_text(json.dumps(document))
     with pytest.raises(ModelFileError, match=expected) as error:
         load_model(path)
-    assert str(error.value).startswith(f"{path}: effects: learned_law: ")
+    assert str(error.value).startswith(f"{path}: effects.learned_law.law")
 
 
 def test_a_file_with_networks_is_refused(tmp_path: Path) -> None:
@@ -149,5 +149,5 @@ def test_a_file_with_networks_is_refused(tmp_path: Path) -> None:
     document = json.loads(path.read_text())
     document["effects"]["learned_residual"] = {"scale": 1.0, "networks": []}
     path.write_text(json.dumps(document))
-    with pytest.raises(ModelFileError, match="effects: learned_residual: networks are no longer part"):
+    with pytest.raises(ModelFileError, match=r"effects\.learned_residual: networks are no longer part"):
         load_model(path)
