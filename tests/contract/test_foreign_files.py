@@ -6,6 +6,7 @@ import os
 import pickle
 import sys
 import time
+import zipfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -78,6 +79,13 @@ def npz(arrays: dict[str, np.ndarray]) -> bytes:
     return content.getvalue()
 
 
+def npy(array: np.ndarray) -> bytes:
+    """Return one array as a file."""
+    content = io.BytesIO()
+    np.save(content, array)
+    return content.getvalue()
+
+
 def hostile_arrays(content: bytes) -> list[bytes]:
     """Return archives with pickles, arrays of other sizes than declared, and bombs."""
     arrays = dict(np.load(io.BytesIO(content)))
@@ -85,7 +93,12 @@ def hostile_arrays(content: bytes) -> list[bytes]:
     odd = (np.array([print], object), np.zeros(2**27, np.int8), np.full(8, 2**31 - 1, np.int32).view("<U1"))
     header = npz(arrays).replace(b"'shape': (", b"'shape': (9")
     version = content.replace(b"\x93NUMPY\x01", b"\x93NUMPY\x02")
-    return [*(npz({**arrays, name: value}) for value in odd), header, content + content, version]
+    unannounced = io.BytesIO()
+    with zipfile.ZipFile(unannounced, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(f"{name}.npy", npy(arrays[name]) + bytes(2**28))
+        archive.getinfo(f"{name}.npy").file_size = len(npy(arrays[name]))
+    odd_arrays = (npz({**arrays, name: value}) for value in odd)
+    return [*odd_arrays, header, content + content, version, unannounced.getvalue()]
 
 
 def hostile_texts(content: bytes) -> list[bytes]:

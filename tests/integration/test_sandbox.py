@@ -112,12 +112,6 @@ def endless(x: jax.Array, u: jax.Array) -> jax.Array:
     return jax.lax.while_loop(lambda c: c[0] >= 0.0, lambda c: 0.5 * c + 1.0, x)
 
 
-def greedy(x: jax.Array, u: jax.Array) -> jax.Array:
-    """Need 4 GiB."""
-    grid = jnp.sin(jnp.arange(2**20, dtype=jnp.float32)[:, None] * jnp.arange(2**10) * x[9])
-    return x + jnp.sum(jnp.sort(grid, axis=0)[::2])
-
-
 def solving(x: jax.Array, u: jax.Array) -> jax.Array:
     """Call LAPACK."""
     return x.at[:4].set(jnp.linalg.svd(jnp.eye(4) + u, compute_uv=False))
@@ -128,30 +122,17 @@ def calling(x: jax.Array, u: jax.Array) -> jax.Array:
     return jax.ffi.ffi_call("my callback", jax.ShapeDtypeStruct(x.shape, x.dtype))(x)
 
 
-def nested(x: jax.Array, u: jax.Array) -> jax.Array:
-    """Call functions that call functions, too deeply for the compiler."""
-    step: Callable[..., Any] = lambda x, u: x  # noqa: E731
-    for _ in range(200):
-        step = jax.jit(lambda x, u, inner=step: 0.5 * inner(x, u))
-    return step(x, u)
-
-
 @pytest.mark.parametrize(
     ("step", "message"),
     [
         pytest.param(endless, "took more than 1 s of processor time", marks=pytest.mark.slow),
-        pytest.param(greedy, "Out of memory|needs more than 1 GiB|crashed", marks=pytest.mark.slow),
         (solving, r"found a call of lapack_\w+, expected a pure function that calls nothing"),
         (calling, "found a call of my callback, expected a pure function that calls nothing"),
-        pytest.param(nested, r"crashed the process that it was tried in \(SIGSEGV\)", marks=pytest.mark.slow),
     ],
 )
 def test_hostile_black_boxes_are_refused(step: Callable[..., Any], message: str, tmp_path: Path) -> None:
     checks = [export.DisabledSafetyCheck.custom_call("my callback")]
-    depth = sys.getrecursionlimit()
-    sys.setrecursionlimit(20_000)
     path = write_artifact(tmp_path / "a.bin", step, disabled_checks=checks)
-    sys.setrecursionlimit(depth)
     with pytest.raises(BlackBoxError, match=rf"^{path}: .*({message})"):
         load(path, limits=ResourceLimits(cpu_s=1) if step is endless else ResourceLimits())
 

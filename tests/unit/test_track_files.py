@@ -55,7 +55,6 @@ def test_refusals_name_file_field_and_reason(case, tmp_path):
         ("name = \n", "not a TOML file: .*line 1"),
         (VALID.replace("id = 3", "id = "), "not a TOML file: .*line 20"),
         (VALID + "frame = 3\n", "not a TOML file: .*(frame|overwrite)"),
-        (b" " * 2**20, "cannot be read: found 1048576 bytes"),
     ],
 )
 def test_what_is_no_toml_file_is_refused(text, reason, tmp_path):
