@@ -165,7 +165,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         terminated are scalars. key is unused.
         """
         del key
-        rows, next_state, reward, flags, info = one_kernel(self._step_env)(
+        rows, next_state, reward, flags, info = one_kernel(self._transition)(
             state, clip_action(action, self._dtype(state)), params
         )
         return jnp.stack(rows), next_state, reward, flags["terminated"], info
@@ -221,9 +221,9 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         """
         if params is None:
             params = self.default_params
-        return self._step_from(seed_of(key), state, action, params)
+        return self._fly(seed_of(key), state, action, params)
 
-    def _step_env(self, state: Any, command: Action, params: EnvParams) -> tuple[Any, ...]:
+    def _transition(self, state: Any, command: Action, params: EnvParams) -> tuple[Any, ...]:
         """Return observation, row by row, state, reward, flags and info of a step without auto-reset."""
         next_state, reward, terminated, info = self.advance(state, command, params)
         next_state, reward = _keep_types(next_state, state), jnp.asarray(reward, self._dtype(state))
@@ -232,11 +232,11 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         flags = {"terminated": terminated, "truncated": self.is_truncated(next_state, params)}
         return rows, next_state, reward, flags, info
 
-    def _step(
+    def _transition_or_reset(
         self, seed: jax.Array, state: Any, command: Action, params: EnvParams, has_ended: Any
     ) -> tuple[Any, ...]:
         """Return observation and that before the reset, row by row, state, reward, flags and info."""
-        final_rows, next_state, reward, flags, info = self._step_env(state, command, params)
+        final_rows, next_state, reward, flags, info = self._transition(state, command, params)
         if has_ended is None:
             done = flags["terminated"] | flags["truncated"]
         else:
@@ -264,13 +264,14 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         step before is reset instead of stepped, with a reward of 0, both flags False and a meaningless info.
         """
         seeds = seeds_of(seed_of(key), jnp.arange(actions.shape[0]))
-        step = jax.vmap(self._step_from, in_axes=(0, 0, 0, None, 0))
+        step = jax.vmap(self._fly, in_axes=(0, 0, 0, None, 0))
         return step(seeds, states, actions, params, has_ended)
 
-    def _step_from(
+    def _fly(
         self, seed: jax.Array, state: Any, action: jax.Array, params: EnvParams, has_ended: Any = None
     ) -> Step:
-        found = one_kernel(self._step)(
+        """Return what ``step`` does, of an action (4,) and one random word."""
+        found = one_kernel(self._transition_or_reset)(
             seed, state, clip_action(action, self._dtype(state)), params, has_ended
         )
         rows, final_rows, state, reward, flags, info = found

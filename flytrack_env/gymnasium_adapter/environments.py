@@ -1,5 +1,6 @@
 """The environments behind ``gymnasium.make`` and ``gymnasium.make_vec``: one compiled step each."""
 
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -12,7 +13,7 @@ from gymnax.environments.spaces import gymnax_space_to_gym_space
 from flytrack_env.env import EnvParams
 from flytrack_env.gymnasium_adapter.options import TRACK, check_names, read_start
 from flytrack_env.gymnasium_adapter.packing import Packed
-from flytrack_env.gymnasium_adapter.simulation import Simulation, draw_key
+from flytrack_env.gymnasium_adapter.simulation import Simulation, begin, draw_key, step, step_batch
 from flytrack_env.messages import check_keywords
 from flytrack_env.registration import ARGUMENTS
 from flytrack_env.rendering import FlightLog, can_render, open_window
@@ -20,6 +21,7 @@ from flytrack_env.rendering import FlightLog, can_render, open_window
 RENDER_MODES, VECTOR_RENDER_MODES = ("human", "rgb_array"), ("rgb_array",)
 AUTORESET_MODES = AutoresetMode.NEXT_STEP.value, AutoresetMode.SAME_STEP.value
 SEED_WORDS = 4
+NONE_BEGAN = np.zeros(1, bool)
 MOST_STEPS = 2**32  # that a uint32 can count
 
 
@@ -31,6 +33,8 @@ class _Adapter:
     _simulation: Simulation
     _renderer: Any
     _window: Any
+    _states: Packed | None
+    _logs: dict[int, FlightLog]  # of pictures, by the environment's index
 
     def _set_up(
         self, env_id: str, render_mode: str | None, params: EnvParams | None, overrides: dict[str, Any]
@@ -40,23 +44,26 @@ class _Adapter:
         if render_mode is not None and render_mode not in render_modes:
             expected = ", ".join(map(repr, render_modes))
             raise ValueError(f"render_mode: found {render_mode!r}, expected None, {expected}")
-        self.render_mode = render_mode
-        self._simulation = Simulation(env_id, params, overrides)
-        env, params = self._simulation.env, self._simulation.params
+        self.render_mode, self._states, self._logs = render_mode, None, {}
+        self._simulation = simulation = Simulation(env_id, params, overrides)
         # The class announces every mode, so that asking for one that is missing says how to install it.
         modes = [mode for mode in render_modes if can_render(mode)]
-        self.metadata = self.metadata | {"render_modes": modes, "render_fps": round(1.0 / float(params.dt))}
-        self._renderer = None if render_mode is None else self._simulation.make_renderer()
-        spaces = env.observation_space(params), env.action_space(params)
+        self.metadata = self.metadata | {"render_modes": modes, "render_fps": round(1.0 / simulation.step_s)}
+        self._open()
+        spaces = simulation.env.observation_space(params), simulation.env.action_space(params)
         return tuple(map(gymnax_space_to_gym_space, spaces))
 
-    def _begin(self, options: dict[str, Any] | None, draw_words: Any) -> tuple[Packed, Any, Any]:
-        """Return state, observation and scene of episodes that begin as the options of a reset say.
+    def _open(self) -> None:
+        """Make what draws pictures and shows them, if the mode has any."""
+        self._renderer = None if self.render_mode is None else self._simulation.make_renderer()
+        self._window = open_window(self._simulation.step_s) if self.render_mode == "human" else None
+
+    def _begin(self, options: dict[str, Any] | None, draw_words: Callable[[], np.ndarray]) -> np.ndarray:
+        """Begin episodes as the options of a reset say; return their observations, (num_envs, size).
 
         draw_words: called for the words of their keys once the options are known to be good.
         """
-        options = check_names(options)
-        simulation = self._simulation
+        options, simulation = check_names(options), self._simulation
         if TRACK in options:
             simulation = simulation.with_track(options[TRACK])
         start = read_start(options, simulation.params.course, simulation.params.model.battery)
@@ -64,17 +71,40 @@ class _Adapter:
         if simulation is not self._simulation:
             self._simulation = simulation
             self._renderer = self._renderer and simulation.make_renderer()
-        return simulation.begin(words, *start)
+        self._states, observations, scenes = begin(
+            simulation.compiled, words, start, simulation.packed_params
+        )
+        self._log(scenes, np.ones(len(words), bool))
+        return np.array(observations)
 
-    def _checked(self, name: str, state: Any, actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
+    def _log(self, scenes: Any, has_begun: np.ndarray) -> None:
+        """Log what pictures need, if there are any, in new logs where episodes began."""
+        if self._renderer is None:
+            return
+        for index in np.flatnonzero(has_begun).tolist():
+            self._logs[index] = FlightLog(self._simulation.step_s)
+        for index, scene in enumerate(np.asarray(scenes)):
+            self._logs[index].append(scene)
+
+    def _check(self, name: str, actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
         """Return actions as float32, once an episode has begun and if they have that shape."""
-        if state is None:
-            raise gymnasium.error.ResetNeeded("step: found no episode, expected a reset before it")
+        self._check_begun("step")
         with np.errstate(over="ignore"):  # what is beyond float32 is infinite, and clipped as such
             actions = np.asarray(actions, np.float32)
         if actions.shape != shape:
             raise ValueError(f"{name}: found shape {actions.shape}, expected {shape}")
         return actions
+
+    def _check_begun(self, method: str) -> None:
+        if self._states is None:
+            raise gymnasium.error.ResetNeeded(f"{method}: found no episode, expected a reset before it")
+
+    def _draw_pictures(self) -> tuple[np.ndarray, ...] | None:
+        """Return a picture per environment in mode "rgb_array", else None."""
+        if self.render_mode != "rgb_array":
+            return None
+        self._check_begun("render")
+        return tuple(self._renderer.draw(self._logs[index]) for index in sorted(self._logs))
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs: it gets a renderer and a window of its own."""
@@ -83,11 +113,7 @@ class _Adapter:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take over what a copy needs."""
         self.__dict__.update(state)
-        params = self._simulation.params
-        if self.render_mode is not None:
-            self._renderer = self._simulation.make_renderer()
-        if self.render_mode == "human":
-            self._window = open_window(float(params.dt))
+        self._open()
 
 
 class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
@@ -109,10 +135,6 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
     ):
         check_keywords(overrides, ("render_mode", "params", *ARGUMENTS))
         self.observation_space, self.action_space = self._set_up(env_id, render_mode, params, overrides)
-        self._state: Any = None
-        step_s = float(self._simulation.params.dt)
-        self._log = FlightLog(step_s)
-        self._window = open_window(step_s) if render_mode == "human" else None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -128,12 +150,11 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
 
         def draw() -> np.ndarray:
             super(FlyTrackEnv, self).reset(seed=seed)
-            return draw_key(self.np_random)
+            return draw_key(self.np_random, (1,))
 
-        self._state, observation, scene = self._begin(options, draw)
-        self._log = FlightLog(float(self._simulation.params.dt))
-        self._show(scene)
-        return np.array(observation), {}
+        observation = self._begin(options, draw)[0]
+        self._show()
+        return observation, {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Return observation, reward, terminated, truncated and info, of Python's own types.
@@ -144,22 +165,20 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
             gymnasium.error.ResetNeeded: no episode has begun.
             ValueError: an action of another shape.
         """
-        action = self._checked("action", self._state, action, self.action_space.shape)
-        programs = self._simulation.programs
-        outputs = programs.step(self._state, action, self._simulation.packed_params)
-        self._state, observation, scene, blocks = outputs
-        reward, terminated, truncated, info = programs.columns.plain(blocks)
-        self._show(scene)
-        return np.array(observation), reward, terminated, truncated, info
+        action, simulation = self._check("action", action, self.action_space.shape), self._simulation
+        found = step(simulation.compiled, self._states, action[None], simulation.packed_params)
+        self._states, observations, scenes, outcomes = found
+        self._log(scenes, NONE_BEGAN)
+        self._show()
+        reward, terminated, truncated, info = outcomes.to_host()
+        info = {name: value[0] if value.ndim > 1 else value.item() for name, value in info.items()}
+        return np.array(observations)[0], reward.item(), terminated.item(), truncated.item(), info
 
-    def _show(self, scene: Any) -> None:
-        """Log what a picture needs, and show it in the window if there is one."""
-        renderer = self._renderer
-        if renderer is None:
-            return
-        self._log.append(np.asarray(scene))
+    def _show(self) -> None:
+        """Show the state in the window, if there is one."""
         if self._window is not None:
-            self._window.show(lambda: renderer.draw(self._log), is_first=len(self._log.rows) == 1)
+            log = self._logs[0]
+            self._window.show(lambda: self._renderer.draw(log), is_first=len(log.rows) == 1)
 
     def render(self) -> np.ndarray | None:
         """Return a picture (540, 960, 3), uint8, in mode "rgb_array"; else None.
@@ -169,11 +188,8 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
         """
-        if self.render_mode != "rgb_array" or self._renderer is None:
-            return None
-        if self._state is None:
-            raise gymnasium.error.ResetNeeded("render: found no episode, expected a reset before it")
-        return self._renderer.draw(self._log)
+        pictures = self._draw_pictures()
+        return None if pictures is None else pictures[0]
 
     def close(self) -> None:
         """Close the window, if there is one; more than once is allowed."""
@@ -214,19 +230,16 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
             raise ValueError(f"autoreset_mode: found {mode!r}, expected {expected}")
         if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
             raise ValueError(f"num_envs: found {num_envs!r}, expected an integer of at least 1")
-        self.num_envs = num_envs = int(num_envs)
+        self.num_envs = int(num_envs)
         self.single_observation_space, self.single_action_space = self._set_up(
             env_id, render_mode, params, overrides
         )
         self.autoreset_mode = AutoresetMode(mode)  # where TorchRL looks for it
         self.metadata["autoreset_mode"] = self.autoreset_mode
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self._states: Any = None
-        self._words = np.zeros(0, np.uint32)
-        self._count = 0
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._words, self._count = np.zeros(0, np.uint32), 0
         self._has_ended: np.ndarray | None = None  # in the step before, in mode NEXT_STEP
-        self._logs = [FlightLog(1.0)] * num_envs
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -241,12 +254,11 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
             ValueError: an unknown option, a value that no episode can start with, or another number of
                 seeds.
         """
-        self._states, observations, scenes = self._begin(options, lambda: self._seed(seed))
+        observations = self._begin(options, lambda: self._seed(seed))
         self._words, self._count = draw_key(self.np_random), 0
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             self._has_ended = np.zeros(self.num_envs, bool)
-        self._log(scenes, np.ones(self.num_envs, bool))
-        return np.array(observations), {}
+        return observations, {}
 
     def _seed(self, seed: Any) -> np.ndarray:
         """Seed the generator and return a key's words per environment."""
@@ -278,41 +290,32 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
             gymnasium.error.ResetNeeded: no episode has begun.
             ValueError: actions of another shape.
         """
-        actions = self._checked("actions", self._states, actions, self.action_space.shape)
-        programs, has_ended = self._simulation.programs, self._has_ended
-        self._states, observations, final_observations, scenes, blocks = programs.step_batch(
+        actions = self._check("actions", actions, self.action_space.shape)
+        simulation, has_ended = self._simulation, self._has_ended
+        self._states, observations, final_observations, scenes, grouped = step_batch(
+            simulation.compiled,
             self._states,
             self._words,
             np.uint32(self._count),
             actions,
-            self._simulation.packed_params,
+            simulation.packed_params,
             has_ended,
             self._renderer is not None,
         )
         self._count = (self._count + 1) % MOST_STEPS
-        columns = programs.columns_of(has_ended).batched(blocks)
-        rewards, terminated, truncated, infos, final_info, final_masks = columns
+        rewards, terminated, truncated, infos, final_info, final_masks = grouped.to_host()
         done = terminated | truncated
         self._log(scenes, done if has_ended is None else has_ended)
         if has_ended is not None:
             self._has_ended = done
             infos = {} if has_ended.all() else infos
         elif done.any():
-            places, infos = np.flatnonzero(done), {} if done.all() else infos
+            indices, infos = np.flatnonzero(done), {} if done.all() else infos
             final_obs = np.empty(self.num_envs, object)  # filled with None
-            for place, final in zip(places.tolist(), np.asarray(final_observations)[places], strict=True):
-                final_obs[place] = final
+            for index, final in zip(indices.tolist(), np.asarray(final_observations)[indices], strict=True):
+                final_obs[index] = final
             infos.update(final_obs=final_obs, final_info=final_info, **final_masks)
         return np.array(observations), rewards, terminated, truncated, infos
-
-    def _log(self, scenes: Any, has_begun: np.ndarray) -> None:
-        """Log what pictures need, if there are any, in new logs where episodes began."""
-        if self._renderer is None:
-            return
-        for place in np.flatnonzero(has_begun):
-            self._logs[place] = FlightLog(float(self._simulation.params.dt))
-        for log, scene in zip(self._logs, np.asarray(scenes), strict=True):
-            log.append(scene)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return a picture (540, 960, 3), uint8, per environment in mode "rgb_array"; else None.
@@ -320,8 +323,4 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
         """
-        if self._renderer is None:
-            return None
-        if self._states is None:
-            raise gymnasium.error.ResetNeeded("render: found no episodes, expected a reset before it")
-        return tuple(self._renderer.draw(log) for log in self._logs)
+        return self._draw_pictures()

@@ -43,56 +43,60 @@ def check_names(options: Mapping[str, Any] | None) -> dict[str, Any]:
     return dict(options)
 
 
-def read_start(
-    options: Mapping[str, Any], course: Course, battery: Battery
-) -> tuple[np.ndarray | None, int, float | None]:
-    """Return the start that checked options ask for on a course: drone, gate to fly first, battery, V.
+def read_start(options: Mapping[str, Any], course: Course, battery: Battery) -> dict[str, Any]:
+    """Return the start that checked options ask for on a course; what is not in it is drawn.
 
-    The drone is (21,), laid out as in ``flytrack_env.state``, and with the gate's index instead of a drawn
-    start, and the battery instead of the start's own; None is as drawn.
+    drone, gate_index: (21,), laid out as in ``flytrack_env.state``, and the gate to fly first. battery_v: V.
 
     Raises:
         ValueError: a value that no episode can start with; it names option, found and expected.
     """
-    battery_v = None
+    start: dict[str, Any] = {}
     if BATTERY_V in options:
-        battery_v = float(_numbers(options, BATTERY_V, 0))
+        battery_v = _numbers(options, BATTERY_V, 0)
         if not battery.empty_v < battery_v <= battery.full_v * (1.0 + ROUNDING):
             expected = f"above {battery.empty_v:g} and up to {battery.full_v:g} V"
             raise _error(BATTERY_V, options, expected)
-    if not any(name in options for name in POSE_NAMES):
-        return None, 0, battery_v
-    drone = np.zeros(layout.STATE_SIZE, np.float32)
-    drone[layout.POSITION], drone[layout.QUATERNION], drone[layout.VELOCITY] = _pose(options, course)
-    drone[layout.APPLIED_ACTION] = STILL_ROTORS
-    drone[layout.BATTERY] = battery.full_v
-    return drone, _gate_index(options, course.num_gates), battery_v
+        start["battery_v"] = np.float32(battery_v)
+    if any(name in options for name in POSE_NAMES):
+        drone = np.zeros(layout.STATE_SIZE, np.float32)
+        drone[layout.POSITION] = _position(options, course)
+        drone[layout.QUATERNION] = _quaternion(options, course)
+        drone[layout.VELOCITY] = _velocity(options)
+        drone[layout.APPLIED_ACTION] = STILL_ROTORS
+        drone[layout.BATTERY] = battery.full_v
+        start |= {"drone": drone, "gate_index": np.int32(_gate_index(options, course.num_gates))}
+    return start
 
 
-def _pose(options: Mapping[str, Any], course: Course) -> tuple[Any, Any, Any]:
-    """Return position, quaternion and velocity."""
-    position: Any = course.start_pos_w
-    quaternion: Any = course.start_quat
-    velocity: Any = np.zeros(3)
-    if "position" in options:
-        position = _numbers(options, "position", 3)
-        low, high = np.array(course.bounds_low), np.array(course.bounds_high)
-        if not ((position >= low) & (position <= high)).all():
-            raise _error("position", options, f"within the bounds, {low.tolist()} to {high.tolist()} m")
+def _position(options: Mapping[str, Any], course: Course) -> Any:
+    if "position" not in options:
+        return course.start_pos_w
+    position = _numbers(options, "position", 3)
+    low, high = np.array(course.bounds_low), np.array(course.bounds_high)
+    if not ((position >= low) & (position <= high)).all():
+        raise _error("position", options, f"within the bounds, {low.tolist()} to {high.tolist()} m")
+    return position
+
+
+def _quaternion(options: Mapping[str, Any], course: Course) -> Any:
     if "yaw_deg" in options:
         half = 0.5 * math.radians(_numbers(options, "yaw_deg", 0))
-        quaternion = (math.cos(half), 0.0, 0.0, math.sin(half))
-    elif "quaternion" in options:
-        quaternion = _numbers(options, "quaternion", 4)
-        norm = np.linalg.norm(quaternion)
-        if abs(norm - 1.0) > UNIT_NORM_TOLERANCE:
-            raise _error("quaternion", options, f"norm 1 within {UNIT_NORM_TOLERANCE:g}")
-        quaternion = quaternion / norm
-    if "velocity" in options:
-        velocity = _numbers(options, "velocity", 3)
-        if not (abs(velocity) <= LARGEST_SPEED).all():
-            raise _error("velocity", options, f"at most {LARGEST_SPEED:g} m/s along every axis")
-    return position, quaternion, velocity
+        return math.cos(half), 0.0, 0.0, math.sin(half)
+    if "quaternion" not in options:
+        return course.start_quat
+    quaternion = _numbers(options, "quaternion", 4)
+    norm = np.linalg.norm(quaternion)
+    if abs(norm - 1.0) > UNIT_NORM_TOLERANCE:
+        raise _error("quaternion", options, f"norm 1 within {UNIT_NORM_TOLERANCE:g}")
+    return quaternion / norm
+
+
+def _velocity(options: Mapping[str, Any]) -> Any:
+    velocity = _numbers(options, "velocity", 3) if "velocity" in options else np.zeros(3)
+    if not (abs(velocity) <= LARGEST_SPEED).all():
+        raise _error("velocity", options, f"at most {LARGEST_SPEED:g} m/s along every axis")
+    return velocity
 
 
 def _gate_index(options: Mapping[str, Any], num_gates: int) -> int:

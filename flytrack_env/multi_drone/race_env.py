@@ -203,12 +203,12 @@ class MultiDroneRace:
         out. truncated: whether the race is over for one that is not. info: that of ``env`` while a drone
         flies, ``collision``, ``rank``, ``gap_gates``, ``race_over`` and ``final_observation``.
         """
-        return self._step_from(seed_of(key)[None], states, actions, params, resets=True)
+        return self._advance_flat(seed_of(key)[None], states, actions, params, resets=True)
 
     @partial(jax.jit, static_argnames=("self",))
     def step_env(self, states: EntrantState, actions: jax.Array, params: RaceParams | None = None) -> Step:
         """Return the same without auto-reset."""
-        return self._step_from(jnp.zeros(1, jnp.uint32), states, actions, params, resets=False)
+        return self._advance_flat(jnp.zeros(1, jnp.uint32), states, actions, params, resets=False)
 
     @partial(jax.jit, static_argnames=("self",))
     def step_batch(
@@ -221,12 +221,12 @@ class MultiDroneRace:
         shape = actions.shape[:-1]
         seeds = seeds_of(seed_of(key), jnp.arange(shape[0]))
         flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (states, actions))
-        found = self._step_from(seeds, flat[0], flat[1], params, resets=True)
+        found = self._advance_flat(seeds, flat[0], flat[1], params, resets=True)
         return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), found)
 
     # Below, drones of all races are one flat vector.
 
-    def _step_from(
+    def _advance_flat(
         self,
         seeds: jax.Array,
         states: EntrantState,
@@ -237,14 +237,14 @@ class MultiDroneRace:
         params = self.default_params if params is None else params
         dtype = jnp.result_type(self.env.drone(states.inner).pos_w.x)
         commands = jax.vmap(partial(clip_action, dtype=dtype))(actions)
-        step = one_kernel(partial(self._step, resets))
+        step = one_kernel(partial(self._transition, resets))
         rows, final_rows, states, reward, terminated, truncated, info = step(
             self._words(seeds), states, commands, params, self._ghosts_at(states.step)
         )
         info = {**info, "final_observation": jnp.stack(final_rows, axis=-1)}
         return jnp.stack(rows, axis=-1), states, reward, terminated, truncated, info
 
-    def _step(
+    def _transition(
         self,
         resets: bool,
         words: jax.Array,

@@ -22,6 +22,7 @@ from gymnasium.wrappers import vector as wrappers
 import flytrack_env
 from flytrack_env.effects import CommandDelay
 from flytrack_env.env import EnvParams, FlyTrack
+from flytrack_env.gymnasium_adapter import simulation
 from flytrack_env.registration import ENVIRONMENTS
 from tests.support.coasting import track_of_row
 from tests.support.slow import slow_but
@@ -251,6 +252,19 @@ def test_wrong_use_is_refused() -> None:
     assert make_vector(num_envs=np.int64(4)).num_envs == 4
     with pytest.raises(ValueError, match="autoreset_mode: found 'Disabled', expected 'NextStep' or"):
         make_vector(autoreset_mode=AutoresetMode.DISABLED)
+
+
+def test_integers_and_numbers_of_numpy_are_as_good_as_pythons(params: EnvParams) -> None:
+    assert make_vector(num_envs=np.int64(4)).reset()[0].shape[0] == 4
+    with pytest.raises(ValueError, match=r"num_envs: found 2\.0, expected an integer"):
+        make_vector(num_envs=2.0)
+    compiled = []
+    for dt in (0.01, np.float32(0.01), np.float64(0.01)):
+        env = gymnasium.make(BASE, params=params.replace(dt=dt))
+        env.reset()
+        env.step(np.zeros(4))
+        compiled.append((simulation.begin._cache_size(), simulation.step._cache_size()))
+    assert len(set(compiled)) == 1
 
 
 def test_models_with_other_delays_are_flown_with_their_own() -> None:
