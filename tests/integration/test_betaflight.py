@@ -104,7 +104,7 @@ def test_a_held_stick_turns_as_the_models_curve_says(rates_type, rc_rate, rate, 
     with Betaflight(rates) as curved:
         model, flown = curved.nominal_model(), curved.fly(starts(3), held)
     curve = model.effects[0]
-    bent = [effect_of(curve).command(curve, None, Action(*u), None).roll for u in held[:, 0]]
+    bent = [effect_of(curve).hooks["command"](curve, None, Action(*u), None).roll for u in held[:, 0]]
     expected = np.deg2rad(model.max_rate[0]) * np.array(bent)
     np.testing.assert_allclose(flown[:, 40:, RATES][..., 0].mean(axis=1), expected, rtol=0.01, atol=0.01)
 

@@ -111,7 +111,7 @@ def test_stick_curves_are_the_firmwares(rates_type):
     curve, sticks = stick_curve(rates_type, axes), np.linspace(-1, 1, 21)
     full = [full_stick_rate(rates_type, rc, rate, 1998.0) for rc, rate, _ in axes]
     for stick in sticks:
-        bent = effect_of(curve).command(curve, None, Action(stick, stick, stick, 0.3), None)
+        bent = effect_of(curve).hooks["command"](curve, None, Action(stick, stick, stick, 0.3), None)
         expected = [of_firmware(rates_type, stick, *axis) for axis in axes]
         np.testing.assert_allclose(bent[:3], np.divide(expected, full), atol=1e-6)
         assert bent.thrust == 0.3
