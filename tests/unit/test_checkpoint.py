@@ -66,7 +66,7 @@ def test_observations_that_do_not_fit_are_refused(tmp_path, params):
         (safetensors.numpy.save({"a": np.zeros(3)}), "not a checkpoint, or damaged"),
         (
             safetensors.numpy.save({}, {"meta": "{}", "sha256": checksum("{}", {})}),
-            "missing required field format",
+            "format: missing, expected a text",
         ),
     ],
 )
