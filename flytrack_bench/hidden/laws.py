@@ -62,7 +62,7 @@ def _time(shape: Any, drone: Any) -> Number:
     return 0.5 + 0.5 * tanh((share - middle) / width) if is_step else _bump(share, middle, width)
 
 
-def _heading_of(drone: Any) -> Number:
+def _heading(drone: Any) -> Number:
     return atan2(drone.rows[1][0], drone.rows[0][0])
 
 
@@ -104,14 +104,14 @@ def _payload(shape: Any, drone: Any) -> Vector:
 SIGNALS: dict[str, Callable[[Any, Any], Number]] = {
     "position": _position,
     "time": _time,
-    "heading": lambda shape, drone: heading_waves(shape, _heading_of(drone)) / shape["largest"],
+    "heading": lambda shape, drone: heading_waves(shape, _heading(drone)) / shape["largest"],
     "airspeed": lambda shape, drone: _bump(norm(drone.airspeed_b), shape["speed_ms"], shape["width_ms"]),
     "attitude": _attitude,
     "periodic": lambda shape, drone: math.sin(
         2.0 * math.pi * shape["frequency_hz"] * drone.time_s + shape["phase"]
     ),
     "flapping": lambda shape, drone: drone.airspeed_b[0] / USUAL_SPEED_MS,
-    "cable": lambda shape, drone: cos(_heading_of(drone) + shape["phase"]),
+    "cable": lambda shape, drone: cos(_heading(drone) + shape["phase"]),
     "heating": _heating,
 }
 # Those that neither remember nor depend on the time: JAX flies them, too.

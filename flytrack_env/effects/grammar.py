@@ -220,7 +220,7 @@ class Term:
     """A vector times factors.
 
     acts: "force", m/s^2 of specific force, or "rate", rad/s of body rates. frame: of the vector: body, world
-    or air, of which the first component alone is given, along the direction of flight through the air.
+    or air: only the first component is used, along the velocity through the air.
     coefficients, standard_errors: three each.
     """
 

@@ -26,7 +26,7 @@ def draw_key(generator: np.random.Generator, shape: tuple[int, ...] = ()) -> np.
     return generator.integers(0, 2**32, (*shape, KEY_WORDS), np.uint32)
 
 
-def _key_of(words: jax.Array) -> jax.Array:
+def _make_key(words: jax.Array) -> jax.Array:
     return jax.random.wrap_key_data(words, impl="threefry2x32")
 
 
@@ -49,7 +49,7 @@ def begin(
     own = _params_of(params)
 
     def begin_one(words: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
-        seed = seed_of(_key_of(words))
+        seed = seed_of(_make_key(words))
         drone, gate_index = env.sample_start(seed, own)
         if "drone" in start:
             drone, gate_index = unpack(start["drone"]), start["gate_index"]
@@ -95,7 +95,7 @@ def step_batch(
     has_ended: None to reset in this step, or (num_envs,) bool for those that ended in the step before.
     Scenes, after the auto-reset, are None unless they are needed.
     """
-    key = jax.random.fold_in(_key_of(words), count)
+    key = jax.random.fold_in(_make_key(words), count)
     found = env.step_batch(key, states.unpack(), actions, _params_of(params), has_ended)
     observations, after, rewards, terminated, truncated, info = found
     final_observations = info["final_observation"] if has_ended is None else None

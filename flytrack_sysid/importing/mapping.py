@@ -103,7 +103,7 @@ class CraftFields(Fields):
 
 
 class ScaledFields(Fields, kw_only=True):
-    """A table of columns in a unit: a known one, or one of so many SI units."""
+    """A table of columns with a unit: its name, or its size in SI units."""
 
     unit: str | None = None
     scale: Positive | None = None
