@@ -1,7 +1,7 @@
 """Checks of releases: ``make check-wheel check-versions``.
 
-``nox --list`` names the sessions. They install into fresh environments, made by uv, and run in empty folders,
-so that nothing of the checkout can be imported by accident.
+``nox --list`` names the sessions. They install into fresh environments, made by uv, and run in
+empty folders, so that nothing of the checkout can be imported by accident.
 """
 
 import shlex
@@ -20,9 +20,17 @@ nox.options.sessions = []  # a bare call names the sessions and runs none
 nox.options.error_on_missing_interpreters = False
 
 ROOT = Path(__file__).parent
-PACKAGES = ("baselines/", *(f"flytrack{name}/" for name in ("", "_bench", "_env", "_fly", "_loop", "_sysid")))
+PACKAGES = (
+    "baselines/",
+    *(f"flytrack{name}/" for name in ("", "_bench", "_env", "_fly", "_loop", "_sysid")),
+)
 CLONE_ONLY = "firmware/"
-HEADLESS = {"JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg", "SDL_VIDEODRIVER": "dummy", "PYTHONPATH": ""}
+HEADLESS = {
+    "JAX_PLATFORMS": "cpu",
+    "MPLBACKEND": "agg",
+    "SDL_VIDEODRIVER": "dummy",
+    "PYTHONPATH": "",
+}
 TEST_TOOLS = ("pytest>=9", "hypothesis>=6.150", "pillow", "pyulog>=1.2", "orangebox>=0.4,<0.5")
 CHAMPION = ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.safetensors"
 
@@ -104,7 +112,9 @@ USES = {
         "flytrack validate model.json data.npz --out report",
         "flytrack diagnose data.npz --model model.json --out diagnosis",
     ),
-    "logs": ("python -m pytest -q tests/unit/test_import_ulog.py tests/unit/test_import_betaflight.py",),
+    "logs": (
+        "python -m pytest -q tests/unit/test_import_ulog.py tests/unit/test_import_betaflight.py",
+    ),
     "bags": ("python -m pytest -q tests/unit/test_import_bag.py",),
     "viz": (SAVE_GHOST, "flytrack show flight.npy"),
     "render": (RENDER,),
@@ -122,14 +132,18 @@ COPIED = ("benchmarks", "blackbox", "tests", "pyproject.toml")
 def built() -> tuple[Path, Path]:
     """Build the source distribution and, from it, the wheel; return both: wheel, source."""
     folder = ROOT / ".nox" / "dist"
-    subprocess.run([sys.executable, "-m", "uv", "build", "--clear", "--out-dir", folder, ROOT], check=True)
+    subprocess.run(
+        [sys.executable, "-m", "uv", "build", "--clear", "--out-dir", folder, ROOT], check=True
+    )
     return next(folder.glob("*.whl")), next(folder.glob("*.tar.gz"))
 
 
 @nox.session(tags=["wheel"])
 def contents(session: nox.Session) -> None:
     """The wheel has the packages' files; the source distribution has every tracked file but firmware/."""
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True)
+    listed = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
     tracked = set(listed.stdout.splitlines())
     wheel, source = built()
     with zipfile.ZipFile(wheel) as archive:
@@ -170,4 +184,6 @@ def versions(session: nox.Session, resolution: str) -> None:
         session.skip("the oldest versions are tried on the oldest Python alone")
     session.install(".[train,sysid,viz]", *TEST_TOOLS, "--resolution", resolution)
     lenient = ("-W", "default::DeprecationWarning") if resolution == "lowest-direct" else ()
-    session.run("python", "-m", "pytest", "-q", "-m", "not slow", *lenient, "tests/unit", env=HEADLESS)
+    session.run(
+        "python", "-m", "pytest", "-q", "-m", "not slow", *lenient, "tests/unit", env=HEADLESS
+    )

@@ -1,9 +1,9 @@
 """Crafts of one to six cells through every command: ``python -m benchmarks.any_drone``.
 
-A nominal model (what ``flytrack import --model-out`` writes) and a fitted one of each craft, with the thrust
-that they have by the model, in the environment, in the header of an exported policy and in a flight of the
-evaluator; then PPO with its default settings. The logs that are fitted are of a law that shares nothing with
-the thrust map: specific force = peak x throttle x V / V_full.
+A nominal model (what ``flytrack import --model-out`` writes) and a fitted one of each craft, with
+the thrust that they have by the model, in the environment, in the header of an exported policy and
+in a flight of the evaluator; then PPO with its default settings. The logs that are fitted are of a
+law that shares nothing with the thrust map: specific force = peak x throttle x V / V_full.
 """
 
 import re
@@ -104,7 +104,9 @@ def write_log(craft: TrueCraft, folder: Path, seed: int) -> tuple[Path, Path]:
         decay = np.exp(-1.0 / RATE_HZ / tau_s)
         return lfilter([1.0 - decay], [1.0, -decay], values, axis=0)
 
-    sticks = np.column_stack([held(1.5, 0.3), held(1.3, 0.3), held(1.1, 0.3), -0.2 + held(1.7, 0.6)])
+    sticks = np.column_stack(
+        [held(1.5, 0.3), held(1.3, 0.3), held(1.1, 0.3), -0.2 + held(1.7, 0.6)]
+    )
     empty_v, full_v = craft.volts
     volts = full_v - 0.9 * (full_v - empty_v) * time / time[-1]
     before = np.vstack([sticks[:1], sticks[:-1]])  # held from the row before on
@@ -119,7 +121,10 @@ def write_log(craft: TrueCraft, folder: Path, seed: int) -> tuple[Path, Path]:
     columns = np.column_stack([time, sticks, rates, force, volts])
     np.savetxt(table, columns, delimiter=",", header=header, comments="", fmt="%.6g")
     text = MAPPING.format(
-        rates=", ".join(map(str, craft.max_rate_deg_s)), mass_kg=craft.mass_kg, empty_v=empty_v, full_v=full_v
+        rates=", ".join(map(str, craft.max_rate_deg_s)),
+        mass_kg=craft.mass_kg,
+        empty_v=empty_v,
+        full_v=full_v,
     )
     mapping.write_text(text, encoding="utf-8")
     return table, mapping
@@ -169,7 +174,9 @@ def in_header(checkpoint: Path, folder: Path) -> Thrust:
     header = folder / "policy.h"
     run("export", "--c", header, checkpoint)
     words = " ".join(header.read_text(encoding="utf-8").replace("\n *", " ").split())
-    found = re.search(r"gives ([\d.]+) times the weight at full thrust, and (-?[\d.]+) hovers", words)
+    found = re.search(
+        r"gives ([\d.]+) times the weight at full thrust, and (-?[\d.]+) hovers", words
+    )
     assert found is not None, "the header states no thrust"
     return Thrust(float(found[1]), float(found[2]))
 
@@ -178,9 +185,13 @@ def on_evaluator(checkpoint: Checkpoint, model: ModelParameters) -> Thrust:
     """Return what a flight of the evaluator shows: its force over that of the thrust map, times the map's."""
     env = simulated_env(checkpoint)
     params = flights.start_pose_params(env.default_params, NUM_STEPS)
-    flown = flights.fly_episode(env, checkpoint.policy, jax.random.key(0), params, NUM_STEPS, NUM_LAPS)
+    flown = flights.fly_episode(
+        env, checkpoint.policy, jax.random.key(0), params, NUM_STEPS, NUM_LAPS
+    )
     states = np.asarray(flown.states, float)[: int(np.sum(flown.is_flying))]
-    w, x, y, z = states[:-1, QUATERNION].T  # the handout's step: the force has the attitude before it
+    w, x, y, z = states[
+        :-1, QUATERNION
+    ].T  # the handout's step: the force has the attitude before it
     body_z = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
     force = np.sum((states[1:, ACCELERATION] + [0.0, 0.0, float(model.g)]) * body_z, axis=1)
     coeffs = np.asarray(model.thrust_coeffs, float)
@@ -189,7 +200,9 @@ def on_evaluator(checkpoint: Checkpoint, model: ModelParameters) -> Thrust:
     is_used = mapped > MIN_FORCE
     ratio = float(np.median(force[is_used] / mapped[is_used]))
     weight_n = float(model.m) * float(model.g) / ratio
-    return Thrust(by_model(model).full * ratio, hover_action(coeffs, weight_n, float(model.battery.full_v)))
+    return Thrust(
+        by_model(model).full * ratio, hover_action(coeffs, weight_n, float(model.battery.full_v))
+    )
 
 
 def race(checkpoint: Checkpoint) -> tuple[int, float]:
@@ -198,14 +211,26 @@ def race(checkpoint: Checkpoint) -> tuple[int, float]:
     keys = flights.start_keys(0, NUM_STARTS)
     outcomes = flights.race_many(env, checkpoint.policy, keys, NUM_STEPS, NUM_LAPS)
     laps_s = outcomes.flying_laps_s()
-    return int(outcomes.is_complete().sum()), float(np.median(laps_s)) if len(laps_s) else float("nan")
+    return int(outcomes.is_complete().sum()), float(np.median(laps_s)) if len(laps_s) else float(
+        "nan"
+    )
 
 
-def measure(craft: TrueCraft, kind: str, path: Path, timesteps: int, folder: Path) -> dict[str, Any]:
+def measure(
+    craft: TrueCraft, kind: str, path: Path, timesteps: int, folder: Path
+) -> dict[str, Any]:
     """Train on a model file, and return a row of results."""
     model = flytrack_env.load_model(path)
     trained = folder / "trained"
-    words = ("--model", path, "--total-timesteps", timesteps, "--evaluate-every", 0, "--no-tracking")
+    words = (
+        "--model",
+        path,
+        "--total-timesteps",
+        timesteps,
+        "--evaluate-every",
+        0,
+        "--no-tracking",
+    )
     run("train", *words, "--out", trained)
     checkpoint = load_checkpoint(trained / "final.safetensors")
     finished, lap_s = race(checkpoint)
@@ -242,9 +267,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         thrusts = [f"{row[place].full:.3f} / {row[place].hover:.3f}" for place in places]
         race_cells = [f"{row['finished']} of {NUM_STARTS}", f"{row['lap_s']:.2f} s"]
         lines.append([row["craft"], row["kind"], row["battery"], truth, *thrusts, *race_cells])
-    head = (
-        "craft | model | battery | truth | by the model | in the environment | in the C header | in a flight"
-    )
+    head = "craft | model | battery | truth | by the model | in the environment | in the C header | in a flight"
     return report.table(f"{head} | finished | flying lap", lines)
 
 
@@ -255,7 +278,9 @@ def main(timesteps: int = 10_000_000, seed: int = 0) -> None:
         with TemporaryDirectory() as name:
             folder = Path(name)
             log, mapping = write_log(craft, folder, seed + number)
-            nominal, fitted, npz = (folder / text for text in ("nominal.json", "fitted.json", "log.npz"))
+            nominal, fitted, npz = (
+                folder / text for text in ("nominal.json", "fitted.json", "log.npz")
+            )
             words = ("--format", "csv", "--map", mapping, "--out", npz, "--model-out", nominal)
             run("import", log, *words)
             run("fit", npz, "--from", nominal, "--out", fitted)

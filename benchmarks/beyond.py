@@ -1,10 +1,10 @@
 """Laws without a name: ``python -m benchmarks.beyond [--laws 4] [--clean 20] [--listed 10] [--page]``.
 
-Flies plants with laws outside the package's list (benchmarks.hidden.outside, equations of their own), clean
-ones, and ones with listed effects only, a minute each, and grades what the diagnosis learns of each: is the
-variable right, and the form; how much of the explainable error goes on a new flight. It appends a line a
-plant to docs/results/beyond.jsonl and skips plants that have a line of the same commit; --page writes
-docs/results/beyond.md, of the last lines of each sort.
+Flies plants with laws outside the package's list (benchmarks.hidden.outside, equations of their
+own), clean ones, and ones with listed effects only, a minute each, and grades what the diagnosis
+learns of each: is the variable right, and the form; how much of the explainable error goes on a new
+flight. It appends a line a plant to docs/results/beyond.jsonl and skips plants that have a line of
+the same commit; --page writes docs/results/beyond.md, of the last lines of each sort.
 """
 
 import json
@@ -55,7 +55,9 @@ def truth_of(row: str, rng: np.random.Generator) -> hidden.Truth:
     truth = hidden.draw_base(rng)
     if row == "clean":
         return truth
-    return replace(truth, outside=hidden.draw_outside(rng, row, hidden.log_uniform(*AMPLITUDES, rng)))
+    return replace(
+        truth, outside=hidden.draw_outside(rng, row, hidden.log_uniform(*AMPLITUDES, rng))
+    )
 
 
 def flown_plant(row: str, number: int) -> tuple[hidden.Truth, FlightLog, np.random.Generator]:
@@ -117,13 +119,18 @@ def figures(lines: Sequence[dict[str, Any]]) -> list[report.Figure]:
     unexplained = [line for line in laws if line["unexplained"]]
     learned = [line for line in laws if line["law"]]
     controls = {
-        row: [bool(line["law"]) for line in lines if line["row"] == row] for row in ("clean", "listed")
+        row: [bool(line["law"]) for line in lines if line["row"] == row]
+        for row in ("clean", "listed")
     }
     loads = ["unexplained" in line["verdict"] for line in lines if line["row"] == LOAD]
     shares = [
         ("variable right", "70 %", [line.get("is_variable", False) for line in laws]),
         ("variable and form right", "70 %", [line.get("is_form", False) for line in laws]),
-        ("the same, of those left unexplained", "", [line.get("is_form", False) for line in unexplained]),
+        (
+            "the same, of those left unexplained",
+            "",
+            [line.get("is_form", False) for line in unexplained],
+        ),
         ("law of another variable", "at most 2 %", [not line["is_variable"] for line in learned]),
         *((f"law, {row}", "at most 1 %", flags) for row, flags in controls.items()),
         *([("swinging load left unexplained", "100 %", loads)] if loads else []),
@@ -168,7 +175,8 @@ def diagnoses_of(record: Any) -> list[dict[str, Any]]:
 def real_rows() -> list[tuple[str, str, str, str]]:
     """Return, by diagnosis of measured flights, what was learnt and what it does to errors of free flight.
 
-    Errors are of velocity and position on held-out rows, over those of the extended model without it.
+    Errors are of velocity and position on held-out rows, over those of the extended model without
+    it.
     """
     rows = []
     for path in sorted(REAL.glob("*_diagnosis.json")):
@@ -177,7 +185,14 @@ def real_rows() -> list[tuple[str, str, str, str]]:
             learned, errors = found["learned"], found["prediction"]["errors"]
             if learned is None:
                 has_law = any("from another log" in warning for warning in found["warnings"])
-                rows.append((name, "not looked for: the model has a law" if has_law else "nothing", "-", "-"))
+                rows.append(
+                    (
+                        name,
+                        "not looked for: the model has a law" if has_law else "nothing",
+                        "-",
+                        "-",
+                    )
+                )
                 continue
             ratios = [
                 errors["extended"][quantity][horizon] / before
@@ -186,7 +201,12 @@ def real_rows() -> list[tuple[str, str, str, str]]:
                 for horizon, before in by_horizon.items()
             ]
             rows.append(
-                (name, "; ".join(formulas_of(learned)), f"{np.median(ratios):.2f}", f"{max(ratios):.2f}")
+                (
+                    name,
+                    "; ".join(formulas_of(learned)),
+                    f"{np.median(ratios):.2f}",
+                    f"{max(ratios):.2f}",
+                )
             )
     return rows
 
@@ -224,25 +244,33 @@ def write_page() -> None:
         crashed=len(lines) - len(good),
         figures=report.figures_table(figures(good)),
         kinds=report.table("kind | plants | form right | any law learnt", kind_rows(good)),
-        real=report.table("flights | learnt | error over the one without, median | largest", real_rows()),
+        real=report.table(
+            "flights | learnt | error over the one without, median | largest", real_rows()
+        ),
         plants=report.table("kind | truth | learnt | left unexplained by the list", rows),
     )
 
 
 def main(
-    laws: int = 4, clean: int = 20, listed: int = 10, kinds: tuple[str, ...] = KINDS, page: bool = False
+    laws: int = 4,
+    clean: int = 20,
+    listed: int = 10,
+    kinds: tuple[str, ...] = KINDS,
+    page: bool = False,
 ) -> None:
     """Diagnose the plants, or write the page.
 
-    laws: plants of each kind of law. clean: without anything. listed: with listed effects only. kinds: of
-    laws, so that two processes can share them. page: write the page of what was measured.
+    laws: plants of each kind of law. clean: without anything. listed: with listed effects only.
+    kinds: of laws, so that two processes can share them. page: write the page of what was measured.
     """
     if page:
         write_page()
         return
     counts = dict.fromkeys(kinds, laws) | {"clean": clean, "listed": listed}
     most = max(counts.values())
-    run([(row, number) for number in range(most) for row, count in counts.items() if number < count])
+    run(
+        [(row, number) for number in range(most) for row, count in counts.items() if number < count]
+    )
 
 
 if __name__ == "__main__":

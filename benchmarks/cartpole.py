@@ -1,8 +1,8 @@
 """Is it PureJaxRL's PPO? CartPole-v1 with its configuration: ``python -m benchmarks.cartpole``.
 
-Single updates scatter by 100; the mean over all updates of the mean last return does not, so that is what is
-compared. The target is what PureJaxRL's own ``ppo.py`` reaches, unmodified, over five seeds. Our differences
-from it are switched off here.
+Single updates scatter by 100; the mean over all updates of the mean last return does not, so that
+is what is compared. The target is what PureJaxRL's own ``ppo.py`` reaches, unmodified, over five
+seeds. Our differences from it are switched off here.
 """
 
 import gymnax
@@ -48,7 +48,9 @@ def main(seeds: int = 5) -> None:
         report.RESULTS / "cartpole.md",
         "cartpole",
         figures=report.figures_table([figure]),
-        table=report.table("seed | mean last return", [[n, f"{area:.1f}"] for n, area in enumerate(areas)]),
+        table=report.table(
+            "seed | mean last return", [[n, f"{area:.1f}"] for n, area in enumerate(areas)]
+        ),
     )
     if abs(mean - TARGET) > TOLERANCE:
         raise SystemExit(1)

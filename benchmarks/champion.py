@@ -1,10 +1,10 @@
 """The champions of the FlyTrack course: ``python -m benchmarks.champion [--names robust] [--seeds 0 1]``.
 
-Two policies, each trained by PPO and then polished, on the identified and extended model of the shipped
-black box: ``flytrack`` for that model as it is, flown on the black box itself; ``robust`` for plants drawn
-around it, flown on 256 of them. What is in runs/champion is not trained again. Of the seeds, the fastest of
-those that finish often enough is shipped in baselines/purejaxrl_ppo/champion; a page compares all with the
-time-optimal flight.
+Two policies, each trained by PPO and then polished, on the identified and extended model of the
+shipped black box: ``flytrack`` for that model as it is, flown on the black box itself; ``robust``
+for plants drawn around it, flown on 256 of them. What is in runs/champion is not trained again. Of
+the seeds, the fastest of those that finish often enough is shipped in
+baselines/purejaxrl_ppo/champion; a page compares all with the time-optimal flight.
 """
 
 import time
@@ -32,7 +32,12 @@ CHAMPION = FOLDER / "flytrack.safetensors"
 MODEL = report.ROOT / "benchmarks" / "data" / "time_optimal" / "black_box.json"
 # Gates are all that counts, wherever they are passed and however hard the sticks are thrown.
 REWARD = {"gate_pass": 5.0, "off_centre": 0.0, "body_rates": 0.0, "action_change": 0.0}
-CHANGES: dict[str, Any] = {"min_std": 0.02, "gate_margin": 0.0, "gae_lambda": 0.98, "num_minibatches": 32}
+CHANGES: dict[str, Any] = {
+    "min_std": 0.02,
+    "gate_margin": 0.0,
+    "gae_lambda": 0.98,
+    "num_minibatches": 32,
+}
 RUNS = Path("runs/champion")
 HEADER = (
     "seed | finish | first lap (s) | flying lap (s) | times the time-optimal | before polishing | PPO (s) | "
@@ -44,9 +49,9 @@ STEPS, FLIGHTS, LAPS, FLIGHT_SEED = 2500, 256, 3, 100
 class Recipe(NamedTuple):
     """How a champion is made and judged.
 
-    env_id: that PPO trains on; changes: of its configuration. settings: of polishing. is_robust: for drawn
-    plants, in polishing and in judging. success: share of flights that has to finish. times_optimal: at
-    most, of the flying lap, the time-optimal one being 1.
+    env_id: that PPO trains on; changes: of its configuration. settings: of polishing. is_robust:
+    for drawn plants, in polishing and in judging. success: share of flights that has to finish.
+    times_optimal: at most, of the flying lap, the time-optimal one being 1.
     """
 
     env_id: str
@@ -67,7 +72,8 @@ RECIPES = {
     "robust": Recipe(
         "FlyTrackRandomized-v0",
         {"gamma": 0.99},
-        # Flights of some plants come near losing control, where a gradient through seconds overflows.
+        # Flights of some plants come near losing control, where a gradient through seconds
+        # overflows.
         Settings(
             updates=1200,
             learning_rate=5e-4,
@@ -98,11 +104,20 @@ def fly(policy: Path, recipe: Recipe) -> Flown:
     episodes, plants = (1, FLIGHTS) if recipe.is_robust else (FLIGHTS, None)
     black_box = None if recipe.is_robust else blackbox.SHIPPED
     settings = EvaluationSettings(
-        policy, STEPS, episodes, LAPS, plants=plants, black_box=black_box, seed=FLIGHT_SEED, ghost=True
+        policy,
+        STEPS,
+        episodes,
+        LAPS,
+        plants=plants,
+        black_box=black_box,
+        seed=FLIGHT_SEED,
+        ghost=True,
     )
     found = evaluate(settings)
     above_percent = float(found.numbers["optimal"]["flying_lap_s"]["mean_percent_above"])
-    return Flown(policy, found, float(found.numbers["success"]["share"]), 1.0 + above_percent / 100.0)
+    return Flown(
+        policy, found, float(found.numbers["success"]["share"]), 1.0 + above_percent / 100.0
+    )
 
 
 def train(name: str, seed: int) -> tuple[Path, Path]:
@@ -110,7 +125,9 @@ def train(name: str, seed: int) -> tuple[Path, Path]:
     recipe, folder = RECIPES[name], RUNS / name / f"seed{seed}"
     before, after = folder / "before.safetensors", folder / f"{name}.safetensors"
     if not before.exists():
-        trained, _ = train_policy(folder, recipe.config, seed, recipe.env_id, model=MODEL, reward=REWARD)
+        trained, _ = train_policy(
+            folder, recipe.config, seed, recipe.env_id, model=MODEL, reward=REWARD
+        )
         save_checkpoint(before, trained.params, trained.config, trained.meta)
     if not after.exists():
         trained = load_checkpoint(before)
@@ -132,7 +149,14 @@ def row_of(seed: int, before: Flown, after: Flown) -> list[str]:
     earlier = f"{before.times_optimal:.3f}, {before.success:.1%}"
     seconds = meta["seconds"], meta["polished"]["seconds"]
     ratio = f"{after.times_optimal:.3f}"
-    return [str(seed), f"{after.success:.1%}", *laps, ratio, earlier, *(f"{one:.0f}" for one in seconds)]
+    return [
+        str(seed),
+        f"{after.success:.1%}",
+        *laps,
+        ratio,
+        earlier,
+        *(f"{one:.0f}" for one in seconds),
+    ]
 
 
 def section_of(name: str, seeds: list[int]) -> tuple[str, bool]:
@@ -140,7 +164,9 @@ def section_of(name: str, seeds: list[int]) -> tuple[str, bool]:
     recipe = RECIPES[name]
     flown = [[fly(policy, recipe) for policy in train(name, seed)] for seed in seeds]
     after = [pair[1] for pair in flown]
-    best = min((one for one in after if one.success >= recipe.success), key=lambda one: one.times_optimal)
+    best = min(
+        (one for one in after if one.success >= recipe.success), key=lambda one: one.times_optimal
+    )
     shipped = FOLDER / best.policy.name
     write_atomically(shipped, best.policy.read_bytes())
     flights = f"--plants {FLIGHTS} --episodes 1" if recipe.is_robust else f"--episodes {FLIGHTS}"
@@ -167,7 +193,9 @@ def section_of(name: str, seeds: list[int]) -> tuple[str, bool]:
         f"PPO on {recipe.env_id}, {recipe.config.total_timesteps / 1e6:.0f} M steps, {changes}; polishing: "
         f"{polished}. Shipped: seed {best.found.checkpoint.meta['seed']}.",
         report.figures_table(figures),
-        report.table(HEADER, [row_of(seed, *pair) for seed, pair in zip(seeds, flown, strict=True)]),
+        report.table(
+            HEADER, [row_of(seed, *pair) for seed, pair in zip(seeds, flown, strict=True)]
+        ),
         f"`flytrack eval --checkpoint {path} --steps {STEPS} {flights} --laps {LAPS} "
         f"--seed {FLIGHT_SEED} --ghost`:",
         "```\n" + best.found.text.replace(f"{report.ROOT}/", "") + "```",

@@ -1,11 +1,11 @@
 """How well the diagnosis names hidden effects, on plants drawn at run time.
 
-``python -m benchmarks.diagnosis [--plants 200] [--rows clean,one,...] [--motion fine,...] [--rate 100,...]``
-flies every plant for a minute (benchmarks.hidden), shows the diagnosis the log and the model without the
-hidden effects, and grades the result by what the log could show (benchmarks.hidden.oracle). It appends a line
-a plant to docs/results/diagnosis.jsonl, with the commit and versions it was measured at, and skips plants
-that have a line of the same commit. ``python -m benchmarks.diagnosis_page`` writes the page of the last
-commit's lines.
+``python -m benchmarks.diagnosis [--plants 200] [--rows clean,one,...] [--motion fine,...] [--rate
+100,...]`` flies every plant for a minute (benchmarks.hidden), shows the diagnosis the log and the
+model without the hidden effects, and grades the result by what the log could show
+(benchmarks.hidden.oracle). It appends a line a plant to docs/results/diagnosis.jsonl, with the
+commit and versions it was measured at, and skips plants that have a line of the same commit.
+``python -m benchmarks.diagnosis_page`` writes the page of the last commit's lines.
 """
 
 import os
@@ -22,7 +22,14 @@ import numpy as np
 
 from benchmarks import hidden
 from benchmarks.hidden.oracle import known, removed, signal_to_noise
-from benchmarks.report import RESULTS, append_line, command, commit_of_checkout, lines_of_commit, progress
+from benchmarks.report import (
+    RESULTS,
+    append_line,
+    command,
+    commit_of_checkout,
+    lines_of_commit,
+    progress,
+)
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis import diagnose
@@ -33,7 +40,11 @@ LINES = RESULTS / "diagnosis.jsonl"
 SECONDS = 60.0
 SEED = 29  # no rule was made on it; on 21 to 28 some were
 # How the package calls the plants' motions.
-MOTION_OF = {"handout": Motion.HANDOUT, "semi_implicit": Motion.SEMI_IMPLICIT, "fine": Motion.CONTINUOUS}
+MOTION_OF = {
+    "handout": Motion.HANDOUT,
+    "semi_implicit": Motion.SEMI_IMPLICIT,
+    "fine": Motion.CONTINUOUS,
+}
 AMPLITUDES = (0.5, 3.0)  # of effects outside the list, times the noise
 Rng = np.random.Generator
 
@@ -115,7 +126,9 @@ def plant(trial: Trial) -> dict[str, Any]:
     elif truth.effects:
         true_model = model._replace(motion=MOTION_OF[truth.motion])
         could = known(clean, log, ~held_out_rows(log), true_model, truth.effects)
-        line["known"] = {name: [float(f"{v:.4g}") for v in one[:2]] + [one[2]] for name, one in could.items()}
+        line["known"] = {
+            name: [float(f"{v:.4g}") for v in one[:2]] + [one[2]] for name, one in could.items()
+        }
         # Of explainable error on a new flight, and how large that is, times the noise.
         share, size = removed(hidden.fly(truth, SECONDS, rng), found.base, found.extended)
         line["removed"] = [round(share, 4), round(size, 4)]
@@ -136,7 +149,11 @@ def _graded(cause: Any, truth: hidden.Truth) -> dict[str, Any]:
     spans = {"onset_s": cause.onset_s, "end_s": cause.end_s}
     return {
         "effect": cause.effect,
-        **{name: [round(x, 3) for x in (one.value, *one.ci95)] for name, one in spans.items() if one},
+        **{
+            name: [round(x, 3) for x in (one.value, *one.ci95)]
+            for name, one in spans.items()
+            if one
+        },
         "equivalent": list(cause.equivalent),
         "gain": float(f"{cause.chi2_gain:.4g}"),
         "heldout": float(f"{cause.heldout_gain:.4g}"),
@@ -150,7 +167,10 @@ def _graded(cause: Any, truth: hidden.Truth) -> dict[str, Any]:
 
 def read_lines(commit: str | None) -> dict[Trial, dict[str, Any]]:
     """Return the lines of a commit by plant; of the last line's if None."""
-    return {Trial(*(line[name] for name in Trial._fields)): line for line in lines_of_commit(LINES, commit)}
+    return {
+        Trial(*(line[name] for name in Trial._fields)): line
+        for line in lines_of_commit(LINES, commit)
+    }
 
 
 def run(trials: list[Trial]) -> None:
@@ -177,9 +197,12 @@ def main(
 ) -> None:
     """Diagnose plants.
 
-    plants: of each row, up to this number; first: from this one on. rate: rows per second of the log.
+    plants: of each row, up to this number; first: from this one on. rate: rows per second of the
+    log.
     """
-    every = product(range(first, plants), rows.split(","), motion.split(","), map(int, rate.split(",")))
+    every = product(
+        range(first, plants), rows.split(","), motion.split(","), map(int, rate.split(","))
+    )
     run([Trial(row, number, seed, moved, one_rate) for number, row, moved, one_rate in every])
 
 

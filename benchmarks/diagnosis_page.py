@@ -86,7 +86,9 @@ def is_onset_right(line: Line) -> bool:
 
 def is_time_told(line: Line) -> bool:
     """Return whether a line says of any cause when it began or ended."""
-    return any("onset_s" in cause or "end_s" in cause for cause in (*line["causes"], *line["negligible"]))
+    return any(
+        "onset_s" in cause or "end_s" in cause for cause in (*line["causes"], *line["negligible"])
+    )
 
 
 def figures(by_row: Rows) -> list[Figure]:
@@ -101,7 +103,8 @@ def figures(by_row: Rows) -> list[Figure]:
     outside = [line for line in by_row["outside"] if line["visible"] >= VISIBLE]
     every = [line for lines in by_row.values() for line in lines]
     controls = {
-        row: [bool(named(line) or line.get("beyond_the_list")) for line in by_row[row]] for row in CONTROLS
+        row: [bool(named(line) or line.get("beyond_the_list")) for line in by_row[row]]
+        for row in CONTROLS
     }
     any_name = [flag for flags in controls.values() for flag in flags]
     others = [line for row in ROWS if row != "onset" for line in by_row[row]]
@@ -149,7 +152,10 @@ def figures(by_row: Rows) -> list[Figure]:
     return [
         *(Figure(name, target, *share(flags)) for name, target, flags in shares),
         Figure(
-            "mean size of a class", "at most 1.5", f"{np.mean(sizes):.2f}" if sizes else "none", len(sizes)
+            "mean size of a class",
+            "at most 1.5",
+            f"{np.mean(sizes):.2f}" if sizes else "none",
+            len(sizes),
         ),
         Figure(
             "explainable error removed on a new flight: median, tenth percentile",
@@ -157,7 +163,12 @@ def figures(by_row: Rows) -> list[Figure]:
             percentiles(removed, 50, 10, unit=" %"),
             len(removed),
         ),
-        Figure("CPU seconds a log: median, 95th percentile", "8, 15", percentiles(cpu_s, 50, 95), len(cpu_s)),
+        Figure(
+            "CPU seconds a log: median, 95th percentile",
+            "8, 15",
+            percentiles(cpu_s, 50, 95),
+            len(cpu_s),
+        ),
     ]
 
 
@@ -167,7 +178,9 @@ def figures_of_motions(by_trial: dict[Trial, Line]) -> str:
     rows = []
     for figure, *others in zip(*columns, strict=True):
         rows.append([*figure, *(cell for other in others for cell in (other.measured, other.n))])
-    return table(["figure", "target", *(head for motion in MOTIONS for head in (motion, "n"))], rows)
+    return table(
+        ["figure", "target", *(head for motion in MOTIONS for head in (motion, "n"))], rows
+    )
 
 
 def figures_of_rates(by_trial: dict[Trial, Line]) -> str:
@@ -184,7 +197,11 @@ def figures_of_rates(by_trial: dict[Trial, Line]) -> str:
 
 def by_row_of(by_trial: dict[Trial, Line], motion: str, rate: int) -> Rows:
     """Return the lines of a motion and rate by row."""
-    chosen = {trial: line for trial, line in by_trial.items() if (trial.motion, trial.rate) == (motion, rate)}
+    chosen = {
+        trial: line
+        for trial, line in by_trial.items()
+        if (trial.motion, trial.rate) == (motion, rate)
+    }
     return {row: [line for trial, line in chosen.items() if trial.row == row] for row in ROWS}
 
 
@@ -206,7 +223,9 @@ def misses(by_trial: dict[Trial, Line]) -> str:
     for trial, line in sorted(by_trial.items()):
         if not is_exact(line) and named(line) != [CLOCK]:
             known = line.get("known", {}).items()
-            could = ", ".join(f"{name} {size:.3g}, {beside:.3g}" for name, (size, beside, _) in known)
+            could = ", ".join(
+                f"{name} {size:.3g}, {beside:.3g}" for name, (size, beside, _) in known
+            )
             flown = f"{trial.motion}, {trial.rate} Hz"
             rows.append((trial.row, flown, line["truth"], could, ", ".join(named(line)) or "none"))
     return table("row | flown | truth | lambda, lambda_sep | named", rows)
@@ -217,7 +236,9 @@ def main() -> None:
     lines = list(read_lines(None).values())
     by_trial = {trial: line for trial, line in read_lines(None).items() if "error" not in line}
     by_row = {row: [line for trial, line in by_trial.items() if trial.row == row] for row in ROWS}
-    singles = [(line["effects"][0], " + ".join(sorted(named(line))) or "none") for line in by_row["one"]]
+    singles = [
+        (line["effects"][0], " + ".join(sorted(named(line))) or "none") for line in by_row["one"]
+    ]
     outside = []
     for line in by_row["outside"]:
         if line["visible"] >= VISIBLE:

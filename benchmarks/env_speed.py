@@ -1,9 +1,10 @@
 """Environment steps per second of process CPU time on one core, beside Pendulum and l2f; races, Gymnasium.
 
-``python -m benchmarks.env_speed [--repeats 7] [--out PAGE]`` prints a table and writes it; with ``--effects``
-that of the step's cost with each effect, and with each motion. Keys and actions
-are drawn before the clock starts; every output of a step is kept, so that nothing of it can be optimised
-away. The contestants take turns, because machines drift: compare ratios of one run, not rates of two runs.
+``python -m benchmarks.env_speed [--repeats 7] [--out PAGE]`` prints a table and writes it; with
+``--effects`` that of the step's cost with each effect, and with each motion. Keys and actions are
+drawn before the clock starts; every output of a step is kept, so that nothing of it can be
+optimised away. The contestants take turns, because machines drift: compare ratios of one run, not
+rates of two runs.
 """
 
 import statistics
@@ -91,7 +92,11 @@ def l2f_contestant(name: str, num_envs: int, length: int) -> Contestant:
 
     vector = l2f.vector_selector[num_envs]
     device, rng, env = l2f.Device(), vector.VectorRng(), vector.VectorEnvironment()
-    parameters, state, next_state = vector.VectorParameters(), vector.VectorState(), vector.VectorState()
+    parameters, state, next_state = (
+        vector.VectorParameters(),
+        vector.VectorState(),
+        vector.VectorState(),
+    )
     vector.initialize_rng(device, rng, 0)
     vector.initialize_environment(device, env)
     vector.sample_initial_parameters(device, env, parameters, rng)
@@ -119,7 +124,9 @@ def l2f_contestant(name: str, num_envs: int, length: int) -> Contestant:
     return Contestant(name, length * num_envs / 1e6, run)
 
 
-def gymnasium_contestant(num_envs: int, length: int, autoreset_mode: str = "SameStep") -> Contestant:
+def gymnasium_contestant(
+    num_envs: int, length: int, autoreset_mode: str = "SameStep"
+) -> Contestant:
     """Return steps through Gymnasium, NumPy in and out: of a vector environment, or of a single one."""
     import gymnasium
     import numpy as np
@@ -150,7 +157,10 @@ def contestants() -> list[Contestant]:
         jax_contestant(BATCH, "FlyTrack-v0", 4096, 200, is_batch=True),
         jax_contestant(SMALL_BATCH, "FlyTrack-v0", 1024, 200, is_batch=True),
         jax_contestant(DUEL, "FlyTrackDuel-v0", 1024, 200, is_batch=True),
-        *(jax_contestant(name, env_id, 1024, 200, is_batch=False) for name, env_id in VARIANTS.items()),
+        *(
+            jax_contestant(name, env_id, 1024, 200, is_batch=False)
+            for name, env_id in VARIANTS.items()
+        ),
         gymnasium_contestant(1024, 200),
         gymnasium_contestant(1024, 200, "NextStep"),
         gymnasium_contestant(1, 2000),
@@ -192,7 +202,9 @@ def effect_costs(repeats: int) -> str:
         entry = jax_contestant(name, "FlyTrack-v0", 1024, 200, is_batch=False, model=model)
         rates = measure([plain, entry], repeats, warm_up=1)
         costs = [a / b for a, b in zip(rates[PLAIN], rates[name], strict=True)]
-        rows.append([*cost_figure(name, statistics.median(costs), repeats), report.spread(costs, ".2f")])
+        rows.append(
+            [*cost_figure(name, statistics.median(costs), repeats), report.spread(costs, ".2f")]
+        )
     return report.table("figure | target | measured | n | lowest to highest", rows)
 
 
@@ -218,7 +230,8 @@ def median_ratio(rates: dict[str, list[float]], name: str, peer: str) -> float:
 def main(repeats: int = 7, out: Path | None = None, effects: bool = False) -> None:
     """Measure, print and write.
 
-    repeats: rounds, at least 5 for figures to publish. out: page. effects: measure the cost of each instead.
+    repeats: rounds, at least 5 for figures to publish. out: page. effects: measure the cost of each
+    instead.
     """
     core = report.pin_to_one_core()
     if effects:
@@ -237,20 +250,27 @@ def main(repeats: int = 7, out: Path | None = None, effects: bool = False) -> No
     )
     figures = [
         report.Figure(
-            f"{name} to {peer}", f"at least {goal:g}", f"{median_ratio(rates, name, peer):.2g}", repeats
+            f"{name} to {peer}",
+            f"at least {goal:g}",
+            f"{median_ratio(rates, name, peer):.2g}",
+            repeats,
         )
         for name, peer, goal in TARGETS
         if peer in rates
     ]
     figures += [
-        cost_figure(f"cost of {name} over the plain step", median_ratio(rates, PLAIN, name), repeats)
+        cost_figure(
+            f"cost of {name} over the plain step", median_ratio(rates, PLAIN, name), repeats
+        )
         for name in VARIANTS
     ]
     report.fill_page(
         out,
         "env_speed",
         ["l2f", "gymnasium"],
-        speeds=report.table("environment | million steps per CPU second, median | lowest to highest", speeds),
+        speeds=report.table(
+            "environment | million steps per CPU second, median | lowest to highest", speeds
+        ),
         figures=report.figures_table(figures),
         repeats=repeats,
         core=core,

@@ -1,10 +1,10 @@
 """How well changes of real firmware and its body are named, given the log and the model of before.
 
-``python -m benchmarks.firmware [--matched 2] [--single 4] [--pairs 8] [--champion 256]`` flies Betaflight
-(docs/firmware.md), makes a model of a nominal set-up from its log, changes a setting or the body, and shows
-``diagnose_change`` the model and the logs before and after. It appends a line each to
-docs/results/firmware.jsonl, and writes tables of the last commit's lines between the marks of
-docs/results/firmware.md.
+``python -m benchmarks.firmware [--matched 2] [--single 4] [--pairs 8] [--champion 256]`` flies
+Betaflight (docs/firmware.md), makes a model of a nominal set-up from its log, changes a setting or
+the body, and shows ``diagnose_change`` the model and the logs before and after. It appends a line
+each to docs/results/firmware.jsonl, and writes tables of the last commit's lines between the marks
+of docs/results/firmware.md.
 """
 
 import time
@@ -67,7 +67,9 @@ def _both(rng: Rng, factor: tuple[float, float], **stock: float) -> dict[str, An
     """Return settings of roll and pitch, all times one factor."""
     times = rng.uniform(*factor)
     return {
-        f"{name}_{axis}": round(times * value) for name, value in stock.items() for axis in ("roll", "pitch")
+        f"{name}_{axis}": round(times * value)
+        for name, value in stock.items()
+        for axis in ("roll", "pitch")
     }
 
 
@@ -79,16 +81,25 @@ def _rates(rng: Rng, center: tuple[float, float], full: tuple[float, float]) -> 
 
 KINDS = {
     "expo": Kind(lambda rng: (_rates(rng, (0.35, 0.65), (62, 62)), {}), ("rate_expo",)),
-    "rates": Kind(lambda rng: (_rates(rng, (1, 1), (70, 85)), {}), ("rate_scale",), ("gyro_scale",)),
+    "rates": Kind(
+        lambda rng: (_rates(rng, (1, 1), (70, 85)), {}), ("rate_scale",), ("gyro_scale",)
+    ),
     "P and D term": Kind(lambda rng: (_both(rng, (0.4, 0.65), p=45, d=30), {}), (GAINS,), RESPONSE),
     "filters": Kind(
         # A dynamic filter would take the static one's place.
-        lambda rng: ({"gyro_lpf1_dyn_min_hz": 0, "gyro_lpf1_static_hz": int(rng.uniform(25, 50))}, {}),
+        lambda rng: (
+            {"gyro_lpf1_dyn_min_hz": 0, "gyro_lpf1_static_hz": int(rng.uniform(25, 50))},
+            {},
+        ),
         (LATE,),
         RESPONSE,
     ),
-    "thrust linearisation": Kind(lambda rng: ({"thrust_linear": int(rng.uniform(60, 120))}, {}), THRUST),
-    "motor output limit": Kind(lambda rng: ({"motor_output_limit": int(rng.uniform(70, 88))}, {}), THRUST),
+    "thrust linearisation": Kind(
+        lambda rng: ({"thrust_linear": int(rng.uniform(60, 120))}, {}), THRUST
+    ),
+    "motor output limit": Kind(
+        lambda rng: ({"motor_output_limit": int(rng.uniform(70, 88))}, {}), THRUST
+    ),
     "a weak motor": Kind(
         lambda rng: (
             {},
@@ -103,12 +114,17 @@ KINDS = {
         ("rotor_drag", "quadratic_drag"),
     ),
     "sag": Kind(
-        lambda rng: ({}, {"resistance_ohm": float(rng.uniform(0.012, 0.03))}), ("voltage_sag",), THRUST
+        lambda rng: ({}, {"resistance_ohm": float(rng.uniform(0.012, 0.03))}),
+        ("voltage_sag",),
+        THRUST,
     ),
     "mass": Kind(lambda rng: ({}, {"mass_kg": float(rng.uniform(1.1, 1.35))}), THRUST),
     "thrust curve": Kind(lambda rng: ({}, {"linear": float(rng.uniform(0.3, 0.7))}), THRUST),
     "bent thrust": Kind(
-        lambda rng: ({}, {"thrust_tilt_rad": (float(rng.choice([-1, 1]) * rng.uniform(0.04, 0.08)), 0.0)}),
+        lambda rng: (
+            {},
+            {"thrust_tilt_rad": (float(rng.choice([-1, 1]) * rng.uniform(0.04, 0.08)), 0.0)},
+        ),
         ("thrust_tilt",),
     ),
     "centre of mass": Kind(
@@ -165,7 +181,9 @@ def places(settings: Mapping[str, Any], body: Body, seed: int) -> np.ndarray:
 
 def graded(trial: Trial, known: Known, seed: int) -> dict[str, Any]:
     """Fly a changed set-up and return how its diagnosis did."""
-    rng = np.random.default_rng([seed, trial.number, *(list(KINDS).index(kind) for kind in trial.kinds)])
+    rng = np.random.default_rng(
+        [seed, trial.number, *(list(KINDS).index(kind) for kind in trial.kinds)]
+    )
     settings, body = dict(SETUPS[trial.setup]), Body()
     for kind in trial.kinds:
         own, fields = KINDS[kind].draw(rng)
@@ -177,7 +195,9 @@ def graded(trial: Trial, known: Known, seed: int) -> dict[str, Any]:
     named = {name: values for one in found.causes for name, values in by_name(one).items()}
     return {
         "settings": settings,
-        "body": {name: value for name, value in vars(body).items() if value != getattr(Body(), name)},
+        "body": {
+            name: value for name, value in vars(body).items() if value != getattr(Body(), name)
+        },
         "apart": round(float(np.median(apart / np.linalg.norm(known.places_m, axis=1))), 4),
         "verdict": found.verdict,
         "found": {k: {p: [v.value, *v.ci95] for p, v in own.items()} for k, own in named.items()},
@@ -192,8 +212,12 @@ def by_name(cause: Cause) -> dict[str, Mapping[str, Any]]:
     """Return a cause's parameters by name; of the loop, by the first of the settings that change together."""
     if cause.effect != "betaflight_loop":
         return {cause.effect: cause.parameters}
-    groups = Candidate(cause.effect, tuple(f"{cause.effect}.{name}" for name in cause.parameters)).groups
-    return {own[0]: {field: cause.parameters[field.split(".")[1]] for field in own} for own in groups}
+    groups = Candidate(
+        cause.effect, tuple(f"{cause.effect}.{name}" for name in cause.parameters)
+    ).groups
+    return {
+        own[0]: {field: cause.parameters[field.split(".")[1]] for field in own} for own in groups
+    }
 
 
 def names_of(kind: str, body: Body) -> tuple[set[str], set[str]]:
@@ -205,7 +229,8 @@ def names_of(kind: str, body: Body) -> tuple[set[str], set[str]]:
 def grade(changes: Sequence[tuple[set[str], set[str]]], names: list[str]) -> dict[str, bool]:
     """Return whether the names are exactly those of what changed, in its classes, and whether one is false.
 
-    changes: as of ``names_of``. Each has at least one of its names, and each name belongs to a change.
+    changes: as of ``names_of``. Each has at least one of its names, and each name belongs to a
+    change.
     """
 
     def fits(classes: Sequence[set[str]]) -> bool:
@@ -223,7 +248,11 @@ def error_ratios(found: Diagnosis) -> dict[str, float]:
     """Return held-out position errors of the extended model over those of the refitted one, by horizon."""
     errors = {name: one.get("position_m", {}) for name, one in found.prediction.errors.items()}
     base = errors.get("refitted_base", {})
-    return {horizon: round(errors["extended"][horizon] / size, 4) for horizon, size in base.items() if size}
+    return {
+        horizon: round(errors["extended"][horizon] / size, 4)
+        for horizon, size in base.items()
+        if size
+    }
 
 
 def tables(lines: list[dict[str, Any]]) -> str:
@@ -236,12 +265,21 @@ def tables(lines: list[dict[str, Any]]) -> str:
         for figure in ("is_exact", "is_in_class", "is_false"):
             name = f"{row} that matters: {figure[3:].replace('_', ' ')}"
             figures.append(report.Figure(name, "", *report.share([line[figure] for line in some])))
-    named = [line["error"] for row in ROWS[1:] for line in by_row[row] if line["found"] and line["error"]]
+    named = [
+        line["error"] for row in ROWS[1:] for line in by_row[row] if line["found"] and line["error"]
+    ]
     if named:
-        worst, last = [max(one.values()) for one in named], [one["1"] for one in named if "1" in one]
+        worst, last = (
+            [max(one.values()) for one in named],
+            [one["1"] for one in named if "1" in one],
+        )
         ratio = "extended over refitted"
-        figures.append(report.Figure(f"{ratio}: largest at any horizon", "", f"{max(worst):.3f}", len(worst)))
-        figures.append(report.Figure(f"{ratio} after 1 s: median", "", f"{np.median(last):.3f}", len(last)))
+        figures.append(
+            report.Figure(f"{ratio}: largest at any horizon", "", f"{max(worst):.3f}", len(worst))
+        )
+        figures.append(
+            report.Figure(f"{ratio} after 1 s: median", "", f"{np.median(last):.3f}", len(last))
+        )
     seconds = [line["cpu_s"] for some in by_row.values() for line in some]
     figures.append(
         report.Figure("CPU s of a diagnosis: median", "", f"{np.median(seconds):.0f}", len(seconds))
@@ -266,11 +304,13 @@ def tables(lines: list[dict[str, Any]]) -> str:
     return "\n\n".join(parts)
 
 
-def main(matched: int = 2, single: int = 4, pairs: int = 8, champion: int = 256, seed: int = SEED) -> None:
+def main(
+    matched: int = 2, single: int = 4, pairs: int = 8, champion: int = 256, seed: int = SEED
+) -> None:
     """Fly, diagnose, and write the lines and the tables.
 
-    matched: flights of each set-up and excitation. single: draws of each kind of change. pairs: set-ups with
-    two changes. champion: starts of it, 0 for none.
+    matched: flights of each set-up and excitation. single: draws of each kind of change. pairs:
+    set-ups with two changes. champion: starts of it, 0 for none.
     """
     rng = np.random.default_rng([seed, 7])
     trials = [
@@ -282,7 +322,9 @@ def main(matched: int = 2, single: int = 4, pairs: int = 8, champion: int = 256,
     sets = [(kind,) for kind in KINDS for _ in range(single)]
     apart = [kind for kind in KINDS if kind != "expo"]  # it is made of the settings of the rates
     sets += [tuple(rng.choice(apart, 2, replace=False).tolist()) for _ in range(pairs)]
-    trials += [Trial(ROWS[len(own)], "stock", "full", own, 10 + number) for number, own in enumerate(sets)]
+    trials += [
+        Trial(ROWS[len(own)], "stock", "full", own, 10 + number) for number, own in enumerate(sets)
+    ]
     commit = report.commit_of_checkout()
     if champion:
         with Betaflight() as plant:
@@ -293,7 +335,9 @@ def main(matched: int = 2, single: int = 4, pairs: int = 8, champion: int = 256,
     for trial in report.progress(trials, "set-ups"):
         key = trial.setup, trial.flown
         known[key] = known.get(key) or know(*key, seed)
-        report.append_line(LINES, {"commit": commit, **trial._asdict(), **graded(trial, known[key], seed)})
+        report.append_line(
+            LINES, {"commit": commit, **trial._asdict(), **graded(trial, known[key], seed)}
+        )
     found = report.lines_of_commit(LINES)
     text = PAGE.read_text(encoding="utf-8")
     before, after = text.split(MARKS[0])[0], text.split(MARKS[1])[1]

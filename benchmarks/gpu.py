@@ -1,10 +1,10 @@
 """FlyTrack on an accelerator: ``python -m benchmarks.gpu [--most 20]``.
 
-The same actions and the same policy in 256 flights on the accelerator and on the CPU; environment steps with
-random actions, observations and resets included, compilation excluded, from 2^10 to 2^20 environments, beside
-gymnax's Pendulum; seeds that train side by side, and a training until 95 % of 256 starts finish. Times are
-wall times. Without an accelerator the page says so and nothing else; ``--cpu`` measures small sizes without a
-page.
+The same actions and the same policy in 256 flights on the accelerator and on the CPU; environment
+steps with random actions, observations and resets included, compilation excluded, from 2^10 to 2^20
+environments, beside gymnax's Pendulum; seeds that train side by side, and a training until 95 % of
+256 starts finish. Times are wall times. Without an accelerator the page says so and nothing else;
+``--cpu`` measures small sizes without a page.
 """
 
 import statistics
@@ -85,9 +85,13 @@ def environments(most: int) -> str:
     """
     rows = []
     for power in report.progress(range(10, most + 1, 2), "size"):
-        rates = [1e6 * rate_of(jax_contestant(one, one, 2**power, LENGTH, is_batch=False)) for one in IDS]
+        rates = [
+            1e6 * rate_of(jax_contestant(one, one, 2**power, LENGTH, is_batch=False)) for one in IDS
+        ]
         rows.append([f"2^{power}", *(f"{rate:.3g}" for rate in rates), f"{0.01 * rates[0]:.3g}"])
-    return report.table(["environments", *(f"{one}, decisions/s" for one in IDS), "simulated s/s"], rows)
+    return report.table(
+        ["environments", *(f"{one}, decisions/s" for one in IDS), "simulated s/s"], rows
+    )
 
 
 def run_and_wait(run: Callable[[], Any]) -> None:
@@ -118,7 +122,8 @@ def race(config: Config) -> str:
 def main(most: int = 20, steps: int = 8_000_000, cpu: bool = False) -> None:
     """Measure, and write the page where there is an accelerator.
 
-    most: environments, as a power of 2. steps: of the training. cpu: print what a CPU does, write nothing.
+    most: environments, as a power of 2. steps: of the training. cpu: print what a CPU does, write
+    nothing.
     """
     path, parts = (None if cpu else PAGE), ["Not measured."]
     if cpu or jax.default_backend() != "cpu":
@@ -131,7 +136,9 @@ def main(most: int = 20, steps: int = 8_000_000, cpu: bool = False) -> None:
         ):
             parts.append(part())
             print(parts[-1], end="\n\n", flush=True)
-        parts.append(f"{jax.devices()[0].device_kind}. {report.provenance_line(report.provenance())}")
+        parts.append(
+            f"{jax.devices()[0].device_kind}. {report.provenance_line(report.provenance())}"
+        )
     report.write_page(path, report.page("On a GPU", f"{report.command_line()}: {WHAT}", *parts))
 
 

@@ -1,9 +1,9 @@
 """How fast racing is learnt from scratch: ``python -m benchmarks.learning_curve [--seeds 5]``.
 
-Trains a short recipe on FlyTrack-v0, one seed after the other, and every quarter of a million environment
-steps flies 256 noisy starts over 3 laps in the simulator. What counts is from when on 95 % of them finish and
-do so at every later evaluation. CPU seconds are those of training alone, without compilation and evaluations.
-Writes a page and a chart.
+Trains a short recipe on FlyTrack-v0, one seed after the other, and every quarter of a million
+environment steps flies 256 noisy starts over 3 laps in the simulator. What counts is from when on
+95 % of them finish and do so at every later evaluation. CPU seconds are those of training alone,
+without compilation and evaluations. Writes a page and a chart.
 """
 
 import time
@@ -61,8 +61,13 @@ def train(trainer: Trainer, seed: int) -> list[Point]:
         started_s = time.process_time()
         runner, _ = jax.block_until_ready(trainer.update(runner))
         cpu_s += time.process_time() - started_s
-        if is_due(update * config.batch_size, EVERY, config.batch_size) or update == config.num_updates:
-            points.append(evaluate(trainer, runner.train_state.params, update * config.batch_size, cpu_s))
+        if (
+            is_due(update * config.batch_size, EVERY, config.batch_size)
+            or update == config.num_updates
+        ):
+            points.append(
+                evaluate(trainer, runner.train_state.params, update * config.batch_size, cpu_s)
+            )
     return points
 
 
@@ -87,7 +92,9 @@ def draw(path: Path, curves: dict[int, list[Point]]) -> None:
     upper, lower = figure.subplots(2, 1, sharex=True)
     for seed, points in curves.items():
         steps = np.array([point.steps for point in points]) / 1e6
-        upper.plot(steps, [100 * point.success for point in points], marker="o", label=f"seed {seed}")
+        upper.plot(
+            steps, [100 * point.success for point in points], marker="o", label=f"seed {seed}"
+        )
         lower.plot(steps, [point.flying_lap_s for point in points], marker="o")
     upper.axhline(100 * TARGET_SUCCESS, color="0.5", linestyle=":")
     upper.set(ylabel=f"{NUM_LAPS} laps completed (%)", title="FlyTrack-v0 from scratch")

@@ -10,7 +10,9 @@ from xml.etree import ElementTree
 
 from benchmarks import report
 
-CLOCKS, CUT_OFF, GROUND = (f"tests/unit/test_{name}.py" for name in ("timestamps", "cut_off_logs", "ground"))
+CLOCKS, CUT_OFF, GROUND = (
+    f"tests/unit/test_{name}.py" for name in ("timestamps", "cut_off_logs", "ground")
+)
 ULOG, DATAFLASH = "tests/unit/test_import_ulog.py", "tests/unit/test_import_dataflash.py"
 
 
@@ -94,5 +96,8 @@ def cell(found: dict[str, bool | None], tests: list[tuple[str, str]]) -> str:
 def fault_table() -> str:
     """Return the table of formats and faults."""
     found = outcomes()
-    rows = [[one.name, *(cell(found, tests_of(one)) for tests_of in COLUMNS.values())] for one in FORMATS]
+    rows = [
+        [one.name, *(cell(found, tests_of(one)) for tests_of in COLUMNS.values())]
+        for one in FORMATS
+    ]
     return report.table(" | ".join(["log", *COLUMNS]), rows)

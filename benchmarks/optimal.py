@@ -1,14 +1,14 @@
 """The time-optimal flight as a nonlinear program: multiple shooting over the simulator's own step.
 
-A flight is cut into segments, one per gate, that end with the step in which the gate is passed. Every
-segment has a whole number of steps of one length, and the point of passing lies on the straight line from
-the last node but one to the last, as ``flytrack_env.race`` has it: at a fraction of that step. With fractions
-held at 1 and free lengths, segments have free times; with lengths held at 0.01 s and free fractions, the
-flight is one of the simulator at 100 Hz, exactly.
+A flight is cut into segments, one per gate, that end with the step in which the gate is passed.
+Every segment has a whole number of steps of one length, and the point of passing lies on the
+straight line from the last node but one to the last, as ``flytrack_env.race`` has it: at a fraction
+of that step. With fractions held at 1 and free lengths, segments have free times; with lengths held
+at 0.01 s and free fractions, the flight is one of the simulator at 100 Hz, exactly.
 
-There is no second copy of the physics: ``flytrack_env.dynamics.advance`` is traced by JAX for one drone of
-scalars and one model, and every operation of the trace is carried out on CasADi symbols, including those of
-all effects.
+There is no second copy of the physics: ``flytrack_env.dynamics.advance`` is traced by JAX for one
+drone of scalars and one model, and every operation of the trace is carried out on CasADi symbols,
+including those of all effects.
 
 From a task to its optimum: coarse from several starts, then fine, then on the simulator's own grid.
 """
@@ -32,7 +32,8 @@ from flytrack_env.tracks import Course, hermite_curve, sample_way
 
 SENSOR = ("sensor",)  # stage of effects that do not change the flight
 CLEARANCE_M = 2e-3  # kept from frames and bounds: float32 replays stray less
-SMOOTHING_S = 1e-6  # s per squared change of a command: prevents chatter, costs less than a millisecond
+# s per squared change of a command: prevents chatter, costs less than a millisecond
+SMOOTHING_S = 1e-6
 ACROSS_M_S = 0.1  # m/s, least speed through a gate in its direction of flight
 SHORTEST_SHARE, LONGEST_SHARE = 0.2, 5.0  # of a free step's length, of its first guess
 LOOSE_UNIT = 1.1  # bound of a component of a unit quaternion, which the step itself normalises
@@ -45,7 +46,11 @@ COARSE_STEP_M = 0.6  # of the path, per step
 FEWEST_STEPS = 4  # of a coarse segment
 QUARTER_TURN = 0.5 * np.pi
 SPEEDS_M_S = (10.0, 16.0)  # of first guesses: gentle, and fast enough to turn upside down
-HEADINGS_RAD = (FOLLOW, 0.0, QUARTER_TURN / 2)  # of first guesses; quarter turns are nearly equivalent
+HEADINGS_RAD = (
+    FOLLOW,
+    0.0,
+    QUARTER_TURN / 2,
+)  # of first guesses; quarter turns are nearly equivalent
 MOST_SHIFTS = 8  # rounds in which gates move to an adjacent step
 NEAR_EDGE = 1e-3  # of a step: a gate this near to the end of its step's range is moved
 COARSE = {"ipopt.max_iter": 400, "ipopt.tol": 1e-5, "ipopt.acceptable_tol": 1e-4}
@@ -59,7 +64,14 @@ OWN_NAMES = {
     operator: ("add", "sub", "mul", "neg", "pow", "lt", "le", "gt", "ge", "eq"),
     casadi: ("exp", "log", "sqrt", "sin", "cos", "tanh", "sign", "floor"),
 }
-NEUTRAL = ("convert_element_type", "broadcast_in_dim", "reshape", "squeeze", "copy", "stop_gradient")
+NEUTRAL = (
+    "convert_element_type",
+    "broadcast_in_dim",
+    "reshape",
+    "squeeze",
+    "copy",
+    "stop_gradient",
+)
 OPERATIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(module, name) for module, names in OWN_NAMES.items() for name in names},
     **dict.fromkeys(NEUTRAL, lambda value: value),
@@ -132,8 +144,13 @@ def step_function(model: ModelParameters) -> casadi.Function:
             return jax.tree.leaves(advance(drone, memories, command, leaves[-1], model)[0])
 
         scalar = jax.ShapeDtypeStruct((), np.float64)
-        trace = jax.make_jaxpr(leaves_after)(*[scalar] * (layout.STATE_SIZE + layout.ACTION_SIZE + 1))
-        state, command = casadi.SX.sym("x", layout.STATE_SIZE), casadi.SX.sym("u", layout.ACTION_SIZE)
+        trace = jax.make_jaxpr(leaves_after)(
+            *[scalar] * (layout.STATE_SIZE + layout.ACTION_SIZE + 1)
+        )
+        state, command = (
+            casadi.SX.sym("x", layout.STATE_SIZE),
+            casadi.SX.sym("u", layout.ACTION_SIZE),
+        )
         dt = casadi.SX.sym("dt")
         arguments = [*casadi.vertsplit(state), *casadi.vertsplit(command), dt]
         after = casadi.vertcat(*_evaluate(trace.jaxpr, trace.consts, arguments))
@@ -168,9 +185,14 @@ class Guess(NamedTuple):
     def closure(self) -> float:
         """Return 1 if the last attitude's quaternion has the sign of the first, else -1.
 
-        Both signs are the same attitude; the sign depends on whole turns, which a search does not change.
+        Both signs are the same attitude; the sign depends on whole turns, which a search does not
+        change.
         """
-        return 1.0 if self.states[0, layout.QUATERNION] @ self.states[-1, layout.QUATERNION] > 0.0 else -1.0
+        return (
+            1.0
+            if self.states[0, layout.QUATERNION] @ self.states[-1, layout.QUATERNION] > 0.0
+            else -1.0
+        )
 
 
 class Solution(NamedTuple):
@@ -221,14 +243,25 @@ def _gate_limits(task: Task, index: int, point: Any, velocity: Any) -> list[Limi
 class Problem:
     """The program of a task and a model for given numbers of steps; solved again from other guesses.
 
-    step: the model's step. needed: the places of the state vector that it depends on. counts: (num_gates,),
-    steps of each segment. closure: as ``Guess.closure`` says, of a flying lap.
+    step: the model's step. needed: the places of the state vector that it depends on. counts:
+    (num_gates,), steps of each segment. closure: as ``Guess.closure`` says, of a flying lap.
     """
 
     def __init__(
-        self, task: Task, step: casadi.Function, needed: list[int], counts: np.ndarray, closure: float
+        self,
+        task: Task,
+        step: casadi.Function,
+        needed: list[int],
+        counts: np.ndarray,
+        closure: float,
     ):
-        self.task, self.step, self.needed, self.counts, self.closure = task, step, needed, counts, closure
+        self.task, self.step, self.needed, self.counts, self.closure = (
+            task,
+            step,
+            needed,
+            counts,
+            closure,
+        )
         self.num_steps, size = int(np.sum(counts)), len(needed)
         self.states = casadi.MX.sym("x", size, self.num_steps + 1)
         self.commands = casadi.MX.sym("u", layout.ACTION_SIZE, self.num_steps)
@@ -289,21 +322,37 @@ class Problem:
         """Return the least and the greatest values of the variables."""
         task, shape = self.task, (len(self.needed), self.num_steps + 1)
         low, high = np.full(shape, -np.inf), np.full(shape, np.inf)
-        low[self.rows(layout.POSITION)] = np.array(task.course.bounds_low, float)[:, None] + CLEARANCE_M
-        high[self.rows(layout.POSITION)] = np.array(task.course.bounds_high, float)[:, None] - CLEARANCE_M
-        low[self.rows(layout.QUATERNION)], high[self.rows(layout.QUATERNION)] = -LOOSE_UNIT, LOOSE_UNIT
+        low[self.rows(layout.POSITION)] = (
+            np.array(task.course.bounds_low, float)[:, None] + CLEARANCE_M
+        )
+        high[self.rows(layout.POSITION)] = (
+            np.array(task.course.bounds_high, float)[:, None] - CLEARANCE_M
+        )
+        low[self.rows(layout.QUATERNION)], high[self.rows(layout.QUATERNION)] = (
+            -LOOSE_UNIT,
+            LOOSE_UNIT,
+        )
         is_given = [place == layout.BATTERY or not task.is_lap for place in self.needed]
         low[is_given, 0] = high[is_given, 0] = task.start[np.array(self.needed)[is_given]]
         if is_on_grid:
             steps, fractions = (guess.steps_s,) * 2, (FRACTION_EDGE, 1.0 - FRACTION_EDGE)
         else:
-            steps, fractions = (SHORTEST_SHARE * guess.steps_s, LONGEST_SHARE * guess.steps_s), (1.0, 1.0)
+            steps, fractions = (
+                (SHORTEST_SHARE * guess.steps_s, LONGEST_SHARE * guess.steps_s),
+                (1.0, 1.0),
+            )
 
-        def stacked(states: np.ndarray, stick: float, step: np.ndarray, fraction: float) -> np.ndarray:
+        def stacked(
+            states: np.ndarray, stick: float, step: np.ndarray, fraction: float
+        ) -> np.ndarray:
             sticks = np.full(layout.ACTION_SIZE * self.num_steps, stick)
-            return np.concatenate([states.ravel("F"), sticks, step, np.full(len(self.counts), fraction)])
+            return np.concatenate(
+                [states.ravel("F"), sticks, step, np.full(len(self.counts), fraction)]
+            )
 
-        return stacked(low, -1.0, steps[0], fractions[0]), stacked(high, 1.0, steps[1], fractions[1])
+        return stacked(low, -1.0, steps[0], fractions[0]), stacked(
+            high, 1.0, steps[1], fractions[1]
+        )
 
     def solve(self, guess: Guess, is_on_grid: bool, options: dict[str, Any]) -> Solution:
         """Return what IPOPT finds from a guess: lengths of steps as in the guess, or free ones.
@@ -316,7 +365,12 @@ class Problem:
         solver = casadi.nlpsol("solver", "ipopt", program, options)
         low, high = self._bounds(guess, is_on_grid)
         start = np.concatenate(
-            [guess.states[:, self.needed].ravel(), guess.commands.ravel(), guess.steps_s, guess.fractions]
+            [
+                guess.states[:, self.needed].ravel(),
+                guess.commands.ravel(),
+                guess.steps_s,
+                guess.fractions,
+            ]
         )
         arguments = {"x0": np.clip(start, low, high), "lbx": low, "ubx": high}
         arguments |= {"lbg": np.repeat([least for _, least, _ in self.limits], sizes)}
@@ -400,7 +454,9 @@ def _attitudes(thrust_w: np.ndarray, velocity: np.ndarray, heading_rad: float | 
     return np.array(quats)
 
 
-def first_guess(task: Task, counts: np.ndarray, speed_m_s: float, heading_rad: float | None) -> Guess:
+def first_guess(
+    task: Task, counts: np.ndarray, speed_m_s: float, heading_rad: float | None
+) -> Guess:
     """Return a flight along the path at one speed, m/s, with a heading, rad, or along the path.
 
     counts: (num_gates,), steps of each segment. The flight satisfies no equation of motion.
@@ -428,12 +484,16 @@ def first_guess(task: Task, counts: np.ndarray, speed_m_s: float, heading_rad: f
     return Guess(states, commands, steps_s, np.ones(len(counts)))
 
 
-def resample(flight: Guess, counts: np.ndarray, new_counts: np.ndarray, steps_s: np.ndarray) -> Guess:
+def resample(
+    flight: Guess, counts: np.ndarray, new_counts: np.ndarray, steps_s: np.ndarray
+) -> Guess:
     """Return a flight resampled to other numbers and lengths of steps of each segment."""
     old = np.concatenate([[0.0], np.cumsum(np.repeat(flight.steps_s, counts))])
     new = np.concatenate([[0.0], np.cumsum(np.repeat(steps_s, new_counts))])
     states = np.stack([np.interp(new, old, column) for column in flight.states.T], axis=1)
-    states[:, layout.QUATERNION] /= np.linalg.norm(states[:, layout.QUATERNION], axis=1, keepdims=True)
+    states[:, layout.QUATERNION] /= np.linalg.norm(
+        states[:, layout.QUATERNION], axis=1, keepdims=True
+    )
     middles = 0.5 * (new[:-1] + new[1:])
     held = np.clip(np.searchsorted(old, middles, side="right") - 1, 0, len(flight.commands) - 1)
     return Guess(states, flight.commands[held], steps_s, flight.fractions)
@@ -448,7 +508,9 @@ class _Search:
         self.needed = needed_states(self.step)
         self.iterations = 0
 
-    def solve(self, guess: Guess, counts: np.ndarray, is_on_grid: bool, options: dict[str, Any]) -> Solution:
+    def solve(
+        self, guess: Guess, counts: np.ndarray, is_on_grid: bool, options: dict[str, Any]
+    ) -> Solution:
         """Return the solution from a guess, for numbers of steps of each segment; counts iterations."""
         problem = Problem(self.task, self.step, self.needed, counts, guess.closure())
         found = problem.solve(guess, is_on_grid, QUIET | options)
@@ -483,7 +545,8 @@ class _Search:
     def on_grid(self, flight: Guess, counts: np.ndarray) -> tuple[Solution, np.ndarray]:
         """Return the optimum in steps of ``dt_s``, every gate passed within the step where it is best.
 
-        Gates at an end of their step move to the next one, as long as that is new and can be solved.
+        Gates at an end of their step move to the next one, as long as that is new and can be
+        solved.
         """
         nodes = np.ceil(flight.times(counts) / self.dt_s).astype(int)
         guess = resample(flight, counts, np.diff(nodes, prepend=0), np.full(len(nodes), self.dt_s))

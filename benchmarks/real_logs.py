@@ -51,7 +51,9 @@ def main(data: Path = DATA, diagnose: str = "") -> None:
     for name in filter(None, diagnose.split(",")):
         folder = data / CRAFTS[name].folder
         if not folder.is_dir():
-            sys.exit(f"skipped: no measured flights at {folder}; --data or {VARIABLE} names their folder")
+            sys.exit(
+                f"skipped: no measured flights at {folder}; --data or {VARIABLE} names their folder"
+            )
         try:
             write_json(kept(name), CRAFTS[name].measure(data))
         except LogError as error:

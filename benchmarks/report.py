@@ -1,6 +1,7 @@
 """What all benchmarks share: tables and pages in Markdown, and a record of what was measured where and when.
 
-Nothing here imports JAX at the top, so that ``pin_to_one_core`` can run before JAX starts its threads.
+Nothing here imports JAX at the top, so that ``pin_to_one_core`` can run before JAX starts its
+threads.
 """
 
 import json
@@ -53,7 +54,9 @@ def commit_of_checkout() -> str:
     """Return the checkout's commit, with ``-dirty`` if tracked files but results have changed since."""
 
     def git(*command: str) -> str:
-        run = subprocess.run(["git", *command], cwd=ROOT, check=True, capture_output=True, text=True)
+        run = subprocess.run(
+            ["git", *command], cwd=ROOT, check=True, capture_output=True, text=True
+        )
         return run.stdout.strip()
 
     try:
@@ -139,7 +142,9 @@ def page(title: str, *parts: str) -> str:
 
 def filled(name: str, /, **values: Any) -> str:
     """Return a template of ``benchmarks/pages`` with values filled in."""
-    return (ROOT / "benchmarks" / "pages" / f"{name}.md").read_text(encoding="utf-8").format(**values)
+    return (
+        (ROOT / "benchmarks" / "pages" / f"{name}.md").read_text(encoding="utf-8").format(**values)
+    )
 
 
 def fill_page(path: Path | None, name: str, /, packages: Sequence[str] = (), **values: Any) -> None:
@@ -147,7 +152,11 @@ def fill_page(path: Path | None, name: str, /, packages: Sequence[str] = (), **v
 
     ``{command}`` and ``{provenance}`` need not be given. packages: as for ``provenance``.
     """
-    values = {"command": command_line(), "provenance": provenance_line(provenance(*packages)), **values}
+    values = {
+        "command": command_line(),
+        "provenance": provenance_line(provenance(*packages)),
+        **values,
+    }
     write_page(path, filled(name, **values))
 
 

@@ -1,8 +1,8 @@
 """The suite of ``flytrack_bench``: ``python -m benchmarks.suite [--draw] [--page]``.
 
-``--draw`` draws the tracks and hidden plants of suite v1 from its seed and writes them; a test compares them
-with those that are shipped. ``--page`` writes docs/benchmark.md of the results in docs/results/suite, which
-``flytrack bench`` wrote.
+``--draw`` draws the tracks and hidden plants of suite v1 from its seed and writes them; a test
+compares them with those that are shipped. ``--page`` writes docs/benchmark.md of the results in
+docs/results/suite, which ``flytrack bench`` wrote.
 """
 
 import dataclasses
@@ -18,7 +18,8 @@ from flytrack_env.references import shipped_reference, track_digest
 
 SEED, START_SEED = 2026, 7
 TRACK_SEEDS = {"random_1": 101, "random_2": 102, "random_3": 103}
-# python -m benchmarks.time_optimal --tracks flytrack_bench/suites/v1/random_{1,2,3}.toml --kinds flying
+# python -m benchmarks.time_optimal --tracks flytrack_bench/suites/v1/random_{1,2,3}.toml --kinds
+# flying
 OPTIMAL_S = {"random_1": 4.4545, "random_2": 6.2877, "random_3": 5.8095}
 PLANTS = range(3, 11)  # of ``draw_plant``: two, three and five effects each
 RESULTS = report.RESULTS / "suite"
@@ -28,11 +29,18 @@ PAGE = report.ROOT / "docs" / "benchmark.md"
 def draw_suite(folder: Path) -> None:
     """Write suite v1 into a folder: its tracks and its file."""
     for name, seed in TRACK_SEEDS.items():
-        save_track(folder / "v1" / f"{name}.toml", dataclasses.replace(random_track(seed), name=name))
-    own = {name: (f"v1/{name}.toml", load_track(folder / "v1" / f"{name}.toml")) for name in TRACK_SEEDS}
+        save_track(
+            folder / "v1" / f"{name}.toml", dataclasses.replace(random_track(seed), name=name)
+        )
+    own = {
+        name: (f"v1/{name}.toml", load_track(folder / "v1" / f"{name}.toml"))
+        for name in TRACK_SEEDS
+    }
     flytrack, optimal_s = load_track("flytrack"), shipped_reference("flytrack").time_s
     tasks = [_task("flytrack", "flytrack", flytrack, optimal_s, None)]
-    tasks += [_task(name, file, track, OPTIMAL_S[name], None) for name, (file, track) in own.items()]
+    tasks += [
+        _task(name, file, track, OPTIMAL_S[name], None) for name, (file, track) in own.items()
+    ]
     for place, number in enumerate(PLANTS):
         craft = craft_as_json(draw_plant(number, SEED))
         tasks.append(_task(f"plant_{place + 1}", "flytrack", flytrack, optimal_s, craft))
@@ -69,7 +77,11 @@ def row(path: Path) -> list[str]:
         share = sum(values) / len(values)
         return f"{share:.1%}" if name == "success" else f"{share:.3f}"
 
-    groups = (["flytrack"], list(TRACK_SEEDS), [f"plant_{place + 1}" for place in range(len(PLANTS))])
+    groups = (
+        ["flytrack"],
+        list(TRACK_SEEDS),
+        [f"plant_{place + 1}" for place in range(len(PLANTS))],
+    )
     cells = [f"{mean(ids, 'success')}, {mean(ids, 'over_optimal')}" for ids in groups]
     score = found["summary"]["score"]
     interval = "" if score["ci95"] is None else " ({:.3f} to {:.3f})".format(*score["ci95"])

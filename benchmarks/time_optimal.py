@@ -1,8 +1,9 @@
 """The time-optimal flying lap and standing start of a track: ``python -m benchmarks.time_optimal``.
 
-Finds them with CasADi and IPOPT (``pip install .[optimal]``), writes them as data, replays them in the
-simulator and writes docs/results/time_optimal.md. With ``--verify`` it only replays existing files, which
-needs no solver. In Python: ``flytrack_env.references.shipped_reference("flytrack", "flying").time_s``.
+Finds them with CasADi and IPOPT (``pip install .[optimal]``), writes them as data, replays them in
+the simulator and writes docs/results/time_optimal.md. With ``--verify`` it only replays existing
+files, which needs no solver. In Python: ``flytrack_env.references.shipped_reference("flytrack",
+"flying").time_s``.
 """
 
 from functools import cache
@@ -55,11 +56,14 @@ def start_state(track: Track, battery_v: float) -> np.ndarray:
 def drained_in_float32(model: ModelParameters, start: np.ndarray, dt_s: float) -> ModelParameters:
     """Return the model with the battery drain that results from float32, for the optimiser in float64.
 
-    A step drains so little that rounding the voltage changes the drain by up to a percent, in every step the
-    same way: millimetres on a path, after seconds. start: (21,), the state at which rounding is measured.
+    A step drains so little that rounding the voltage changes the drain by up to a percent, in every
+    step the same way: millimetres on a path, after seconds. start: (21,), the state at which
+    rounding is measured.
     """
     rounded = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), model._replace(effects=()))
-    after = step(jnp.asarray(start, jnp.float32), jnp.zeros(layout.ACTION_SIZE), np.float32(dt_s), rounded)
+    after = step(
+        jnp.asarray(start, jnp.float32), jnp.zeros(layout.ACTION_SIZE), np.float32(dt_s), rounded
+    )
     drained_v = float(np.float32(start[layout.BATTERY])) - float(after[layout.BATTERY])
     return model._replace(battery_drain_v_per_min=drained_v / dt_s * SECONDS_PER_MINUTE)
 
@@ -107,9 +111,10 @@ def optimise(track: Track, kind: str, model: ModelParameters, model_name: str) -
 class Replay(NamedTuple):
     """The outcome of a reference's commands.
 
-    states: (N + 1, 21), float32. gates_passed: in order, by the environment. time_s: to the last gate as the
-    environment interpolates it, NaN if it was not passed. ended_by: causes of termination. drift_m: largest
-    distance from the reference. frames_touched: of all gates, also those that were not next.
+    states: (N + 1, 21), float32. gates_passed: in order, by the environment. time_s: to the last
+    gate as the environment interpolates it, NaN if it was not passed. ended_by: causes of
+    termination. drift_m: largest distance from the reference. frames_touched: of all gates, also
+    those that were not next.
     """
 
     states: np.ndarray
@@ -135,8 +140,8 @@ def _environment(plant: Plant | None) -> tuple[FlyTrack, Any]:
 def replay(reference: Reference, track: Track, plant: Plant | None = None) -> Replay:
     """Return how a reference's commands fly, open loop, as judged by the environment.
 
-    The environment is that of ``FlyTrack-v0`` with the reference's model, float32, or with another plant,
-    such as a black box; the flight ends at the first cause of termination.
+    The environment is that of ``FlyTrack-v0`` with the reference's model, float32, or with another
+    plant, such as a black box; the flight ends at the first cause of termination.
     """
     env, step = _environment(plant)
     model = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), reference.model)
@@ -151,7 +156,9 @@ def replay(reference: Reference, track: Track, plant: Plant | None = None) -> Re
     is_over = np.any(np.stack(causes), axis=0)
     last = int(np.argmax(is_over)) if is_over.any() else len(steps) - 1
     states = np.concatenate([np.asarray(first)[None], packed[: last + 1]])
-    drift = np.linalg.norm(states[:, layout.POSITION] - reference.states[: last + 2, layout.POSITION], axis=1)
+    drift = np.linalg.norm(
+        states[:, layout.POSITION] - reference.states[: last + 2, layout.POSITION], axis=1
+    )
     race = jax.tree.map(lambda leaf: leaf[last], races)
     ends = (states[:-1, layout.POSITION], states[1:, layout.POSITION])
     begin, end = (Vec3(*(jnp.asarray(axis)[:, None] for axis in points.T)) for points in ends)
@@ -169,14 +176,18 @@ def replay(reference: Reference, track: Track, plant: Plant | None = None) -> Re
 def is_verified(reference: Reference, flown: Replay) -> bool:
     """Return whether a replay passed every gate, touched no frame and took the expected time."""
     is_whole = flown.gates_passed == len(reference.gate_times_s) and not flown.ended_by
-    return is_whole and flown.frames_touched == 0 and abs(flown.time_s - reference.time_s) <= LARGEST_ERROR_S
+    return (
+        is_whole
+        and flown.frames_touched == 0
+        and abs(flown.time_s - reference.time_s) <= LARGEST_ERROR_S
+    )
 
 
 def verified(folder: Path, tracks: list[Track]) -> tuple[list[tuple[Reference, str, Replay]], bool]:
     """Return a folder's references with their replays, and whether those in the reference's model are right.
 
-    References of the model ``black_box`` are flown on the shipped black box as well. tracks: where references
-    may be of tracks that are not shipped.
+    References of the model ``black_box`` are flown on the shipped black box as well. tracks: where
+    references may be of tracks that are not shipped.
 
     Raises:
         files.ReferenceFileError, TrackError: a file that cannot be used, or no references.
@@ -192,7 +203,9 @@ def verified(folder: Path, tracks: list[Track]) -> tuple[list[tuple[Reference, s
     ):
         track = known.get(reference.track) or flytrack_env.load_track(reference.track)
         flown = replay(reference, track)
-        is_good &= is_verified(reference, flown) and files.track_digest(track) == reference.track_sha256
+        is_good &= (
+            is_verified(reference, flown) and files.track_digest(track) == reference.track_sha256
+        )
         replays.append((reference, "simulator", flown))
         if reference.model_name == BLACK_BOX:
             replays.append((reference, "black box", replay(reference, track, plant)))
@@ -244,7 +257,8 @@ def _replay_row(reference: Reference, flown_by: str, flown: Replay) -> tuple[Any
 def write_page(path: Path | None, replays: list[tuple[Reference, str, Replay]]) -> None:
     """Print, and write unless the path is None, the tables of references and their replays.
 
-    replays: references, the plants that flew them, and the replays; a reference may occur several times.
+    replays: references, the plants that flew them, and the replays; a reference may occur several
+    times.
     """
     references = list({id(found): found for found, _, _ in replays}.values())
     notes = [reference.found for reference in references]
@@ -283,16 +297,21 @@ def main(
 ) -> None:
     """Find references, replay all and write the page; exit 1 if a replay is not as it should be.
 
-    tracks: names or files. model: file; by default the simulator's nominal model. verify: only replay
-    existing references. out: their folder. page: to write, with pictures beside it.
+    tracks: names or files. model: file; by default the simulator's nominal model. verify: only
+    replay existing references. out: their folder. page: to write, with pictures beside it.
     """
     known = list(map(flytrack_env.load_track, tracks))
     if not verify:
-        named = (nominal(), NOMINAL) if model is None else (flytrack_env.load_model(model), model.stem)
+        named = (
+            (nominal(), NOMINAL) if model is None else (flytrack_env.load_model(model), model.stem)
+        )
         for track, kind in product(known, kinds):
             found = optimise(track, kind, *named)
             files.save_reference(out / f"{track.name}_{found.model_name}_{kind}.npz", found)
-            print(f"{track.name} {kind}: {found.time_s:.4f} s, {found.found['cpu_s']} CPU s", flush=True)
+            print(
+                f"{track.name} {kind}: {found.time_s:.4f} s, {found.found['cpu_s']} CPU s",
+                flush=True,
+            )
     replays, is_good = verified(out, known)
     write_page(page, replays)
     if page is not None:

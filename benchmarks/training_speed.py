@@ -1,8 +1,9 @@
 """Training speed on one core, and what it costs to watch: ``python -m benchmarks.training_speed``.
 
 Trains the default recipe for a number of steps, alone and with all that the command does by default
-(checkpoints, evaluations with their charts, MLflow with a local store), in turns, and counts process CPU
-time. Compilation and imports happen before: a first run, which is not counted, does them.
+(checkpoints, evaluations with their charts, MLflow with a local store), in turns, and counts
+process CPU time. Compilation and imports happen before: a first run, which is not counted, does
+them.
 """
 
 import statistics
@@ -22,15 +23,17 @@ from benchmarks import report
 TARGET_STEPS_PER_S, TARGET_COST, LIMIT_REPEATS = 800_000, 0.1, 5
 ALL_ON = "steps per CPU second with everything on"
 COST = "cost of checkpoints, evaluations, charts and MLflow, a new store included"
-BOUND = "steps per CPU second if products of matrices, at the best rate of this core, were all there is"
+BOUND = (
+    "steps per CPU second if products of matrices, at the best rate of this core, were all there is"
+)
 
 
 def matrix_limit(trainer: Trainer) -> float:
     """Return the steps a CPU second if products of matrices at this core's best rate were all there is.
 
     The best rate: a chain of products of a minibatch and a layer, which stay in the cache. A step
-    takes a product with every weight to act, one to learn, one for the gradient of the weights, and one for
-    that of the inputs except in the first layer.
+    takes a product with every weight to act, one to learn, one for the gradient of the weights, and
+    one for that of the inputs except in the first layer.
     """
     width, chain = trainer.config.hidden_sizes[0], 200
     rows = trainer.config.batch_size // trainer.config.num_minibatches
@@ -47,7 +50,11 @@ def matrix_limit(trainer: Trainer) -> float:
     leaves = jax.tree.leaves(trainer.start(jax.random.key(0)).train_state.params)
     sizes = [leaf.shape for leaf in leaves if leaf.ndim == 2]
     all_weights = sum(rows * columns for rows, columns in sizes)
-    first = sum(rows * columns for rows, columns in sizes if rows == trainer.env.observation_space().shape[0])
+    first = sum(
+        rows * columns
+        for rows, columns in sizes
+        if rows == trainer.env.observation_space().shape[0]
+    )
     return products_per_s / (4 * all_weights - first)
 
 
@@ -72,7 +79,10 @@ def main(total_timesteps: float = Config.total_timesteps, repeats: int = 1) -> N
         for name, options in modes.items():
             rates[name].append(measure(trainer, options, is_tracked=options is DEFAULT_OPTIONS))
             print(f"{name}: {rates[name][-1]:,.0f} steps per CPU s", flush=True)
-    rows = [[name, f"{statistics.median(found):,.0f}", report.spread(found)] for name, found in rates.items()]
+    rows = [
+        [name, f"{statistics.median(found):,.0f}", report.spread(found)]
+        for name, found in rates.items()
+    ]
     alone, watched = (statistics.median(found) for found in rates.values())
     cost = 1.0 - watched / alone
     limit = statistics.median(matrix_limit(trainer) for _ in range(LIMIT_REPEATS))

@@ -88,7 +88,9 @@ def static_thrust(thrust_action: jax.Array, volt: jax.Array, coeffs: jax.Array) 
     return jnp.maximum(jnp.sum(coeffs * terms), 0.0)
 
 
-def translational_lift_factor(airspeed_b: jax.Array, gain: jax.Array, half_speed: jax.Array) -> jax.Array:
+def translational_lift_factor(
+    airspeed_b: jax.Array, gain: jax.Array, half_speed: jax.Array
+) -> jax.Array:
     """Return the factor on thrust of flying edgewise: 1 at rest, 1 + gain far above half_speed.
 
     ``airspeed_b``: (3,) m/s. ``half_speed``: m/s. A saturating fit of momentum theory: a rotor that
@@ -163,4 +165,6 @@ def step(x: jax.Array, u: jax.Array, parameters: PlantParameters) -> jax.Array:
     velocity_w = x[3:6] + accel_w * DT_S
     volt = x[20] - parameters.battery_drain * (DT_S / SECONDS_PER_MINUTE)
     attitude = turned(x[9:13], rates_b)
-    return jnp.concatenate([position_w, velocity_w, accel_w, attitude, rates_b, applied, volt[None]])
+    return jnp.concatenate(
+        [position_w, velocity_w, accel_w, attitude, rates_b, applied, volt[None]]
+    )

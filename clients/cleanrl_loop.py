@@ -32,5 +32,7 @@ def measure(seed: int) -> Outcome:
             episode = infos.get("episode", {"r": nothing})
             results.append((done, episode["r"], infos.get("gates_passed", nothing)))
             observations, had_ended = following, done
-        training = learn(training, key, observations, tuple(map(np.stack, zip(*steps, strict=True))))
+        training = learn(
+            training, key, observations, tuple(map(np.stack, zip(*steps, strict=True)))
+        )
     return outcome_of(*map(np.stack, zip(*results, strict=True)))

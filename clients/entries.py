@@ -1,6 +1,7 @@
 """Policies of other trainers for ``flytrack bench``: ``clients.entries:sb3_0`` is that of seed 0.
 
-Each is trained when it is asked for, on FlyTrack-v0, by the settings of this folder and for so many steps.
+Each is trained when it is asked for, on FlyTrack-v0, by the settings of this folder and for so many
+steps.
 """
 
 from collections.abc import Callable
@@ -64,5 +65,7 @@ TRAINERS = {"sb3": sb3, "rejax": rejax, "evosax": evosax}
 def __getattr__(name: str) -> Act:
     trainer, _, seed = name.rpartition("_")
     if trainer not in TRAINERS or not seed.isdecimal():
-        raise AttributeError(f"found {name}, expected one of {', '.join(TRAINERS)}, and a seed: sb3_0")
+        raise AttributeError(
+            f"found {name}, expected one of {', '.join(TRAINERS)}, and a seed: sb3_0"
+        )
     return TRAINERS[trainer](int(seed))

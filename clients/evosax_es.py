@@ -26,7 +26,9 @@ def evaluate(problem: GymnaxProblem, network: Any, problem_state: Any) -> tuple[
     network: the policy's variables. problem_state: how observations are normalised.
     """
     num_steps = problem.episode_length
-    many = GymnaxProblem(problem.env_name, problem.policy, episode_length=num_steps, num_rollouts=NUM_FLIGHTS)
+    many = GymnaxProblem(
+        problem.env_name, problem.policy, episode_length=num_steps, num_rollouts=NUM_FLIGHTS
+    )
     key = jax.random.key(EVALUATION_SEED)
     returns, _, _ = many.eval(key, jax.tree.map(lambda leaf: leaf[None], network), problem_state)
 

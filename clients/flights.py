@@ -33,7 +33,8 @@ def mean_gates(
 ) -> float:
     """Return the gates passed in an episode, mean over ``NUM_FLIGHTS`` episodes on the same starts.
 
-    act: observation and key to action. env: with gymnax's 6-value step. num_steps: of the longest episode.
+    act: observation and key to action. env: with gymnax's 6-value step. num_steps: of the longest
+    episode.
     """
 
     def fly(key: jax.Array) -> jax.Array:
@@ -44,7 +45,9 @@ def mean_gates(
             observation, state, gates, has_ended = carry
             act_key, step_key = jax.random.split(key)
             action = act(observation, act_key)
-            observation, state, _, terminated, truncated, info = env.step(step_key, state, action, params)
+            observation, state, _, terminated, truncated, info = env.step(
+                step_key, state, action, params
+            )
             gates = jnp.where(has_ended, gates, info["gates_passed"])
             return (observation, state, gates, has_ended | terminated | truncated), None
 
@@ -57,10 +60,13 @@ def mean_gates(
 def outcome_of(done: Any, returns: Any, gates: Any) -> Outcome:
     """Return the mean results of the episodes that ended in the first and in the last tenth of a training.
 
-    Of every step, (num_updates, ...): whether an episode ended, and its return and gates where it did.
+    Of every step, (num_updates, ...): whether an episode ended, and its return and gates where it
+    did.
     """
     done, returns, gates = map(np.asarray, (done, returns, gates))
     tenth = max(1, len(done) // 10)
     parts = slice(tenth), slice(-tenth, None)
-    means = [float(values[part][done[part]].mean()) for values in (returns, gates) for part in parts]
+    means = [
+        float(values[part][done[part]].mean()) for values in (returns, gates) for part in parts
+    ]
     return Outcome(*means)

@@ -41,8 +41,9 @@ def act(training: Any, observations: Any, key: jax.Array) -> jax.Array:
 def learn(training: Any, key: jax.Array, last: Any, steps: Any) -> Any:
     """Return the training after a flight. A truncation counts as an end.
 
-    last: observations after the flight. steps: observations before each step, actions, rewards, whether the
-    episode ended and whether the step counts, which a reset does not, (NUM_STEPS, NUM_ENVS, ...).
+    last: observations after the flight. steps: observations before each step, actions, rewards,
+    whether the episode ended and whether the step counts, which a reset does not, (NUM_STEPS,
+    NUM_ENVS, ...).
     """
     observations, actions, rewards, done, counts = steps
     everything = jnp.concatenate([observations, last[None]])
@@ -73,4 +74,6 @@ def learn(training: Any, key: jax.Array, last: Any, steps: Any) -> Any:
         return (optax.apply_updates(training[0], changes), memory), None
 
     orders = [jax.random.permutation(each, done.size) for each in jax.random.split(key, NUM_EPOCHS)]
-    return jax.lax.scan(improve, training, jnp.stack(orders).reshape(NUM_EPOCHS * NUM_MINIBATCHES, -1))[0]
+    return jax.lax.scan(
+        improve, training, jnp.stack(orders).reshape(NUM_EPOCHS * NUM_MINIBATCHES, -1)
+    )[0]

@@ -6,7 +6,15 @@ Runs the training of ``make test-clients`` for several seeds and writes a table 
 import time
 
 from benchmarks import report
-from clients import cleanrl_loop, evosax_es, purejaxrl_loop, rejax_ppo, sb3_ppo, sbx_ppo, torchrl_ppo
+from clients import (
+    cleanrl_loop,
+    evosax_es,
+    purejaxrl_loop,
+    rejax_ppo,
+    sb3_ppo,
+    sbx_ppo,
+    torchrl_ppo,
+)
 
 CLIENTS = {
     "rejax": rejax_ppo,

@@ -27,7 +27,9 @@ def measure(seed: int) -> Outcome:
         return (training, *outputs[:2]), (observations, actions, outputs[2], outputs[5])
 
     def update(carry: Any, key: jax.Array) -> Any:
-        (training, *now), (*steps, info) = jax.lax.scan(step, carry, jax.random.split(key, NUM_STEPS))
+        (training, *now), (*steps, info) = jax.lax.scan(
+            step, carry, jax.random.split(key, NUM_STEPS)
+        )
         done = info["returned_episode"]
         training = learn(training, key, now[0], (*steps, done, jnp.ones(done.shape)))
         return (training, *now), (done, info["returned_episode_returns"], info["gates_passed"])
@@ -35,6 +37,8 @@ def measure(seed: int) -> Outcome:
     @jax.jit
     def train(key: jax.Array) -> Any:
         start = jax.vmap(env.reset, (0, None))(jax.random.split(key, NUM_ENVS), params)
-        return jax.lax.scan(update, (begin(key, start[0]), *start), jax.random.split(key, NUM_UPDATES))[1]
+        return jax.lax.scan(
+            update, (begin(key, start[0]), *start), jax.random.split(key, NUM_UPDATES)
+        )[1]
 
     return outcome_of(*train(jax.random.key(seed)))

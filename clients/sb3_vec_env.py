@@ -11,15 +11,17 @@ from stable_baselines3.common.vec_env import VecEnv
 class SameStepVecEnv(VecEnv):
     """Adapt a Gymnasium vector environment that resets in the same step to Stable-Baselines3.
 
-    Only infos of ended episodes are passed on, with ``terminal_observation`` and ``TimeLimit.truncated``; the
-    others are empty, because a dict per environment and step costs more than the step.
-    Raises ValueError for an environment that does not reset in the same step.
+    Only infos of ended episodes are passed on, with ``terminal_observation`` and
+    ``TimeLimit.truncated``; the others are empty, because a dict per environment and step costs
+    more than the step. Raises ValueError for an environment that does not reset in the same step.
     """
 
     def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any]):
         mode = env.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
-            raise ValueError(f"env: found autoreset_mode {mode}, expected {AutoresetMode.SAME_STEP}")
+            raise ValueError(
+                f"env: found autoreset_mode {mode}, expected {AutoresetMode.SAME_STEP}"
+            )
         self.env = env
         self._actions = np.zeros(0)
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
@@ -29,7 +31,9 @@ class SameStepVecEnv(VecEnv):
         # Stable-Baselines3 has a None per environment where Gymnasium has a single None.
         seeds: Any = None if None in self._seeds else list(self._seeds)
         if any(options != self._options[0] for options in self._options):
-            raise ValueError(f"options: found {self._options}, expected the same for every environment")
+            raise ValueError(
+                f"options: found {self._options}, expected the same for every environment"
+            )
         observations, _ = self.env.reset(seed=seeds, options=self._options[0] or None)
         self._reset_seeds()
         self._reset_options()
@@ -68,9 +72,13 @@ class SameStepVecEnv(VecEnv):
         """Raise NotImplementedError: one compiled program steps all environments."""
         raise NotImplementedError(f"set_attr({attr_name!r}): all environments share one program")
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any
+    ) -> list[Any]:
         """Raise NotImplementedError: one compiled program steps all environments."""
-        raise NotImplementedError(f"env_method({method_name!r}): all environments share one program")
+        raise NotImplementedError(
+            f"env_method({method_name!r}): all environments share one program"
+        )
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """Return that no environment has a wrapper of its own."""

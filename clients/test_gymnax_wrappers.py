@@ -21,7 +21,9 @@ def fly_at_random(env: Any, params: Any) -> tuple[Any, Any]:
     Keys and actions do not depend on the wrapper, so that two flights can be compared.
     """
     reset_key, steps_key = jax.random.split(jax.random.key(0))
-    observations, states = jax.vmap(env.reset, (0, None))(jax.random.split(reset_key, NUM_ENVS), params)
+    observations, states = jax.vmap(env.reset, (0, None))(
+        jax.random.split(reset_key, NUM_ENVS), params
+    )
 
     def step(states: Any, key: jax.Array) -> tuple[Any, Any]:
         keys = jax.random.split(key, NUM_ENVS)
@@ -66,6 +68,8 @@ def test_gymnax_to_gym_wrapper_flies_what_the_environment_flies(env_id: str) -> 
         action = wrapped.action_space.sample()
         observation, *outcome, info = wrapped.step(action)
         key, step_key = jax.random.split(key)
-        expected, state, *expected_outcome, expected_info = env.step(step_key, state, action, params)
+        expected, state, *expected_outcome, expected_info = env.step(
+            step_key, state, action, params
+        )
         np.testing.assert_allclose(outcome, expected_outcome, atol=1e-5)
         assert set(info) == set(expected_info)

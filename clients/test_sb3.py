@@ -31,7 +31,9 @@ def test_check_env_passes_without_a_warning(env_id: str) -> None:
 
 
 def test_ppo_learns_from_a_single_environment() -> None:
-    model = PPO("MlpPolicy", "flytrack_env:FlyTrack-v0", n_steps=128, batch_size=64, device="cpu", seed=0)
+    model = PPO(
+        "MlpPolicy", "flytrack_env:FlyTrack-v0", n_steps=128, batch_size=64, device="cpu", seed=0
+    )
     model.learn(256)
     assert all(np.isfinite(values.detach().numpy()).all() for values in model.policy.parameters())
 
@@ -51,7 +53,9 @@ def test_the_adapter_passes_on_the_ends_of_episodes() -> None:
         assert [bool(info) for info in infos] == done.tolist()
         for index in np.flatnonzero(done):
             info = infos[index]
-            np.testing.assert_array_equal(info["terminal_observation"], plain_infos["final_obs"][index])
+            np.testing.assert_array_equal(
+                info["terminal_observation"], plain_infos["final_obs"][index]
+            )
             assert info["TimeLimit.truncated"] == (truncated[index] and not terminated[index])
             assert info["gates_passed"] == plain_infos["final_info"]["gates_passed"][index]
             ended.append(info["TimeLimit.truncated"])

@@ -49,7 +49,11 @@ def test_evosax_evaluates_a_population(env_id: str) -> None:
         population = jax.vmap(problem.sample)(jax.random.split(key, POPULATION_SIZE))
         return problem.eval(key, population, problem.init(key))[:2]
 
-    fitness, problem_state = jax.jit(evaluate)(jax.random.key(0))  # one compilation instead of three
+    fitness, problem_state = jax.jit(evaluate)(
+        jax.random.key(0)
+    )  # one compilation instead of three
     assert fitness.shape == (POPULATION_SIZE,)
     assert np.isfinite(fitness).all() and len(np.unique(fitness)) > POPULATION_SIZE // 2
-    assert np.isfinite(problem_state.obs_mean).all() and (np.asarray(problem_state.obs_std) > 0).any()
+    assert (
+        np.isfinite(problem_state.obs_mean).all() and (np.asarray(problem_state.obs_std) > 0).any()
+    )

@@ -23,7 +23,9 @@ def measure(seed: int) -> Outcome:
     envs = gymnasium.make_vec("flytrack_env:FlyTrack-v0", NUM_ENVS, autoreset_mode="SameStep")
     env = TransformedEnv(GymWrapper(envs), RewardSum(), auto_unwrap=True)
     env.set_seed(seed)
-    mean = torch.nn.Sequential(MLP(29, 8, num_cells=[64, 64]), NormalParamExtractor("biased_softplus_0.4"))
+    mean = torch.nn.Sequential(
+        MLP(29, 8, num_cells=[64, 64]), NormalParamExtractor("biased_softplus_0.4")
+    )
     outputs = ["loc", "scale"]
     module = TensorDictModule(mean, ["observation"], outputs)
     actor = ProbabilisticActor(module, outputs, distribution_class=TanhNormal, return_log_prob=True)
@@ -34,7 +36,8 @@ def measure(seed: int) -> Outcome:
     results = []
     frames = {"frames_per_batch": size, "total_frames": size * NUM_UPDATES}
     for batch in Collector(env, actor, auto_register_policy_transforms=False, **frames):
-        # The infos of the step that ends an episode are in final_info: the gates are those before it.
+        # The infos of the step that ends an episode are in final_info: the gates are those before
+        # it.
         names = ("next", "done"), ("next", "episode_reward"), "gates_passed"
         results.append([batch[name].flatten().numpy() for name in names])
         for _ in range(NUM_EPOCHS):

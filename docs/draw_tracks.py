@@ -9,7 +9,14 @@ from matplotlib.patches import Rectangle
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures import drawing
 from flytrack_env.scene import PAPER_OPENING
-from flytrack_env.tracks import Track, available_tracks, build_course, load_track, random_track, sample_way
+from flytrack_env.tracks import (
+    Track,
+    available_tracks,
+    build_course,
+    load_track,
+    random_track,
+    sample_way,
+)
 
 OUT = Path(__file__).parent / "tracks"
 RANDOM_SEEDS = (0, 1)
@@ -22,7 +29,8 @@ START_COLOUR = "tab:blue"
 def draw_track(name: str, track: Track) -> Figure:
     """Return a figure of a track from above and, below it, from the side (looking along +y).
 
-    The line is the path on which episodes start in flight, its colour the height. Both views share a scale.
+    The line is the path on which episodes start in flight, its colour the height. Both views share
+    a scale.
     """
     low, size = np.array(track.bounds_low), drawing.extent(track)
     height_in = 0.86 * WIDTH_IN * (size[1] + size[2]) / size[0] + MARGIN_IN
@@ -31,10 +39,14 @@ def draw_track(name: str, track: Track) -> Figure:
     points = sample_way(build_course(track), NUM_SAMPLES).reshape(-1, 3)
     top_m = drawing.HEADROOM * max(points[:, 2].max(), LOWEST_TOP_M)
     for axes, view in ((top, [0, 1]), (side, [0, 2])):
-        axes.add_patch(Rectangle(low[view], *size[view], fill=False, edgecolor="0.6", linestyle="--"))
+        axes.add_patch(
+            Rectangle(low[view], *size[view], fill=False, edgecolor="0.6", linestyle="--")
+        )
         path = drawing.draw_path(axes, points[:, view], points[:-1, 2], top_m)
         drawing.draw_gates(axes, track, view)
-        axes.plot(*np.array(track.start_position)[view], "o", color=START_COLOUR, markersize=7, zorder=5)
+        axes.plot(
+            *np.array(track.start_position)[view], "o", color=START_COLOUR, markersize=7, zorder=5
+        )
         axes.set(aspect="equal", ylabel=f"{'xyz'[view[1]]} (m)")
     drawing.label_from_above(top, track)
     ids: dict[tuple[float, float], list[str]] = {}

@@ -28,7 +28,9 @@ def needs_of(effect: Effect) -> str:
     if {"lag", "thrust", "air", "force"} & set(effect.stages):
         parts.append("Without `f`, `v`, or `a` and `q`, it shows nothing of a force.")
     if effect.acts_on == ("sensor",):
-        parts.append("An error of one sensor shows only where another one measures the same motion.")
+        parts.append(
+            "An error of one sensor shows only where another one measures the same motion."
+        )
     return " ".join(parts)
 
 
@@ -40,7 +42,9 @@ def arguments(values: Mapping[str, float]) -> str:
 def effect_page(effect: Effect) -> str:
     """Return the page of an effect."""
     neutral = effect.parameters()._asdict()
-    shown = effect.search.fitted or (effect.search.groups[-1] if effect.search.groups else effect.notable)
+    shown = effect.search.fitted or (
+        effect.search.groups[-1] if effect.search.groups else effect.notable
+    )
     names = [name for name in shown if name in effect.notable]
     high = {name: neutral[name] + effect.notable[name] for name in names}
     varied = [REGRESSORS[panel.regressor] for panel in EVIDENCE[effect.name].panels]
@@ -56,7 +60,9 @@ def effect_page(effect: Effect) -> str:
         low=arguments({name: neutral[name] for name in high}),
         in_file="{" + ", ".join(f'"{name}": {value:g}' for name, value in high.items()) + "}",
         needs=needs_of(effect),
-        varied=dict.fromkeys(label if unit == "1" else f"{label} ({unit})" for label, unit in varied),
+        varied=dict.fromkeys(
+            label if unit == "1" else f"{label} ({unit})" for label, unit in varied
+        ),
         reading=EVIDENCE[effect.name].reading,
         **{"class": effect.parameters.__name__},
     )

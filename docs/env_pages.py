@@ -44,10 +44,18 @@ def range_rows(ranges: RandomizationParams) -> list[tuple[str, str, str]]:
 def layer_of(wrapper: Wrapper) -> dict[str, Any]:
     """Return what a page says of a wrapper: name, first sentence, parameters."""
     own = wrapper.own_defaults()
-    layer = {"name": type(wrapper).__name__, "about": sentence(type(wrapper).__doc__), "key": wrapper.key}
+    layer = {
+        "name": type(wrapper).__name__,
+        "about": sentence(type(wrapper).__doc__),
+        "key": wrapper.key,
+    }
     if isinstance(own, RandomizationParams):
         return {**layer, "columns": ("from", "to"), "rows": range_rows(own)}
-    rows = [(f"`{name}`", f"{value:g}") for name, value in own._asdict().items()] if own is not None else []
+    rows = (
+        [(f"`{name}`", f"{value:g}") for name, value in own._asdict().items()]
+        if own is not None
+        else []
+    )
     return {**layer, "columns": ("value",), "rows": rows}
 
 
@@ -73,7 +81,9 @@ def env_page(env_id: str) -> str:
         env_id=env_id,
         summary=ENVIRONMENTS[env_id].summary,
         params=params,
-        layers=[layer_of(layer) for layer in reversed(layers_of(env)) if isinstance(layer, Wrapper)],
+        layers=[
+            layer_of(layer) for layer in reversed(layers_of(env)) if isinstance(layer, Wrapper)
+        ],
         is_randomised="domain_randomization" in (params.wrappers or {}),
         size=observation.size,
         observation=observation_rows(env),

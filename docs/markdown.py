@@ -35,4 +35,6 @@ def field_texts(record: Any) -> dict[str, str]:
     """Return what a class's docstring says of its fields, each "name: text." or "name, name: text."."""
     body = one_line(record.__doc__.partition("\n\n")[2])
     parts = re.split(r"(?:^|(?<=[.;] ))((?:[a-z_*/]+(?:, )?)+): ", body)
-    return {name: text.strip().rstrip(".;") for name, text in zip(parts[1::2], parts[2::2], strict=True)}
+    return {
+        name: text.strip().rstrip(".;") for name, text in zip(parts[1::2], parts[2::2], strict=True)
+    }

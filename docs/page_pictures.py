@@ -19,7 +19,10 @@ from flytrack_env.state import unpack, unpack_action
 
 FLIGHT = shipped_reference("flytrack", "standing", "nominal")
 NUM_STEPS, NUM_NOTABLE = 150, 3.0  # of the flight; sizes of an effect from which on it matters
-PULSE_STEPS, PULSE = 25, 0.8  # the time-optimal throttle is always full, and hides what its changes do
+PULSE_STEPS, PULSE = (
+    25,
+    0.8,
+)  # the time-optimal throttle is always full, and hides what its changes do
 SMALLEST = 0.01  # in a panel's unit: less is none
 WIDTHS = (5.0, 3.0, 1.5)  # of lines: where they lie on each other, all are seen
 NUM_EPISODES, EPISODE_STEPS = 40, 130
@@ -36,7 +39,10 @@ def strong(effect: Effect) -> dict[str, float]:
     neutral = effect.parameters()._asdict()
     sizes = {name: neutral[name] + NUM_NOTABLE * step for name, step in effect.notable.items()}
     ranges = effect.ranges
-    return {name: float(np.clip(size, ranges[name].low, ranges[name].high)) for name, size in sizes.items()}
+    return {
+        name: float(np.clip(size, ranges[name].low, ranges[name].high))
+        for name, size in sizes.items()
+    }
 
 
 def measured(model: ModelParameters) -> np.ndarray:
@@ -46,7 +52,12 @@ def measured(model: ModelParameters) -> np.ndarray:
         moved = move(*state, unpack_action(command), STEP_S, model)
         drone, memories, _ = moved
         reading, seen = read_sensors(moved, model), sensed(drone, memories, STEP_S, model)
-        rows = (*(jnp.rad2deg(rate) for rate in reading.rates_b), *reading.force_b, *seen.vel_w, *seen.pos_w)
+        rows = (
+            *(jnp.rad2deg(rate) for rate in reading.rates_b),
+            *reading.force_b,
+            *seen.vel_w,
+            *seen.pos_w,
+        )
         return (drone, memories), jnp.stack([jnp.asarray(value, jnp.float32) for value in rows])
 
     drone = jax.tree.map(jnp.float32, unpack(jnp.asarray(FLIGHT.states[0], jnp.float32)))
@@ -77,7 +88,9 @@ def draw_effect(effect: Effect) -> Figure:
         if most < SMALLEST:
             title = f"{title}: unchanged"
         drawing.plain(axes).set_title(title, fontsize="medium", loc="left")
-        for axis, colour, width, line in zip("xyz", (ORANGE, BLUE, GREEN), WIDTHS, values.T, strict=True):
+        for axis, colour, width, line in zip(
+            "xyz", (ORANGE, BLUE, GREEN), WIDTHS, values.T, strict=True
+        ):
             axes.plot(times_s, line, color=colour, linewidth=width, label=axis)
         reach = 1.15 * most if most >= SMALLEST else 1.0
         axes.set_ylim(-reach, reach)
@@ -85,7 +98,9 @@ def draw_effect(effect: Effect) -> Figure:
         axes.set_xlabel("time (s)")
     axes_names = figure.axes[0].get_legend_handles_labels()
     figure.legend(*axes_names, loc="outside lower center", ncols=3, frameon=False)
-    figure.suptitle(f"A flight with {effect.name} minus one without, same commands", fontweight="bold")
+    figure.suptitle(
+        f"A flight with {effect.name} minus one without, same commands", fontweight="bold"
+    )
     return figure
 
 

@@ -1,8 +1,9 @@
 """The site's pages that are not in ``docs/``, written by mkdocs-gen-files when the site is built.
 
-They are the pages that the code determines (environment ids, effects, tracks), and Markdown from outside of
-``docs/``. Links in the repository's Markdown are relative paths, so that they work where it is browsed; here
-they are rewritten to the pages of the site. A link to a source file that has no page becomes plain text.
+They are the pages that the code determines (environment ids, effects, tracks), and Markdown from
+outside of ``docs/``. Links in the repository's Markdown are relative paths, so that they work where
+it is browsed; here they are rewritten to the pages of the site. A link to a source file that has no
+page becomes plain text.
 """
 
 import json
@@ -57,7 +58,11 @@ def with_links(markdown: str, path: str, page: str) -> str:
     def rewrite(match: re.Match[str]) -> str:
         text, target, anchor = match.group(1), match.group(2), match.group(3) or ""
         linked = posixpath.normpath(posixpath.join(posixpath.dirname(path), target))
-        goal = linked.removeprefix("docs/") if linked.startswith("docs/") else PAGES_OF_SOURCES.get(linked)
+        goal = (
+            linked.removeprefix("docs/")
+            if linked.startswith("docs/")
+            else PAGES_OF_SOURCES.get(linked)
+        )
         if goal is None and (ROOT / linked).exists():
             return text[1:-1]
         relative = posixpath.relpath(goal or linked, posixpath.dirname(page) or ".")
@@ -72,7 +77,10 @@ def site_pages() -> dict[str, str]:
     sources = {str(path.relative_to(ROOT)): path for path in sorted((ROOT / "docs").rglob("*.md"))}
     sources |= {path: ROOT / path for path in COPIED}
     ids = "".join(f"- [{env_id}](envs/{env_id}.md)\n" for env_id in ENVIRONMENTS)
-    appended = {"effects.md": effects_table(), "environment.md": f"\n## Every id in detail\n\n{ids}"}
+    appended = {
+        "effects.md": effects_table(),
+        "environment.md": f"\n## Every id in detail\n\n{ids}",
+    }
     pages = {f"envs/{env_id}.md": env_page(env_id) for env_id in ENVIRONMENTS}
     pages |= {f"effects/{effect.name}.md": effect_page(effect) for effect in EFFECTS}
     pages |= {f"tracks/{name}.md": track_page(name) for name in available_tracks()}

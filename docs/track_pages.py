@@ -28,7 +28,9 @@ def gate_rows(track: Track) -> list[tuple[Gate, float, float, float]]:
     for gate, distance in zip(track.gates, distances, strict=True):
         w, _, _, z = gate.quaternion
         yaw_deg = float(np.rad2deg(2.0 * np.arctan2(z, w)))
-        rows.append((gate, yaw_deg % 360.0, (yaw_deg + 90.0 * gate.direction) % 360.0, float(distance)))
+        rows.append(
+            (gate, yaw_deg % 360.0, (yaw_deg + 90.0 * gate.direction) % 360.0, float(distance))
+        )
     return rows
 
 

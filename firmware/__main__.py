@@ -51,11 +51,17 @@ def check() -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Do as the command line says; return the exit status."""
-    parser = argparse.ArgumentParser(prog="flytrack firmware", description="Betaflight in the loop.")
+    parser = argparse.ArgumentParser(
+        prog="flytrack firmware", description="Betaflight in the loop."
+    )
     commands = parser.add_subparsers(required=True, dest="command")
     commands.add_parser("check", help="fly a fixed set of flights twice: their hash, and the speed")
-    command = commands.add_parser("build", help="download by hash and compile, in the user's cache folder")
-    command.add_argument("--sdist", type=Path, help="the source distribution, if it is downloaded already")
+    command = commands.add_parser(
+        "build", help="download by hash and compile, in the user's cache folder"
+    )
+    command.add_argument(
+        "--sdist", type=Path, help="the source distribution, if it is downloaded already"
+    )
     try:
         asked = parser.parse_args(arguments)
         if asked.command == "check":

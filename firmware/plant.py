@@ -1,9 +1,10 @@
 """``Betaflight``: the firmware on a body, as a plant for ``collect``, the evaluator and environments.
 
-A flight is a process. A plant's state holds the drone as it was reported, the number of its flight (0: not
-begun) and its steps so far; a step passes through a callback to the processes, all rows of a ``vmap`` at
-once, each in a process of its own. A flight goes on from its newest state; the last step of it can be asked
-for again, as padded rollouts do, and is the same; an older state is an error.
+A flight is a process. A plant's state holds the drone as it was reported, the number of its flight
+(0: not begun) and its steps so far; a step passes through a callback to the processes, all rows of
+a ``vmap`` at once, each in a process of its own. A flight goes on from its newest state; the last
+step of it can be asked for again, as padded rollouts do, and is the same; an older state is an
+error.
 """
 
 import hashlib
@@ -33,7 +34,15 @@ from flytrack_env.messages import error_text
 from flytrack_env.motion import Motion
 from flytrack_env.plants import Plant
 from flytrack_env.quaternion import Scalar
-from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V, STATE_SIZE, Action, Drone, pack, unpack
+from flytrack_env.state import (
+    BATTERY_EMPTY_V,
+    BATTERY_FULL_V,
+    STATE_SIZE,
+    Action,
+    Drone,
+    pack,
+    unpack,
+)
 from flytrack_sysid.importing.betaflight_settings import full_stick_rate, rate_loop, stick_curve
 
 DT_S = 0.01
@@ -58,7 +67,12 @@ def _sticks(command: np.ndarray, throttle_us: float | None = None) -> tuple[floa
     """Return the receiver's channels, us, of a command in [-1, 1], armed; our yaw is positive to the left."""
     roll, pitch, yaw, thrust = (float(value) for value in np.clip(command, -1.0, 1.0))
     throttle = CENTER_US + STICK_US * thrust if throttle_us is None else throttle_us
-    sticks = (CENTER_US + STICK_US * roll, CENTER_US + STICK_US * pitch, throttle, CENTER_US - STICK_US * yaw)
+    sticks = (
+        CENTER_US + STICK_US * roll,
+        CENTER_US + STICK_US * pitch,
+        throttle,
+        CENTER_US - STICK_US * yaw,
+    )
     return (*sticks, SWITCH_US, *AT_REST[5:])
 
 
@@ -83,11 +97,17 @@ class _Flight:
         noise = int.from_bytes(digest[:8], "little")
         place, turn = (*start[layout.POSITION], *start[layout.VELOCITY]), start[layout.QUATERNION]
         at = [*place, *turn / np.linalg.norm(turn)]
-        reply = self.link.call(FLY, duration_us=ARM_US, rc=_sticks(np.zeros(4), AT_REST[2]), is_held=True)
+        reply = self.link.call(
+            FLY, duration_us=ARM_US, rc=_sticks(np.zeros(4), AT_REST[2]), is_held=True
+        )
         if not reply.is_armed:
-            raise FirmwareError(f"firmware: it does not arm: {reply.text.strip() or 'no reason given'}")
+            raise FirmwareError(
+                f"firmware: it does not arm: {reply.text.strip() or 'no reason given'}"
+            )
         self.link.call(BODY, payload=self.body.pack(plant.firmware.is_reversed))
-        self.link.call(START, payload=START_STATE.pack(*at, 0.0, 0.0, 0.0, start[layout.BATTERY], noise))
+        self.link.call(
+            START, payload=START_STATE.pack(*at, 0.0, 0.0, 0.0, start[layout.BATTERY], noise)
+        )
         held = np.array([0.0, 0.0, 0.0, start[layout.APPLIED_ACTION][3]])
         self.link.call(FLY, duration_us=SETTLE_US, rc=_sticks(held), is_held=True)
         self.link.call(
@@ -109,10 +129,10 @@ class _Flight:
 class Betaflight(Plant):
     """Betaflight 4.6 with settings, on a body; a context manager that leaves nothing running.
 
-    Every flight begins armed and settled, hovering at the start's thrust, in whatever attitude; the same
-    start, commands and seed give the same states, bit for bit, alone or among others. The applied action
-    that is reported is angular velocity over full stick, and the thrust action at which motors as fast as
-    these would be steady.
+    Every flight begins armed and settled, hovering at the start's thrust, in whatever attitude; the
+    same start, commands and seed give the same states, bit for bit, alone or among others. The
+    applied action that is reported is angular velocity over full stick, and the thrust action at
+    which motors as fast as these would be steady.
     """
 
     dt = DT_S
@@ -127,10 +147,10 @@ class Betaflight(Plant):
     ):
         """Start the firmware with settings, read them back, and have it ready to fly.
 
-        settings: the text of a ``dump`` or ``diff all``, or a dict above ``firmware.settings.DEFAULTS``.
-        skip: patterns of settings to leave out. seed: of the body's sensor noise. blackbox: new folder for
-        the firmware's own log of each flight of half a second or more, written when the flight ends: when
-        later ones replace it, or in ``close``.
+        settings: the text of a ``dump`` or ``diff all``, or a dict above
+        ``firmware.settings.DEFAULTS``. skip: patterns of settings to leave out. seed: of the body's
+        sensor noise. blackbox: new folder for the firmware's own log of each flight of half a
+        second or more, written when the flight ends: when later ones replace it, or in ``close``.
 
         Raises:
             FirmwareError: not built, settings that are refused or not kept, or it does not start.
@@ -139,14 +159,19 @@ class Betaflight(Plant):
         empty_v = body.full_v * BATTERY_EMPTY_V / BATTERY_FULL_V
         self.battery = Battery(body.full_v, empty_v, empty_v, body.full_v)
         self.box = None if blackbox is None else fresh_folder(Path(blackbox))
-        at_rest = replace(body, gyro_noise=0.0, acc_noise=0.0)  # gyros are calibrated with the motors off
+        at_rest = replace(
+            body, gyro_noise=0.0, acc_noise=0.0
+        )  # gyros are calibrated with the motors off
         made = settings_of(settings, skip, has_blackbox=self.box is not None)
         self.firmware = Firmware(find_executable(), made, at_rest)
         self._flights: dict[int, _Flight] = {}  # the least recently flown first
         self._numbers, self._lock = itertools.count(1), threading.Lock()
         self._failure: FirmwareError | None = None
         self._finalizer = weakref.finalize(self, self.firmware.close)
-        rates, axes = self.value("rates_type"), _rates(self.firmware, "rc_rate", "srate", "rate_limit")
+        rates, axes = (
+            self.value("rates_type"),
+            _rates(self.firmware, "rc_rate", "srate", "rate_limit"),
+        )
         self.full_stick_deg_s = tuple(full_stick_rate(rates, *axis) for axis in axes)
 
     def __enter__(self) -> "Betaflight":
@@ -171,7 +196,9 @@ class Betaflight(Plant):
     def nominal_model(self) -> ModelParameters:
         """Return the model to fit from: the nominal one with the craft's settings, moving as drones do."""
         full = np.array(self.full_stick_deg_s, np.float32)
-        curve = stick_curve(self.value("rates_type"), _rates(self.firmware, "rc_rate", "srate", "expo"))
+        curve = stick_curve(
+            self.value("rates_type"), _rates(self.firmware, "rc_rate", "srate", "expo")
+        )
         model = nominal_parameters()._replace(max_rate=full, motion=Motion.CONTINUOUS)
         loop = rate_loop(self.value, 1.0 / DT_S)
         return model.with_effects(*(one for one in (curve, loop) if one is not None))
@@ -187,7 +214,9 @@ class Betaflight(Plant):
         """Return the state 0.01 s later; ``dt`` and ``model`` are not used."""
         u = jnp.stack([jnp.asarray(value, jnp.float32) for value in command])
         rows = pack(state.drone), state.flight, state.step
-        row, flight, step = jax.pure_callback(self._step_rows, rows, *rows, u, vmap_method="broadcast_all")
+        row, flight, step = jax.pure_callback(
+            self._step_rows, rows, *rows, u, vmap_method="broadcast_all"
+        )
         return FirmwareState(unpack(row), flight, step)
 
     def drone(self, state: FirmwareState) -> Drone:
@@ -217,7 +246,9 @@ class Betaflight(Plant):
         if not self._finalizer.alive:
             raise FirmwareError("firmware: the plant was closed")
 
-    def _step_rows(self, drones: Any, flights: Any, steps: Any, commands: Any) -> tuple[np.ndarray, ...]:
+    def _step_rows(
+        self, drones: Any, flights: Any, steps: Any, commands: Any
+    ) -> tuple[np.ndarray, ...]:
         """Fly a step of each row: (..., 21), (...), (...), (..., 4). What is not finite is not flown: NaN.
 
         Nothing is raised here, inside a compiled program: ``check_alive`` does.
@@ -248,7 +279,8 @@ class Betaflight(Plant):
     ) -> list[_Flight]:
         """Return the flights of the rows, a step later: all processes work at once."""
         flown = [
-            self._find(*row) for row in zip(numbers.tolist(), steps.tolist(), commands, starts, strict=True)
+            self._find(*row)
+            for row in zip(numbers.tolist(), steps.tolist(), commands, starts, strict=True)
         ]
         due: dict[int, _Flight] = {}
         for flight, step, command in zip(flown, steps, commands, strict=True):
@@ -259,7 +291,9 @@ class Betaflight(Plant):
             reply = flight.link.answer()
             if not reply.is_armed:
                 after_s = f"{DT_S * flight.steps:.2f} s"
-                raise FirmwareError(f"firmware: it disarmed in flight, after {after_s}: {reply.text.strip()}")
+                raise FirmwareError(
+                    f"firmware: it disarmed in flight, after {after_s}: {reply.text.strip()}"
+                )
             flight.last_row, flight.steps = self._row(reply), flight.steps + 1
         for flight in flown:  # to the end of the line
             self._flights[flight.number] = self._flights.pop(flight.number)
@@ -274,7 +308,9 @@ class Betaflight(Plant):
             self._flights[flight.number] = flight
             return flight
         if number not in self._flights:
-            raise FirmwareError(f"firmware: flight {number} has ended, since later ones took its place")
+            raise FirmwareError(
+                f"firmware: flight {number} has ended, since later ones took its place"
+            )
         flight = self._flights[number]
         is_again = flight.steps == step + 1 and np.array_equal(flight.last_command, command)
         if flight.steps != step and not is_again:

@@ -1,7 +1,7 @@
 """The firmware's processes: one that is configured and ready, and a copy of it for every flight.
 
-Requests and replies are those of ``lockstep.c``, over a socket that is a process's standard input. No time
-passes in a process but what a request asks for. A process whose host is gone ends.
+Requests and replies are those of ``lockstep.c``, over a socket that is a process's standard input.
+No time passes in a process but what a request asks for. A process whose host is gone ends.
 """
 
 import contextlib
@@ -38,9 +38,9 @@ PROMPT = "# "
 class Reply(NamedTuple):
     """What a process answers.
 
-    is_armed. pid: of a copy. text: of the command line, or why it does not arm. motor_range: (2,), what
-    the mixer may ask for, us. numbers: (21,): position, velocity, acceleration, quaternion, rates,
-    motor speeds, V under load.
+    is_armed. pid: of a copy. text: of the command line, or why it does not arm. motor_range: (2,),
+    what the mixer may ask for, us. numbers: (21,): position, velocity, acceleration, quaternion,
+    rates, motor speeds, V under load.
     """
 
     is_armed: bool
@@ -135,7 +135,9 @@ class Firmware:
             self.is_reversed = self.value("yaw_motors_reversed") == "ON"
             self._start()
             self.link.call(BODY, payload=body.pack(self.is_reversed))
-            self.link.call(START, payload=START_STATE.pack(*[0.0] * 6, 1.0, *[0.0] * 6, body.full_v, 1))
+            self.link.call(
+                START, payload=START_STATE.pack(*[0.0] * 6, 1.0, *[0.0] * 6, body.full_v, 1)
+            )
             self.link.call(FLY, duration_us=READY_US, is_held=True)
         except BaseException:
             self.close()
@@ -157,7 +159,9 @@ class Firmware:
         link = Link(ours, name)
         if not 0 < pid <= LARGEST_PID:
             link.kill()
-            raise FirmwareError("firmware: its process cannot be copied: no memory, or too many processes")
+            raise FirmwareError(
+                "firmware: its process cannot be copied: no memory, or too many processes"
+            )
         link.pid = pid
         link.answer()
         return link
@@ -202,7 +206,9 @@ class Firmware:
                 )
             except OSError as error:
                 ours.close()
-                raise FirmwareError(f"{self.executable}: cannot be started: {error.strerror}") from error
+                raise FirmwareError(
+                    f"{self.executable}: cannot be started: {error.strerror}"
+                ) from error
         self.link = Link(ours, "its process")
 
     def _stop(self) -> None:

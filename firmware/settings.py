@@ -1,6 +1,7 @@
 """Settings of the firmware: from a dict or the text of a pilot's ``dump`` or ``diff all``, each read back.
 
-A setting's name is that of the command line's ``set``, or ``feature NAME`` with the value ON or OFF.
+A setting's name is that of the command line's ``set``, or ``feature NAME`` with the value ON or
+OFF.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -15,7 +16,19 @@ ARM_SWITCH = "aux 0 0 0 1700 2100 0 0"
 CHANNEL_ORDER = "map AETR1234"
 # Lines of a dump about pins, lights, radio and switches, which a simulated board has not: left out.
 HARDWARE = frozenset(
-    {"adjrange", "aux", "batch", "beacon", "beeper", "board_name", "color", "defaults", "dma", "led", "map"}
+    {
+        "adjrange",
+        "aux",
+        "batch",
+        "beacon",
+        "beeper",
+        "board_name",
+        "color",
+        "defaults",
+        "dma",
+        "led",
+        "map",
+    }
     | {"manufacturer_id", "mcu_id", "mode_color", "resource", "rxfail", "rxrange", "save", "serial"}
     | {"signature", "timer", "vtx", "vtxtable"}
 )
@@ -50,9 +63,8 @@ def _number(line: str, most: int) -> int:
 def parse_dump(text: str) -> list[Setting]:
     """Return the settings in the text of a dump, in its order; lines about hardware are left out.
 
-    Raises:
-        FirmwareError: a line that is none of ``set``, ``feature``, ``profile``, ``rateprofile``, ``mixer
-            QUADX`` or hardware; the message names it.
+    Raises: FirmwareError: a line that is none of ``set``, ``feature``, ``profile``,
+            ``rateprofile``, ``mixer QUADX`` or hardware; the message names it.
     """
     profile = rate_profile = 0
     found = []
@@ -73,7 +85,9 @@ def parse_dump(text: str) -> list[Setting]:
             name, _, value = rest.partition("=")
             found.append(Setting(name.strip().lower(), value.strip(), profile, rate_profile))
         else:
-            raise FirmwareError(f"settings: found {quote_name(line)}, expected set, feature or profile lines")
+            raise FirmwareError(
+                f"settings: found {quote_name(line)}, expected set, feature or profile lines"
+            )
     return found
 
 
@@ -90,7 +104,8 @@ def settings_of(
 ) -> list[Setting]:
     """Return the settings to make: those given, above ``DEFAULTS`` (a dict) or the firmware's own (a dump).
 
-    ``REQUIRED`` ones come last. skip: patterns of names to leave out, ``osd_*`` say. has_blackbox: it logs.
+    ``REQUIRED`` ones come last. skip: patterns of names to leave out, ``osd_*`` say. has_blackbox:
+    it logs.
 
     Raises:
         FirmwareError: a dump that cannot be read, or a required setting that a dict would change.
@@ -106,7 +121,9 @@ def settings_of(
         made = [Setting(name, value, 0, 0) for name, value in (DEFAULTS | values).items()]
     skipped = tuple(skip)
     made = [
-        one for one in made if one.name not in REQUIRED and not any(fnmatch(one.name, p) for p in skipped)
+        one
+        for one in made
+        if one.name not in REQUIRED and not any(fnmatch(one.name, p) for p in skipped)
     ]
     last = made[-1] if made else Setting("", "", 0, 0)
     required = REQUIRED | ({"blackbox_device": "VIRTUAL"} if has_blackbox else {})
@@ -150,7 +167,9 @@ def values_of(dump: str) -> dict[tuple[str, int, str], str]:
             scope, number = command, int(rest)
             found["master", 0, command] = rest  # its last lines select what was selected
         elif command == "feature" and rest:
-            found["master", 0, f"feature {rest.removeprefix('-')}"] = "OFF" if rest[0] == "-" else "ON"
+            found["master", 0, f"feature {rest.removeprefix('-')}"] = (
+                "OFF" if rest[0] == "-" else "ON"
+            )
         elif command == "set" and "=" in rest:
             name, _, value = rest.partition("=")
             found[scope, number, name.strip().lower()] = value.strip()
@@ -183,7 +202,10 @@ def check_read_back(settings: list[Setting], dump: str) -> None:
     for one in settings:  # a later line replaces an earlier one
         wanted[one.name, one.profile, one.rate_profile] = one
     wrong = []
-    for name, number in (("profile", settings[-1].profile), ("rateprofile", settings[-1].rate_profile)):
+    for name, number in (
+        ("profile", settings[-1].profile),
+        ("rateprofile", settings[-1].rate_profile),
+    ):
         wanted[name, 0, 0] = Setting(name, str(number), 0, 0)
     for one in wanted.values():
         found = value_of(values, one)
@@ -196,4 +218,6 @@ def _complain(what: str, names: list[str]) -> None:
     if names:
         more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
         listed = ", ".join(names[:MOST_NAMES])
-        raise FirmwareError(f"settings: the firmware {what} {listed}{more}; skip=[...] leaves names out")
+        raise FirmwareError(
+            f"settings: the firmware {what} {listed}{more}; skip=[...] leaves names out"
+        )

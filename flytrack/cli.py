@@ -1,7 +1,7 @@
 """``flytrack COMMAND``: one command for all that FlyTrack does.
 
-Nothing of a command is imported before it is called, so that ``flytrack --help`` is quick and needs no extra.
-``flytrack COMMAND --help`` needs none either: it names the extra.
+Nothing of a command is imported before it is called, so that ``flytrack --help`` is quick and needs
+no extra. ``flytrack COMMAND --help`` needs none either: it names the extra.
 """
 
 import argparse
@@ -19,7 +19,10 @@ from typing import Annotated, Any, NamedTuple, NoReturn, Union
 
 PROG = "flytrack"
 SHELLS = ("bash", "zsh", "fish")
-REFUSED, STOPPED = 2, 130  # exit statuses; 130 is what shells return for a command that Ctrl-C ended
+REFUSED, STOPPED = (
+    2,
+    130,
+)  # exit statuses; 130 is what shells return for a command that Ctrl-C ended
 CLONE = Path(__file__).parents[1]
 PPO = "baselines.purejaxrl_ppo"
 
@@ -27,8 +30,9 @@ PPO = "baselines.purejaxrl_ppo"
 class Command(NamedTuple):
     """A command; ``run`` and ``flags`` are written ``module:name``.
 
-    summary: one line. extra: that it needs. run: called with the flags, or with words if it ``reads_words``:
-    those after the command's name. flags: their dataclass; None where ``run`` has none.
+    summary: one line. extra: that it needs. run: called with the flags, or with words if it
+    ``reads_words``: those after the command's name. flags: their dataclass; None where ``run`` has
+    none.
     """
 
     summary: str
@@ -40,12 +44,16 @@ class Command(NamedTuple):
 
 def _own(name: str, extra: str, module: str, flags: str, summary: str) -> Command:
     """Return a command of this package; module, flags: where what runs it and its flags are."""
-    return Command(summary, extra, f"flytrack.{module}:run_{name}", f"flytrack.{flags}:{name.capitalize()}")
+    return Command(
+        summary, extra, f"flytrack.{module}:run_{name}", f"flytrack.{flags}:{name.capitalize()}"
+    )
 
 
 IDENTIFICATION = ("sysid", "identification", "flags")
 COMMANDS = {
-    "demo": _own("demo", "train", "demo", "flags", "Identify the shipped black box, train, fly on it"),
+    "demo": _own(
+        "demo", "train", "demo", "flags", "Identify the shipped black box, train, fly on it"
+    ),
     "train": Command(
         "Train a policy with PPO",
         "train",
@@ -63,16 +71,27 @@ COMMANDS = {
     "fly": _own("fly", "fly", "fly", "fly", "Fly by keyboard or gamepad against a ghost"),
     "collect": _own("collect", *IDENTIFICATION, "Fly an excitation or a script on a plant"),
     "fit": _own("fit", *IDENTIFICATION, "Identify a model from a flight log"),
-    "validate": _own("validate", *IDENTIFICATION, "Judge a model on flight that it was not fitted to"),
+    "validate": _own(
+        "validate", *IDENTIFICATION, "Judge a model on flight that it was not fitted to"
+    ),
     "diagnose": _own("diagnose", *IDENTIFICATION, "Name what a model gets wrong, and extend it"),
     "plan": _own("plan", *IDENTIFICATION, "Plan flights that settle what a log left open"),
     "import": _own("import", *IDENTIFICATION, "Convert logs of real flights into a flight log"),
-    "loop": _own("loop", "train", "loop", "loop", "Train, fly, diagnose, extend the model, train again"),
+    "loop": _own(
+        "loop", "train", "loop", "loop", "Train, fly, diagnose, extend the model, train again"
+    ),
     "firmware": Command(
-        "Build and check Betaflight in the loop, in a clone", None, "firmware.__main__:main", None, True
+        "Build and check Betaflight in the loop, in a clone",
+        None,
+        "firmware.__main__:main",
+        None,
+        True,
     ),
     "export": Command(
-        "Write a policy as ONNX or C", "export", f"{PPO}.export:run_export", f"{PPO}.export:ExportSettings"
+        "Write a policy as ONNX or C",
+        "export",
+        f"{PPO}.export:run_export",
+        f"{PPO}.export:ExportSettings",
     ),
     "bench": Command(
         "Fly a policy through a frozen suite of tasks",
@@ -99,11 +118,17 @@ def load(name: str, target: str) -> Any:
     except ImportError as error:
         missing, extra = error.name or "", COMMANDS[name].extra
         if module == missing or module.startswith(f"{missing}."):
-            where = "in clones of the repository only" if missing == "firmware" else "not in this version"
+            where = (
+                "in clones of the repository only"
+                if missing == "firmware"
+                else "not in this version"
+            )
             raise NotInstalledError(f"this command is {where}") from error
         if extra is None or not missing or find_spec(missing.partition(".")[0]) is not None:
             raise  # an error of the module, and not of the installation
-        text = f"needs the extra {extra}, of which {missing} is not installed: {how_to_install(extra)}"
+        text = (
+            f"needs the extra {extra}, of which {missing} is not installed: {how_to_install(extra)}"
+        )
         raise NotInstalledError(text) from error
 
 
@@ -114,7 +139,11 @@ def how_to_install(extra: str) -> str:
 
 def describe(command: Command) -> str:
     """Return what stands above the flags of a command."""
-    needed = f"\n\nNeeds the extra {command.extra}: {how_to_install(command.extra)}" if command.extra else ""
+    needed = (
+        f"\n\nNeeds the extra {command.extra}: {how_to_install(command.extra)}"
+        if command.extra
+        else ""
+    )
     return f"{command.summary}.{needed}"
 
 
@@ -135,7 +164,9 @@ def call(name: str, words: Sequence[str]) -> None:
     except NotInstalledError as error:
         if not {"-h", "--help"} & set(words):
             leave(name, REFUSED, f"error: {error}")
-        print(f"usage: {PROG} {name} [OPTIONS]\n\n{describe(command)}\n\nIts flags cannot be shown: {error}")
+        print(
+            f"usage: {PROG} {name} [OPTIONS]\n\n{describe(command)}\n\nIts flags cannot be shown: {error}"
+        )
         return
     warnings.showwarning = lambda message, *_, **__: print(
         f"{PROG} {name}: warning: {message}", file=sys.stderr
@@ -189,7 +220,9 @@ def print_completion(shell: str) -> None:
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
         tyro.cli(of_all, args=script, prog=PROG, config=config)
-    for line in text.getvalue().splitlines():  # shells read an end of line in a help as that of a word
+    for (
+        line
+    ) in text.getvalue().splitlines():  # shells read an end of line in a help as that of a word
         print(line.replace("\\n", " ") if line.startswith("COMPLETION_SPEC = ") else line)
 
 

@@ -40,7 +40,8 @@ WHOLE, QUICK = Size(2.0, 2500, 256), Size(1.0, 200, 16)
 def identify(black_box: Path, out: Path, seed: int, minutes: float) -> dict[str, Validation]:
     """Fly the excitation on the black box, fit, write log and model to train on; return held-out errors.
 
-    The minimal model leaves a force unexplained; linear drag, reported for the original drone, is then added.
+    The minimal model leaves a force unexplained; linear drag, reported for the original drone, is
+    then added.
     """
     flown = collect(blackbox.load(black_box), minutes, seed, report=ProgressBar("flights"))
     save_log(out / "flight_log.npz", flown)
@@ -59,7 +60,9 @@ def describe_identification(validations: dict[str, Validation]) -> None:
     minimal, extended = validations["minimal"], validations["with_drag"]
     print("    one-step MSE on held-out data          minimal   with linear drag")
     for name, error in minimal.one_step.channels.items():
-        print(f"      {NAMES[name]:36} {error.mse:9.3g} {extended.one_step.channels[name].mse:9.3g}")
+        print(
+            f"      {NAMES[name]:36} {error.mse:9.3g} {extended.one_step.channels[name].mse:9.3g}"
+        )
 
 
 def run_demo(flags: Demo) -> None:
@@ -69,7 +72,9 @@ def run_demo(flags: Demo) -> None:
         ValueError, OSError: what cannot be used, settings before any work.
     """
     started = time.perf_counter()
-    size, config = (QUICK, Config(total_timesteps=Config().batch_size)) if flags.quick else (WHOLE, Config())
+    size, config = (
+        (QUICK, Config(total_timesteps=Config().batch_size)) if flags.quick else (WHOLE, Config())
+    )
     if flags.total_timesteps is not None:
         config = dataclasses.replace(config, total_timesteps=int(flags.total_timesteps))
     config.check()
@@ -118,7 +123,9 @@ def run_demo(flags: Demo) -> None:
     }
     write_atomically(out / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
     print("4/4 draw")
-    draw_position_density(out / "position_density.png", flights.positions(), env.track, size.num_episodes)
+    draw_position_density(
+        out / "position_density.png", flights.positions(), env.track, size.num_episodes
+    )
     write_pictures(read_flights([out / "rollout.npy"], env.track), out)
     if can_record():
         report.record(out / "rollout.rrd", with_ghost=True)

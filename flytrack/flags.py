@@ -27,7 +27,9 @@ class Demo:
     """Folder to write to; default: runs/demo, or the next free name."""
     seed: int = 0
     """Seed of flights and training."""
-    total_timesteps: Annotated[float | None, arg(metavar="FLOAT", help_behavior_hint=NO_HINT)] = None
+    total_timesteps: Annotated[float | None, arg(metavar="FLOAT", help_behavior_hint=NO_HINT)] = (
+        None
+    )
     """Environment steps of the training; default: those of `flytrack train`."""
     quick: bool = False
     """Every step once, each as short as it can be, to see that all works: the policy learns nothing."""
@@ -100,7 +102,9 @@ class Fit:
     """The model, .json."""
     fix: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=VALUE")]] = ()
     """Hold a parameter at a value; may be repeated."""
-    start: Annotated[str | None, arg(name="from", metavar="MODEL", help_behavior_hint=NO_HINT)] = None
+    start: Annotated[str | None, arg(name="from", metavar="MODEL", help_behavior_hint=NO_HINT)] = (
+        None
+    )
     """Start from the values of this model; default: the nominal model."""
     effect: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME")]] = ()
     """Identify the parameters of this effect too; may be repeated."""

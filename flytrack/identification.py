@@ -98,13 +98,20 @@ def run_fit(flags: Fit) -> None:
     told = start.motion
     if required_motion(log, requested) is None:
         start = start._replace(motion=motion_of(log, start))
-    found = fit(log, start, fixed, flags.effect, flags.hold_out_every, ProgressBar("rounds"), requested)
+    found = fit(
+        log, start, fixed, flags.effect, flags.hold_out_every, ProgressBar("rounds"), requested
+    )
     provenance = found.provenance()
-    provenance["started_from"] = "nominal parameters" if flags.start is None else Path(flags.start).name
+    provenance["started_from"] = (
+        "nominal parameters" if flags.start is None else Path(flags.start).name
+    )
     provenance["fixed"] = fixed
     save_model(flags.out, found.model, provenance)
     is_other = flags.start is not None and start.motion is not told
-    print(f"motion: {found.model.motion.value}" + f", by likelihood; --from says {told.value}" * is_other)
+    print(
+        f"motion: {found.model.motion.value}"
+        + f", by likelihood; --from says {told.value}" * is_other
+    )
     print(found.describe())
     print_written([flags.out])
 
@@ -126,7 +133,10 @@ def run_diagnose(flags: Diagnose) -> None:
     """Diagnose the model; write the report, the extended model and a recording."""
     if not flags.logs:
         raise ValueError("LOG: found none, expected at least one flight log")
-    train, test = [load_log(path) for path in flags.logs], [load_log(path) for path in flags.hold_out]
+    train, test = (
+        [load_log(path) for path in flags.logs],
+        [load_log(path) for path in flags.hold_out],
+    )
     logs, before = [*train, *test], [load_log(path) for path in flags.before]
     for one in (*logs, *before):
         check_plausible(one)
@@ -167,7 +177,9 @@ def fixed_values(pairs: Sequence[str]) -> dict[str, float]:
     try:
         return {name.strip(): float(value) for name, value in (pair.split("=") for pair in pairs)}
     except ValueError as error:
-        raise ValueError(f"--fix {' '.join(pairs)}: expected NAME=VALUE, as in tau_yaw=0.05") from error
+        raise ValueError(
+            f"--fix {' '.join(pairs)}: expected NAME=VALUE, as in tau_yaw=0.05"
+        ) from error
 
 
 def judged_rows(model_path: Path, log: FlightLog) -> tuple[np.ndarray | None, str]:
@@ -178,11 +190,16 @@ def judged_rows(model_path: Path, log: FlightLog) -> tuple[np.ndarray | None, st
     provenance = load_provenance(model_path)
     data, split = provenance.get("data"), provenance.get("split")
     if not isinstance(data, dict) or data.get("sha256") != log.sha256:  # fitted to another log
-        return None, f"all rows are judged: {model_path.name} was not fitted to {Path(log.source).name}"
+        return (
+            None,
+            f"all rows are judged: {model_path.name} was not fitted to {Path(log.source).name}",
+        )
     every = split.get("held_out_every") if isinstance(split, dict) else None
     if not isinstance(every, int) or every < 2:
         hint = (
-            "fitted to the whole log; validate it on another log" if every == 0 else "expected 0, 2, 3, ..."
+            "fitted to the whole log; validate it on another log"
+            if every == 0
+            else "expected 0, 2, 3, ..."
         )
         raise ModelFileError(f"{model_path}: split: held_out_every: found {every!r}, {hint}")
     return held_out_rows(log, every), f"held-out part: the last of every {every} blocks"

@@ -23,9 +23,9 @@ class Loop:
 
     black_box: OptionalPath = None
     """The plant, an acro_step.bin; default: the shipped one."""
-    plant: Annotated[Literal["betaflight"] | None, arg(metavar="betaflight", help_behavior_hint=NO_HINT)] = (
-        None
-    )
+    plant: Annotated[
+        Literal["betaflight"] | None, arg(metavar="betaflight", help_behavior_hint=NO_HINT)
+    ] = None
     """Instead of a black box: Betaflight's firmware on a simulated body, of a clone."""
     dump: OptionalPath = None
     """The firmware's settings: the text of a pilot's dump or diff all."""
@@ -56,7 +56,9 @@ def _opened(flags: Loop) -> Iterator[tuple[Plant, ModelParameters | None]]:
     try:
         from firmware import Betaflight, Body, read_body
     except ModuleNotFoundError as error:
-        raise ValueError("--plant betaflight: found no folder firmware/, expected a clone") from error
+        raise ValueError(
+            "--plant betaflight: found no folder firmware/, expected a clone"
+        ) from error
     dump = None if flags.dump is None else flags.dump.read_text(encoding="utf-8")
     body = Body() if flags.body is None else read_body(flags.body)
     with Betaflight({} if dump is None else dump, body, flags.skip) as plant:
@@ -72,4 +74,6 @@ def run_loop(flags: Loop) -> None:
         loop = close_loop(plant, out, config, flags.seed, flags.settings, start=start)
         files = write_flights(out, loop, plant, flags.seed)
     print(describe(loop))
-    print(f"written: {out}/ with loop.json, diagnosis/report.html, {', '.join(one.name for one in files)}")
+    print(
+        f"written: {out}/ with loop.json, diagnosis/report.html, {', '.join(one.name for one in files)}"
+    )

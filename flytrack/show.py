@@ -30,7 +30,9 @@ def run_show(flags: Show) -> None:
     if flags.ghost or not recorded:
         references = shipped_references(track, (flags.ghost_model,))
         recorded.append(Trajectory("time-optimal", *ghost_rollout(references, num_steps)))
-    optimal = shipped_reference(track.name, "flying", flags.ghost_model) if flags.animation else None
+    optimal = (
+        shipped_reference(track.name, "flying", flags.ghost_model) if flags.animation else None
+    )
     if flags.out is not None:
         found = next(path for path in (flags.out, *flags.out.parents) if path.exists())
         if not found.is_dir():

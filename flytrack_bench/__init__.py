@@ -2,7 +2,9 @@
 
 from flytrack_env.extras import check_installed
 
-check_installed("bench", "benchmarks", "safetensors", "optax", "distrax", "scipy", "matplotlib", "tqdm")
+check_installed(
+    "bench", "benchmarks", "safetensors", "optax", "distrax", "scipy", "matplotlib", "tqdm"
+)
 
 from flytrack_bench.policies import Policy, PolicyError, load_policy
 from flytrack_bench.results import Data, DataError, differences, run

@@ -50,7 +50,10 @@ def run_bench(flags: Flags) -> int:
 def fly(flags: Flags, suite: Suite, ids: tuple[str, ...]) -> dict[str, Any]:
     """Return the result of the policies on some tasks."""
     policies = [load_policy(one) for one in flags.policy]
-    tasks, adapt = suite.chosen(ids), None if flags.adapt is None else find_object(flags.adapt, "--adapt")
+    tasks, adapt = (
+        suite.chosen(ids),
+        None if flags.adapt is None else find_object(flags.adapt, "--adapt"),
+    )
     if adapt is not None and not ids:
         tasks = tuple(task for task in tasks if task.craft is not None)
     return run(suite, policies, tasks, flags.data_seconds, adapt, ProgressBar("flights"))
@@ -79,7 +82,9 @@ def verify(flags: Flags) -> bool:
     except (KeyError, TypeError, ValueError) as error:
         raise SuiteError(f"{flags.verify}: not a result: {error_text(error)}") from error
     if digest != suite.digest:
-        raise SuiteError(f"{flags.verify}: digest: found {digest}, expected {suite.digest} of {suite.name}")
+        raise SuiteError(
+            f"{flags.verify}: digest: found {digest}, expected {suite.digest} of {suite.name}"
+        )
     if hashes != [load_policy(one).sha256 for one in flags.policy]:
         raise PolicyError(f"{flags.verify}: policies: found others than --policy names")
     rng = np.random.default_rng(int(hashlib.sha256(content).hexdigest(), 16))
@@ -91,7 +96,9 @@ def verify(flags: Flags) -> bool:
 
 def text_of(found: dict[str, Any]) -> str:
     """Return a result as a table, the means over policies, and its summary."""
-    lines = [f"{'task':12} {'success':>8} {'lap':>8} {'over optimal':>13} {'gates':>6}  mostly ended by"]
+    lines = [
+        f"{'task':12} {'success':>8} {'lap':>8} {'over optimal':>13} {'gates':>6}  mostly ended by"
+    ]
     for task, ones in found["tasks"].items():
         laps = [one["flying_lap_s"] for one in ones if one["flying_lap_s"] is not None]
         ratios = [one["over_optimal"] for one in ones if one["over_optimal"] is not None]
@@ -99,7 +106,9 @@ def text_of(found: dict[str, Any]) -> str:
         ratio = f"{np.mean(ratios):.3f}" if ratios else "-"
         success, gates = (np.mean([one[name] for one in ones]) for name in ("success", "gates"))
         ends = ", ".join(dict.fromkeys(cause for one in ones for cause in list(one["ended"])[:1]))
-        lines.append(f"{task:12} {success:8.1%} {lap:>8} {ratio:>13} {gates:6.1f}  {ends.replace('_', ' ')}")
+        lines.append(
+            f"{task:12} {success:8.1%} {lap:>8} {ratio:>13} {gates:6.1f}  {ends.replace('_', ' ')}"
+        )
     for name, one in found["summary"].items():
         interval = "" if one["ci95"] is None else " ({:.3f} to {:.3f})".format(*one["ci95"])
         lines.append(f"{name}: interquartile mean {one['interquartile_mean']:.3f}{interval}")

@@ -44,8 +44,8 @@ class Function:
 class Policy(NamedTuple):
     """What flies.
 
-    network: has ``first_memory()`` and ``act(params, memory, observation)``, which returns the next memory
-    and sticks. checkpoint: where it comes from one. sha256: of its file; empty without one.
+    network: has ``first_memory()`` and ``act(params, memory, observation)``, which returns the next
+    memory and sticks. checkpoint: where it comes from one. sha256: of its file; empty without one.
     """
 
     name: str
@@ -76,9 +76,8 @@ def load_policy(where: str) -> Policy:
 
     The name is that of a function of the observation, or of an object as in ``Policy.network``.
 
-    Raises:
-        PolicyError: nothing of that name, or something that returns no four sticks. CheckpointError: a file
-            that is no checkpoint.
+    Raises: PolicyError: nothing of that name, or something that returns no four sticks.
+            CheckpointError: a file that is no checkpoint.
     """
     if ":" not in where or Path(where).exists():
         checkpoint, content = load_checkpoint(Path(where)), Path(where).read_bytes()
@@ -94,7 +93,9 @@ def load_policy(where: str) -> Policy:
     except Exception as error:  # whatever a user's function raises
         raise PolicyError(f"policy: {where}: {type(error).__name__}: {error}") from error
     if action.shape != (ACTION_SIZE,):
-        raise PolicyError(f"policy: {where}: found an action of shape {action.shape}, expected (4,)")
+        raise PolicyError(
+            f"policy: {where}: found an action of shape {action.shape}, expected (4,)"
+        )
     return Policy(where, network, None, None, "")
 
 

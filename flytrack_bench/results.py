@@ -47,13 +47,17 @@ class Data:
             DataError: more seconds than are left. ValueError: a policy that crashes at once.
         """
         if seconds > self.seconds_left + 1e-9:
-            raise DataError(f"seconds: found {seconds:g}, expected at most the {self.seconds_left:g} s left")
+            raise DataError(
+                f"seconds: found {seconds:g}, expected at most the {self.seconds_left:g} s left"
+            )
         self.seconds_left -= seconds
         self._seed += 1
         env = policy.env(self.task.plant, self.task.track)
         step_s = float(env.default_params.dt)
         steps = round(min(seconds, LONGEST_S) / step_s)
-        flights = fly_many(env, NetworkPolicy(policy.network, policy.params), self._seed, BATCH, steps, steps)
+        flights = fly_many(
+            env, NetworkPolicy(policy.network, policy.params), self._seed, BATCH, steps, steps
+        )
         log = log_of_flights(flights, step_s, self._seed, seconds, NOISE)
         return log.select(np.arange(len(log)) < round(seconds / step_s))
 
@@ -64,8 +68,9 @@ Adapt = Callable[[Data, Policy], Policy]
 def fly_task(task: Task, suite: Suite, policy: Policy) -> dict[str, Any]:
     """Return how a policy does on a task: success, mean lap times, s, its score, and why flights ended.
 
-    The score is the share of starts that finish times the time-optimal lap over the mean flying lap. gates:
-    passed, mean. ended: share of all flights by what ended them, but for those that finished.
+    The score is the share of starts that finish times the time-optimal lap over the mean flying
+    lap. gates: passed, mean. ended: share of all flights by what ended them, but for those that
+    finished.
     """
     env = policy.env(task.plant, task.track)
     params = with_model_as_given(env.default_params)
@@ -89,8 +94,15 @@ def end_shares(outcomes: Outcomes) -> dict[str, float]:
     """Return the share of flights that each cause ended before they finished, the largest first."""
     causes: dict[str, Any] = dict(outcomes.causes._asdict())
     causes["time_limit"] = ~np.any(list(causes.values()), axis=0)
-    shares = {name: float(np.mean(happened & ~outcomes.is_complete())) for name, happened in causes.items()}
-    return {name: round(share, 6) for name, share in sorted(shares.items(), key=lambda one: -one[1]) if share}
+    shares = {
+        name: float(np.mean(happened & ~outcomes.is_complete()))
+        for name, happened in causes.items()
+    }
+    return {
+        name: round(share, 6)
+        for name, share in sorted(shares.items(), key=lambda one: -one[1])
+        if share
+    }
 
 
 def run(
@@ -103,8 +115,8 @@ def run(
 ) -> dict[str, Any]:
     """Return the result of policies, one a training seed, on tasks, as JSON values.
 
-    seconds, adapt: with so much data of each task, each policy is replaced by what is made of it. report:
-    called with flights done and to do.
+    seconds, adapt: with so much data of each task, each policy is replaced by what is made of it.
+    report: called with flights done and to do.
     """
     started_s, total = time.process_time(), len(tasks) * len(policies)
     flown: dict[str, list[dict[str, Any]]] = {}
@@ -133,14 +145,16 @@ def summary(flown: dict[str, list[dict[str, Any]]], name: str) -> dict[str, Any]
     """Return the interquartile mean of a figure over tasks and seeds, and its 95 % interval.
 
     The interval is of a bootstrap that draws seeds again within each task (R. Agarwal et al., "Deep
-    reinforcement learning at the edge of the statistical precipice", 2021); null of fewer than two seeds.
+    reinforcement learning at the edge of the statistical precipice", 2021); null of fewer than two
+    seeds.
     """
     values = np.array([[one[name] for one in ones] for ones in flown.values()])
     interval = None
     if values.shape[1] > 1:
         drawn = np.random.default_rng(0).integers(values.shape[1], size=(DRAWS, *values.shape))
         means = [
-            stats.trim_mean(np.take_along_axis(values, one, axis=1), QUARTER, axis=None) for one in drawn
+            stats.trim_mean(np.take_along_axis(values, one, axis=1), QUARTER, axis=None)
+            for one in drawn
         ]
         tail = 0.5 * (1.0 - COVERED)
         interval = [round(float(one), 6) for one in np.quantile(means, (tail, 1.0 - tail))]

@@ -13,9 +13,12 @@ from flytrack_sysid import diagnose
 def diagnose_and_retrain(data: Data, policy: Policy) -> Policy:
     """Return a policy trained from scratch, by the default recipe, on the extended model of a plant.
 
-    policy: flies all the data that are left. Flights are of its own seed, that of the training is 0.
+    policy: flies all the data that are left. Flights are of its own seed, that of the training is
+    0.
     """
     found = diagnose(data.fly(policy, data.seconds_left))
     with tempfile.TemporaryDirectory() as folder:
-        checkpoint, _ = train_policy(Path(folder) / "retrained", Config(), seed=0, model=found.extended)
+        checkpoint, _ = train_policy(
+            Path(folder) / "retrained", Config(), seed=0, model=found.extended
+        )
     return policy_of(checkpoint, f"{policy.name}, retrained")

@@ -30,8 +30,8 @@ class SuiteError(ValueError):
 class Task:
     """A course and what flies it.
 
-    craft: of a hidden plant; None: the simulator's nominal drone. optimal_lap_s: the nominal drone's
-    time-optimal flying lap, by which lap times are divided.
+    craft: of a hidden plant; None: the simulator's nominal drone. optimal_lap_s: the nominal
+    drone's time-optimal flying lap, by which lap times are divided.
     """
 
     id: str
@@ -75,8 +75,8 @@ def digest_of(content: dict[str, Any]) -> str:
 def load_suite(name_or_path: str | Path) -> Suite:
     """Return a shipped suite by name, or that of a ``.json`` file.
 
-    Raises:
-        SuiteError: an unknown name, a file that cannot be read, or one that was changed since it was written.
+    Raises: SuiteError: an unknown name, a file that cannot be read, or one that was changed since
+        it was written.
     """
     path = Path(name_or_path)
     if path.suffix != ".json":
@@ -93,7 +93,9 @@ def load_suite(name_or_path: str | Path) -> Suite:
         raise SuiteError(f"{path}: not a suite: {error_text(error)}") from error
     file = convert(str(path), content, _SuiteFile, SuiteError)
     if digest_of(content) != file.digest:
-        raise SuiteError(f"{path}: digest: does not belong to the content, so that the file was changed")
+        raise SuiteError(
+            f"{path}: digest: does not belong to the content, so that the file was changed"
+        )
     tasks = tuple(_task(path, task) for task in file.tasks)
     return Suite(file.name, file.digest, file.seed, file.starts, file.laps, file.steps, tasks)
 

@@ -15,11 +15,18 @@ from jax.extend.mlir import ir
 from jax.interpreters.mlir import make_ir_context
 
 # Custom calls that XLA knows: they annotate values and are gone after compilation.
-HARMLESS_CALLS = ("Sharding", "SPMDFullToShardShape", "SPMDShardToFullShape", "annotate_device_placement")
-LONGEST_TEXT = 500  # characters quoted from a file, or from an error message that it may have written
+HARMLESS_CALLS = (
+    "Sharding",
+    "SPMDFullToShardShape",
+    "SPMDShardToFullShape",
+    "annotate_device_placement",
+)
+# characters quoted from a file, or from an error message that it may have written
+LONGEST_TEXT = 500
 MOST_NAMED = 5
-# The compiler recurses into nested loops and calls, and overflows its stack at some depth. A file is tried
-# inside this many loops, so that one that only just compiles is refused rather than crash a larger program.
+# The compiler recurses into nested loops and calls, and overflows its stack at some depth. A file
+# is tried inside this many loops, so that one that only just compiles is refused rather than crash
+# a larger program.
 TRIAL_LOOPS = 16
 
 
@@ -47,7 +54,9 @@ def deserialize(content: bytes) -> export.Exported:
     """
     try:
         return export.deserialize(bytearray(content))
-    except Exception as error:  # damaged bytes raise almost anything: struct.error, IndexError, MLIRError
+    except (
+        Exception
+    ) as error:  # damaged bytes raise almost anything: struct.error, IndexError, MLIRError
         raise _not_readable(content, error) from error
 
 
@@ -63,7 +72,9 @@ def check_signature(exported: export.Exported, sizes: Sequence[int], num_actions
         state, action = ((size,), np.dtype(np.float32)), ((num_actions,), np.dtype(np.float32))
         if inputs == [state, action] and outputs == [state]:
             return size
-    found = f"({', '.join(map(str, exported.in_avals))}) -> ({', '.join(map(str, exported.out_avals))})"
+    found = (
+        f"({', '.join(map(str, exported.in_avals))}) -> ({', '.join(map(str, exported.out_avals))})"
+    )
     raise ArtifactError(
         f"signature: found {_printable(found)}, expected (float32[n], float32[{num_actions}]) -> "
         f"(float32[n]) with n = {' or '.join(map(str, sizes))}"
@@ -76,7 +87,9 @@ def _operations(operation: Any) -> Iterator[Any]:
     while pending:
         current = pending.pop()
         yield current
-        pending += [inner.operation for region in current.regions for block in region for inner in block]
+        pending += [
+            inner.operation for region in current.regions for block in region for inner in block
+        ]
 
 
 def check_pure(content: bytes, exported: export.Exported, is_trusted: bool) -> None:
@@ -94,10 +107,14 @@ def check_pure(content: bytes, exported: export.Exported, is_trusted: bool) -> N
             )
     except Exception as error:  # the program is parsed here for the first time
         raise _not_readable(content, error) from error
-    refused = [name for name in targets if "callback" in name or not (is_trusted or name in HARMLESS_CALLS)]
+    refused = [
+        name for name in targets if "callback" in name or not (is_trusted or name in HARMLESS_CALLS)
+    ]
     if refused:
         listed = _printable(", ".join(refused[:MOST_NAMED]))
-        raise ArtifactError(f"found a call of {listed}, expected a pure function that calls nothing")
+        raise ArtifactError(
+            f"found a call of {listed}, expected a pure function that calls nothing"
+        )
 
 
 def call(exported: export.Exported, state: jax.Array, action: jax.Array) -> jax.Array:
@@ -136,10 +153,13 @@ def check_runs(exported: export.Exported, start: Sequence[float], num_actions: i
         )
 
 
-def check(content: bytes, starts: Sequence[Sequence[float]], num_actions: int, is_trusted: bool) -> None:
+def check(
+    content: bytes, starts: Sequence[Sequence[float]], num_actions: int, is_trusted: bool
+) -> None:
     """Raise ArtifactError unless a file's bytes are a plant: see the functions above.
 
-    starts: a start state of every size that an artifact's state may have. is_trusted: see ``check_pure``.
+    starts: a start state of every size that an artifact's state may have. is_trusted: see
+    ``check_pure``.
     """
     exported = deserialize(content)
     size = check_signature(exported, [len(start) for start in starts], num_actions)

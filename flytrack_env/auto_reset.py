@@ -1,8 +1,8 @@
 """Auto-reset of a batch of which, as a rule, few episodes end in the same step.
 
-Sampling, observing and selecting a start for every environment cost almost as much as the step. So under
-``vmap`` only as many starts are sampled as a step is likely to need, and they are put in the place of the
-environments that ended. Each environment starts as it would alone.
+Sampling, observing and selecting a start for every environment cost almost as much as the step. So
+under ``vmap`` only as many starts are sampled as a step is likely to need, and they are put in the
+place of the environments that ended. Each environment starts as it would alone.
 """
 
 from collections.abc import Callable
@@ -38,8 +38,8 @@ class Ended(NamedTuple):
 def reset_if_ended(begin: Begin, step: Ended, params: Any) -> Shown:
     """Return the start ``begin(seed, params)`` if an episode ended, else what there is.
 
-    Of one environment. Under ``vmap`` starts are sampled only for those that ended, as long as all share the
-    parameters.
+    Of one environment. Under ``vmap`` starts are sampled only for those that ended, as long as all
+    share the parameters.
     """
     batch = reset_ended(begin, jax.tree.map(lambda leaf: leaf[None], step), params)
     return jax.tree.map(lambda leaf: leaf[0], batch)
@@ -94,7 +94,9 @@ def _reset_in_rounds(begin: Begin, steps: Ended, params: Any) -> Shown:
     num_envs = len(steps.done)
     count = min(num_envs, num_envs // ONE_IN + SPARE)
     # One after the other is cheapest within one kernel, and slow where each operation is a kernel.
-    search, take, put = (_scan, _take_each, _put_each) if has_kernels() else (_search, _take, _scatter)
+    search, take, put = (
+        (_scan, _take_each, _put_each) if has_kernels() else (_search, _take, _scatter)
+    )
     find: Callable[..., jax.Array] = partial(search, count=count)
     if not is_in_kernel():
         find, take, put = one_kernel(find), one_kernel(take), one_kernel(put)
@@ -145,7 +147,9 @@ def _scan(ended: jax.Array, count: int) -> jax.Array:
         return jnp.where(is_one, index, index + 1), word, found + is_one.astype(jnp.int32), places
 
     start = (jnp.int32(0), words[0], jnp.int32(0), jnp.full(count, size, jnp.int32))
-    return jax.lax.while_loop(lambda carry: (carry[0] <= last) & (carry[2] < count), next_bit, start)[3]
+    return jax.lax.while_loop(
+        lambda carry: (carry[0] <= last) & (carry[2] < count), next_bit, start
+    )[3]
 
 
 def _at(values: jax.Array, index: Any) -> jax.Array:

@@ -8,8 +8,9 @@ import numpy as np
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
 
-# Share of the full voltage by which the battery may exceed the voltages of the fit before a warning. Thrust
-# goes with the first to second power of the voltage: with no slope at all, it would be 3 to 6 % wrong there.
+# Share of the full voltage by which the battery may exceed the voltages of the fit before a
+# warning. Thrust goes with the first to second power of the voltage: with no slope at all, it would
+# be 3 to 6 % wrong there.
 MAX_EXTRAPOLATION = 0.03
 
 

@@ -7,15 +7,16 @@
   action 1, battery 1. Such a plant does not report the lagged rate actions; they are reconstructed
   as angular velocity / max_rate, which is exact where the rates follow the handout's equation 2.
 
-The file holds StableHLO, a program for XLA's compiler. ``load`` does not trust it: it is read, compiled and
-run for one step in a process of its own (``flytrack_env.sandbox``), with limits on time and memory
-(``limits``), so that a file that crashes, hangs or exhausts the compiler is a BlackBoxError. Bytes that
-passed are not tried again by the same process; the shipped black box is known and never tried.
+The file holds StableHLO, a program for XLA's compiler. ``load`` does not trust it: it is read,
+compiled and run for one step in a process of its own (``flytrack_env.sandbox``), with limits on
+time and memory (``limits``), so that a file that crashes, hangs or exhausts the compiler is a
+BlackBoxError. Bytes that passed are not tried again by the same process; the shipped black box is
+known and never tried.
 
-Nothing in a file is unpickled, and it cannot call Python or native code (``custom_call``), not even LAPACK
-unless ``limits`` is None. The trial cannot show that the plant is a sensible drone, nor what it does later:
-the program then runs in this process, for any state. Windows limits only the wall-clock time of a trial,
-macOS does not limit its memory.
+Nothing in a file is unpickled, and it cannot call Python or native code (``custom_call``), not even
+LAPACK unless ``limits`` is None. The trial cannot show that the plant is a sensible drone, nor what
+it does later: the program then runs in this process, for any state. Windows limits only the
+wall-clock time of a trial, macOS does not limit its memory.
 """
 
 import hashlib
@@ -53,7 +54,9 @@ from flytrack_env.state import (
 DT = 0.01  # s, baked into every artifact
 MAX_FILE_BYTES = 64 * 2**20
 MAX_RATE_DEG_S = (618.0, 618.0, 120.0)
-SHIPPED = Path(__file__).with_name("acro_step.bin")  # in the repository a link to blackbox/acro_step.bin
+SHIPPED = Path(__file__).with_name(
+    "acro_step.bin"
+)  # in the repository a link to blackbox/acro_step.bin
 SHIPPED_SHA256 = "c05e6c001da095b5b0434f7bbc4df90e7d01e548f56eb8e03a615383e383aedd"
 
 # Components of the handout's 21 that an 18-component artifact has: all but the rate actions.
@@ -75,7 +78,11 @@ class BlackBoxError(ValueError):
 def start_vector() -> np.ndarray:
     """Return the handout's start state, (21,): all 0 but q = (1, 0, 0, 0), no thrust, 24 V."""
     start = np.zeros(STATE_SIZE, np.float32)
-    start[QUATERNION], start[APPLIED_ACTION], start[BATTERY] = (1, 0, 0, 0), (0, 0, 0, -1), BATTERY_FULL_V
+    start[QUATERNION], start[APPLIED_ACTION], start[BATTERY] = (
+        (1, 0, 0, 0),
+        (0, 0, 0, -1),
+        BATTERY_FULL_V,
+    )
     return start
 
 
@@ -112,8 +119,8 @@ class BlackBox(Plant):
     the default device is another, run inside ``with jax.default_device(jax.devices("cpu")[0])``;
     JAX raises a ValueError otherwise.
 
-    path: the artifact's file. state_size: components of the artifact's own state, 21 or 18. dt: s, baked in.
-    battery: the handout's, which is part of the contract of these files.
+    path: the artifact's file. state_size: components of the artifact's own state, 21 or 18. dt: s,
+    baked in. battery: the handout's, which is part of the contract of these files.
     """
 
     dt = DT
@@ -181,12 +188,13 @@ def load(
 ) -> BlackBox:
     """Return the plant in a file; see the module's description for what a file may hold, and the risks.
 
-    max_rate: deg/s, body rates at full stick, used with 18-component artifacts only. limits: of the trial.
-    None: no trial, and native calls are allowed; only for files from people whose programs you would run.
+    max_rate: deg/s, body rates at full stick, used with 18-component artifacts only. limits: of the
+    trial. None: no trial, and native calls are allowed; only for files from people whose programs
+    you would run.
 
-    Raises:
-        BlackBoxError: missing, unreadable, too large, damaged, for another platform, of another signature,
-            not pure, not finite after one step from the start state, or it crashed or exceeded ``limits``.
+    Raises: BlackBoxError: missing, unreadable, too large, damaged, for another platform, of another
+            signature, not pure, not finite after one step from the start state, or it crashed or
+            exceeded ``limits``.
     """
     path = Path(path)
     try:

@@ -18,10 +18,10 @@ FOLDER, LEAST_S = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile
 def keep_compiled_programs() -> None:
     """Let JAX keep what took 0.3 s or more to compile in the user's cache folder.
 
-    Does nothing where JAX has a folder already, where ``FLYTRACK_COMPILE_CACHE`` is 0, or where the folder
-    cannot be written. There is one folder per kind of processor, since a program uses what its processor has;
-    one that has grown beyond 1 GiB is begun afresh. JAX's key of a program is its code, JAX's version and its
-    flags.
+    Does nothing where JAX has a folder already, where ``FLYTRACK_COMPILE_CACHE`` is 0, or where the
+    folder cannot be written. There is one folder per kind of processor, since a program uses what
+    its processor has; one that has grown beyond 1 GiB is begun afresh. JAX's key of a program is
+    its code, JAX's version and its flags.
     """
     if os.environ.get(SWITCH, "1") == "0" or getattr(jax.config, FOLDER) is not None:
         return
@@ -44,5 +44,7 @@ def _processor() -> str:
     about = Path("/proc/cpuinfo")
     if about.exists():
         lines = about.read_text().splitlines()
-        known += sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
+        known += sorted(
+            {line for line in lines if line.startswith(("model name", "flags", "Features"))}
+        )
     return hashlib.sha256("\n".join(known).encode()).hexdigest()[:16]

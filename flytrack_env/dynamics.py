@@ -1,8 +1,9 @@
 """The simulator's physics: lag, body rates, thrust, rigid-body translation, battery.
 
 The equations are the handout's; effects that a model has beyond them are folded in between
-(``flytrack_env.effects``). ``move`` states them once, for one drone of scalar leaves; ``step`` is the
-same function on the packed (21,) vector. How they are integrated over a step is the model's ``Motion``.
+(``flytrack_env.effects``). ``move`` states them once, for one drone of scalar leaves; ``step`` is
+the same function on the packed (21,) vector. How they are integrated over a step is the model's
+``Motion``.
 """
 
 from typing import Any, NamedTuple
@@ -27,13 +28,12 @@ HELD_S = 1e6  # s, long enough for lags and limits of the rates to settle, to fl
 class ModelParameters(NamedTuple):
     """Parameters of the minimal model; the first five fields alone construct it.
 
-    tau: (4,) s, time constants of the first-order lag of roll, pitch, yaw, thrust.
-    thrust_coeffs: (6,) N, of 1, u, u^2, u^3, V, u V.
-    max_rate: (3,) deg/s, body rate at full stick.
-    m: kg. g: m/s^2. battery_drain_v_per_min: V/min. effects: parameters of the effects that the model
-    has, in the order of ``flytrack_env.effects.EFFECTS``. motion: how it moves within a step, static.
-    battery: between which voltages it is flown.
-    Without effects, with the default motion and battery, the model is the handout's.
+    tau: (4,) s, time constants of the first-order lag of roll, pitch, yaw, thrust. thrust_coeffs:
+    (6,) N, of 1, u, u^2, u^3, V, u V. max_rate: (3,) deg/s, body rate at full stick. m: kg. g:
+    m/s^2. battery_drain_v_per_min: V/min. effects: parameters of the effects that the model has, in
+    the order of ``flytrack_env.effects.EFFECTS``. motion: how it moves within a step, static.
+    battery: between which voltages it is flown. Without effects, with the default motion and
+    battery, the model is the handout's.
     """
 
     tau: jax.Array | np.ndarray
@@ -93,7 +93,9 @@ def lag(applied: Action, command: Action, dt: Scalar, tau: Any) -> Action:
 def body_rates(applied: Action, max_rate: jax.Array | np.ndarray) -> Vec3:
     """Return body rates in rad/s of an applied action; ``max_rate`` has shape (3,), deg/s."""
     full_stick = jnp.deg2rad(jnp.asarray(max_rate))
-    return Vec3(applied.roll * full_stick[0], applied.pitch * full_stick[1], applied.yaw * full_stick[2])
+    return Vec3(
+        applied.roll * full_stick[0], applied.pitch * full_stick[1], applied.yaw * full_stick[2]
+    )
 
 
 def integrate_attitude(quat: Quaternion, rates_b: Vec3, dt: Scalar) -> Quaternion:
@@ -121,24 +123,32 @@ def start_rates(drone: Drone, params: ModelParameters) -> Vec3:
         return rates_b
     applied, axes = drone.applied, drone.quat.axes()
     # Held this long, the rates settle to the same values under every motion.
-    context = StepContext(drone=drone, command=applied, dt=HELD_S, applied=applied, body_axes_w=axes)
+    context = StepContext(
+        drone=drone, command=applied, dt=HELD_S, applied=applied, body_axes_w=axes
+    )
     memories = effects.start_memories(params.effects, drone)
     context = _with_thrust(context, params, memories)
     return effects.fold_rates(params.effects, memories, rates_b, context, ())[0]
 
 
-def _with_thrust(context: StepContext, params: ModelParameters, memories: tuple[Any, ...]) -> StepContext:
+def _with_thrust(
+    context: StepContext, params: ModelParameters, memories: tuple[Any, ...]
+) -> StepContext:
     """Return the context with the results of the stages air and thrust."""
     air_w = Vec3(0.0, 0.0, 0.0)
     if effects.acts(params.effects, "air"):
         air_w = compute_once(effects.fold("air", params.effects, memories, air_w, context))
     context = context._replace(air_w=air_w)
-    thrust = collective_thrust(context.applied.thrust, context.drone.battery_v, params.thrust_coeffs)
+    thrust = collective_thrust(
+        context.applied.thrust, context.drone.battery_v, params.thrust_coeffs
+    )
     thrust = effects.fold("thrust", params.effects, memories, thrust, context)
     return context._replace(thrust_acc=compute_once(thrust / params.m))
 
 
-def _forces(context: StepContext, params: ModelParameters, memories: tuple[Any, ...]) -> tuple[Vec3, Vec3]:
+def _forces(
+    context: StepContext, params: ModelParameters, memories: tuple[Any, ...]
+) -> tuple[Vec3, Vec3]:
     """Return the acceleration, world, and the specific force, body, m/s^2: thrust and what effects add."""
     axes, thrust_acc = context.body_axes_w, context.thrust_acc
     acc_w = axes[2].scale(thrust_acc) - Vec3(0.0, 0.0, params.g)
@@ -146,7 +156,9 @@ def _forces(context: StepContext, params: ModelParameters, memories: tuple[Any, 
         return acc_w, Vec3(jnp.zeros_like(thrust_acc), jnp.zeros_like(thrust_acc), thrust_acc)
     still = Vec3(0.0, 0.0, 0.0)
     beside_b = compute_once(effects.fold("force", params.effects, memories, still, context))
-    acc_w = acc_w + (axes[0].scale(beside_b.x) + axes[1].scale(beside_b.y) + axes[2].scale(beside_b.z))
+    acc_w = acc_w + (
+        axes[0].scale(beside_b.x) + axes[1].scale(beside_b.y) + axes[2].scale(beside_b.z)
+    )
     return acc_w, beside_b._replace(z=beside_b.z + thrust_acc)
 
 
@@ -218,8 +230,8 @@ def _move_at_once(
 ) -> Moved:
     """Return the step of a simulator that takes each quantity once.
 
-    The thrust is that of the lagged action *after* the step. The acceleration uses the attitude *before* it
-    (handout, equations 1 to 4), or, semi-implicit, the attitude after it.
+    The thrust is that of the lagged action *after* the step. The acceleration uses the attitude
+    *before* it (handout, equations 1 to 4), or, semi-implicit, the attitude after it.
     """
     context = _beginning(drone, command, dt, params)
 
@@ -238,7 +250,9 @@ def _move_at_once(
     quat = integrate_attitude(drone.quat, rates_b, dt)
     if params.motion is Motion.SEMI_IMPLICIT:
         quat = compute_once(quat)
-        context = _with_thrust(context._replace(body_axes_w=compute_once(quat.axes())), params, memories)
+        context = _with_thrust(
+            context._replace(body_axes_w=compute_once(quat.axes())), params, memories
+        )
     acc_w, force_b = _forces(context, params, memories)
     acc_w, context = compute_once(acc_w), context._replace(force_b=force_b)
     after = Drone(
@@ -268,8 +282,8 @@ def _lag_within_step(
 ) -> tuple[tuple[_Instant, _Instant, _Instant], tuple[Any, ...]]:
     """Return the beginning, middle and end of a step under a held command: lag, body rates, battery.
 
-    The lag is exact for commands held over half a step; of a delayed one, each half has its mean. The
-    memories are those of what takes the lag's place.
+    The lag is exact for commands held over half a step; of a delayed one, each half has its mean.
+    The memories are those of what takes the lag's place.
     """
     beginning = _beginning(drone, command, dt, params)
 
@@ -286,8 +300,12 @@ def _lag_within_step(
         applied: Action, elapsed_s: Scalar, acting: Action, tau: Action, first: tuple[Any, ...] = ()
     ) -> _Instant:
         slope = Action(*((to - now) / t for to, now, t in zip(acting, applied, tau, strict=True)))
-        context = beginning._replace(dt=elapsed_s, acting=acting, applied=applied, applied_slope=slope)
-        volts = effects.fold("battery", params.effects, memories, _drained(drone, elapsed_s, params), context)
+        context = beginning._replace(
+            dt=elapsed_s, acting=acting, applied=applied, applied_slope=slope
+        )
+        volts = effects.fold(
+            "battery", params.effects, memories, _drained(drone, elapsed_s, params), context
+        )
         rates_b = body_rates(applied, params.max_rate)
         if effects.acts(params.effects, "rates"):
             context = context._replace(body_axes_w=drone.quat.axes())
@@ -313,9 +331,10 @@ def _move_continuously(
 ) -> Moved:
     """Return the step of a drone whose rates and force change within it.
 
-    The attitude turns by the exponential map of the rates' mean, with the first commutator of the Magnus
-    expansion (Iserles et al., Lie-group methods, 2000); the acceleration is Simpson's mean of the forces at
-    the beginning, middle and end, each with the attitude and velocity of its moment.
+    The attitude turns by the exponential map of the rates' mean, with the first commutator of the
+    Magnus expansion (Iserles et al., Lie-group methods, 2000); the acceleration is Simpson's mean
+    of the forces at the beginning, middle and end, each with the attitude and velocity of its
+    moment.
     """
     instants, response = _lag_within_step(drone, memories, command, dt, params)
     rates_0, rates_m, rates_1 = (compute_once(one.context.rates_b) for one in instants)
@@ -326,10 +345,18 @@ def _move_continuously(
     quat_m = turn_by(drone.quat, angle_m)
     quat_1 = compute_once(turn_by(drone.quat, angle_1).normalize())
 
-    def force_at(instant: _Instant, quat: Quaternion, vel_w: Vec3, elapsed_s: Scalar) -> tuple[Vec3, Vec3]:
+    def force_at(
+        instant: _Instant, quat: Quaternion, vel_w: Vec3, elapsed_s: Scalar
+    ) -> tuple[Vec3, Vec3]:
         pos_w = drone.pos_w + vel_w.scale(elapsed_s)
         there = Drone(
-            pos_w, vel_w, drone.acc_w, quat, instant.context.rates_b, instant.applied, instant.battery_v
+            pos_w,
+            vel_w,
+            drone.acc_w,
+            quat,
+            instant.context.rates_b,
+            instant.applied,
+            instant.battery_v,
         )
         context = instant.context._replace(drone=there, body_axes_w=compute_once(quat.axes()))
         return compute_once(_forces(_with_thrust(context, params, memories), params, memories))
@@ -348,7 +375,9 @@ def _move_continuously(
         applied=instants[2].applied,
         battery_v=instants[2].battery_v,
     )
-    turning = (rates_0 - rates_m.scale(4.0) + rates_1.scale(3.0)).scale(1.0 / dt)  # the parabola's slope
+    turning = (rates_0 - rates_m.scale(4.0) + rates_1.scale(3.0)).scale(
+        1.0 / dt
+    )  # the parabola's slope
     context = instants[2].context._replace(
         force_b=force_1, angular_acc_b=turning, middle_rates_b=rates_m, middle_force_b=force_m
     )
@@ -362,8 +391,9 @@ def observe_rates(
 ) -> tuple[Drone, tuple[Any, ...]]:
     """Return a drone with measured body rates, rad/s, and the memories of its effects.
 
-    A rate loop with a memory takes up how far they are from the model's; where there is none, the applied
-    action does, to first order in what effects make of it. dt: since the last measurement, s.
+    A rate loop with a memory takes up how far they are from the model's; where there is none, the
+    applied action does, to first order in what effects make of it. dt: since the last measurement,
+    s.
     """
     memories, rest_b = effects.observe(params.effects, memories, rates_b - drone.rates_b, dt)
     full_stick = body_rates(Action(1.0, 1.0, 1.0, 0.0), params.max_rate)
@@ -412,8 +442,8 @@ def sensed(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: ModelPar
 def read_sensors(moved: Moved, params: ModelParameters) -> Reading:
     """Return the readings of gyro and accelerometer after a step.
 
-    The true specific force is that of the step, in the body frame whose attitude its force had; of a
-    continuous step that at its end.
+    The true specific force is that of the step, in the body frame whose attitude its force had; of
+    a continuous step that at its end.
     """
     after, memories, context = moved
     return Reading(
@@ -425,12 +455,13 @@ def read_sensors(moved: Moved, params: ModelParameters) -> Reading:
 def step(x: jax.Array, u: jax.Array, dt: Scalar, params: ModelParameters) -> jax.Array:
     """Return the handout's next state: (21,), (4,), s -> (21,); differentiable in everything.
 
-    Raises:
-        ValueError: if ``x`` or ``u`` has another shape, or the model has an effect with a memory, which
-            the vector has no place for; ``flytrack_env.plants.Simulator`` flies that.
+    Raises: ValueError: if ``x`` or ``u`` has another shape, or the model has an effect with a
+            memory, which the vector has no place for; ``flytrack_env.plants.Simulator`` flies that.
     """
     drone = unpack(x)
     memories = effects.start_memories(params.effects, drone)
     if any(memory is not None for memory in memories):
-        raise ValueError("params.effects: found one with a memory, expected none; use plants.Simulator")
+        raise ValueError(
+            "params.effects: found one with a memory, expected none; use plants.Simulator"
+        )
     return pack(advance(drone, memories, unpack_action(u), dt, params)[0])

@@ -45,11 +45,10 @@ class FlyTrack(EpisodicEnvironment):
             "fly_on" with the same gate still to be flown.
         reward: weights of reward terms by name, for those that are not to have the default weight.
 
-    Raises:
-        TrackError, ModelFileError: a track or model that cannot be read.
-        ValueError: another value of ``missed_gate``; an unknown reward term, or a weight that is no number; a
-            battery beyond all voltages that the model was fitted at.
-        TypeError: a plant that is not a ``flytrack_env.plants.Plant``.
+    Raises: TrackError, ModelFileError: a track or model that cannot be read. ValueError: another
+        value of ``missed_gate``; an unknown reward term, or a weight that is no number; a battery
+        beyond all voltages that the model was fitted at. TypeError: a plant that is not a
+        ``flytrack_env.plants.Plant``.
     """
 
     def __init__(
@@ -62,16 +61,22 @@ class FlyTrack(EpisodicEnvironment):
     ):
         super().__init__()
         if missed_gate not in MISSED_GATE_CHOICES:
-            raise ValueError(f"missed_gate: found {missed_gate!r}, expected one of {MISSED_GATE_CHOICES}")
+            raise ValueError(
+                f"missed_gate: found {missed_gate!r}, expected one of {MISSED_GATE_CHOICES}"
+            )
         self.track: Track = track if isinstance(track, Track) else load_track(track)
         self.missed_gate = missed_gate
         if model is None:
             model = nominal_parameters()
         elif not isinstance(model, ModelParameters):
             model = load_model(model)
-        self.plant: Plant = Simulator(delay_steps_of(model.effects, DT_S)) if plant is None else plant
+        self.plant: Plant = (
+            Simulator(delay_steps_of(model.effects, DT_S)) if plant is None else plant
+        )
         if not isinstance(self.plant, Plant):
-            raise TypeError(f"plant: found {type(plant).__name__}, expected a subclass of plants.Plant")
+            raise TypeError(
+                f"plant: found {type(plant).__name__}, expected a subclass of plants.Plant"
+            )
         if self.plant.battery is not None:
             model = model._replace(battery=self.plant.battery)
         model.battery.check()
@@ -129,10 +134,18 @@ class FlyTrack(EpisodicEnvironment):
         after = self.plant.drone(plant_state)
         start_time_s = state.time.astype(state.race.lap_start_s.dtype) * params.dt
         race, events = advance_race(
-            state.race, before.pos_w, after.pos_w, start_time_s, params.dt, params.course, params.drone_radius
+            state.race,
+            before.pos_w,
+            after.pos_w,
+            start_time_s,
+            params.dt,
+            params.course,
+            params.drone_radius,
         )
         is_missed = events.is_miss & (self.missed_gate == "terminate")
-        causes = find_causes(after, params.course, params.model.battery, events.is_frame | is_nan, is_missed)
+        causes = find_causes(
+            after, params.course, params.model.battery, events.is_frame | is_nan, is_missed
+        )
         causes = compute_once(causes)
         is_terminated = compute_once(causes.any())
         reward = total_reward(
@@ -153,8 +166,9 @@ class FlyTrack(EpisodicEnvironment):
     ) -> tuple[EnvState, jax.Array, jax.Array, dict[str, Any]]:
         """Return the next state, the reward, whether the episode terminates, and info.
 
-        info: each cause of termination, ``gates_passed``, ``laps``, ``lap_completed``, ``lap_time_s``
-        (last complete lap, interpolated at the crossing; 0 if none), ``gate_distance_m``.
+        info: each cause of termination, ``gates_passed``, ``laps``, ``lap_completed``,
+        ``lap_time_s`` (last complete lap, interpolated at the crossing; 0 if none),
+        ``gate_distance_m``.
         """
         next_state, reward, causes, events = self.transition(state, command, params)
         race = next_state.race
@@ -183,4 +197,6 @@ class FlyTrack(EpisodicEnvironment):
         params.check(self.plant.delay_steps)
         plant_dt = self.plant.dt
         if plant_dt is not None and not np.allclose(params.dt, plant_dt, rtol=1e-5):
-            raise ValueError(f"dt: found {params.dt} s, expected {plant_dt} s, which the plant has baked in")
+            raise ValueError(
+                f"dt: found {params.dt} s, expected {plant_dt} s, which the plant has baked in"
+            )

@@ -1,8 +1,9 @@
 """Episodes: how an environment's hooks become gymnax's ``reset`` and ``step``, with auto-reset outermost.
 
-An environment, or a wrapper around one, implements the hooks of ``EpisodicEnvironment``: how an episode
-begins, advances and is observed. ``reset``, ``step`` and ``step_batch`` are built from them here, once, and
-called on the outermost object only, so that the state of a wrapper is fresh in every episode.
+An environment, or a wrapper around one, implements the hooks of ``EpisodicEnvironment``: how an
+episode begins, advances and is observed. ``reset``, ``step`` and ``step_batch`` are built from them
+here, once, and called on the outermost object only, so that the state of a wrapper is fresh in
+every episode.
 """
 
 from functools import partial
@@ -109,8 +110,8 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     ) -> tuple[Any, jax.Array, jax.Array, dict[str, Any]]:
         """Return the next state, the reward, whether the episode terminates, and info; no auto-reset.
 
-        reward, terminated: scalars. command: within [-1, 1]; one that is not a number ends the episode and
-        may not get into the state.
+        reward, terminated: scalars. command: within [-1, 1]; one that is not a number ends the
+        episode and may not get into the state.
         """
         raise NotImplementedError
 
@@ -134,8 +135,14 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         return self.env_id
 
     def __repr__(self) -> str:
-        effects = ", ".join(effect_of(one).name for one in self.default_params.model.effects) or "none"
-        track, plant, size = self.track.name, type(self.plant).__name__, self.observation_space().shape[0]
+        effects = (
+            ", ".join(effect_of(one).name for one in self.default_params.model.effects) or "none"
+        )
+        track, plant, size = (
+            self.track.name,
+            type(self.plant).__name__,
+            self.observation_space().shape[0],
+        )
         return f"<{self.env_id}: track {track}, plant {plant}, effects {effects}, observation size {size}>"
 
     @property
@@ -151,7 +158,9 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         """The observation's table as a box."""
         return observation_box(self.observation_table)
 
-    def observe(self, key: jax.Array | None, state: Any, action: Any, params: EnvParams) -> jax.Array:
+    def observe(
+        self, key: jax.Array | None, state: Any, action: Any, params: EnvParams
+    ) -> jax.Array:
         """Return the observation of a state, (size,) float32; key and action are unused."""
         del key, action
         return jnp.stack(self._rows(state, params))
@@ -161,8 +170,8 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     ) -> tuple[jax.Array, Any, jax.Array, jax.Array, dict[str, Any]]:
         """Return observation, state, reward, terminated and info of one step, without auto-reset.
 
-        action: (4,). The observation is (size,), of the type of the state, as the reward is; reward and
-        terminated are scalars. key is unused.
+        action: (4,). The observation is (size,), of the type of the state, as the reward is; reward
+        and terminated are scalars. key is unused.
         """
         del key
         rows, next_state, reward, flags, info = one_kernel(self._transition)(
@@ -175,10 +184,9 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     ) -> tuple[jax.Array, Any]:
         """Return observation, (size,) float32, and state of an episode that begins.
 
-        Raises:
-            TypeError: a key that is none, or more than one.
-            ValueError: parameters of another environment's wrappers; or that no episode can be flown with,
-                where their values are known (not while they are traced).
+        Raises: TypeError: a key that is none, or more than one. ValueError: parameters of another
+                environment's wrappers; or that no episode can be flown with, where their values are
+                known (not while they are traced).
         """
         check_key(key)
         if params is None:
@@ -186,7 +194,9 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         expected = sorted(self.default_params.wrappers)
         if sorted(params.wrappers) != expected:
             found = sorted(params.wrappers)
-            raise ValueError(f"params.wrappers: found {found}, expected {expected}, as in default_params")
+            raise ValueError(
+                f"params.wrappers: found {found}, expected {expected}, as in default_params"
+            )
         if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(params)):
             # As NumPy: comparing JAX's arrays would be traced where the reset is.
             self.check_params(jax.tree.map(np.asarray, params))
@@ -209,15 +219,19 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     def _rows(self, state: Any, params: EnvParams) -> list[jax.Array]:
         """Return the observation of a state, row by row."""
         dtype = self._dtype(state)
-        return [jnp.asarray(row, dtype) for row in self.observe_drone(self.drone(state), state, params)]
+        return [
+            jnp.asarray(row, dtype) for row in self.observe_drone(self.drone(state), state, params)
+        ]
 
     @partial(jax.jit, static_argnames=("self",))
-    def step(self, key: jax.Array, state: Any, action: jax.Array, params: EnvParams | None = None) -> Step:
+    def step(
+        self, key: jax.Array, state: Any, action: jax.Array, params: EnvParams | None = None
+    ) -> Step:
         """Return observation, state, reward, terminated, truncated and info, with auto-reset.
 
-        gymnax's protocol, except that the whole key serves the reset: what a step draws, it draws from
-        the word that the episode began with. The types are those of the state, float32 from a reset: the
-        action is cast to them.
+        gymnax's protocol, except that the whole key serves the reset: what a step draws, it draws
+        from the word that the episode began with. The types are those of the state, float32 from a
+        reset: the action is cast to them.
         """
         if params is None:
             params = self.default_params
@@ -257,18 +271,25 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     ) -> Step:
         """``step`` for a whole batch with one key, faster than ``vmap(step)``.
 
-        states: leaves (num_envs,). actions: (num_envs, 4). params: the same for all. Same results as
-        ``vmap(step)`` up to the random draws: starts are sampled only in steps where an episode ended.
+        states: leaves (num_envs,). actions: (num_envs, 4). params: the same for all. Same results
+        as ``vmap(step)`` up to the random draws: starts are sampled only in steps where an episode
+        ended.
 
-        has_ended: None, or (num_envs,) bool to reset one step late: an environment whose episode ended in the
-        step before is reset instead of stepped, with a reward of 0, both flags False and a meaningless info.
+        has_ended: None, or (num_envs,) bool to reset one step late: an environment whose episode
+        ended in the step before is reset instead of stepped, with a reward of 0, both flags False
+        and a meaningless info.
         """
         seeds = seeds_of(seed_of(key), jnp.arange(actions.shape[0]))
         step = jax.vmap(self._fly, in_axes=(0, 0, 0, None, 0))
         return step(seeds, states, actions, params, has_ended)
 
     def _fly(
-        self, seed: jax.Array, state: Any, action: jax.Array, params: EnvParams, has_ended: Any = None
+        self,
+        seed: jax.Array,
+        state: Any,
+        action: jax.Array,
+        params: EnvParams,
+        has_ended: Any = None,
     ) -> Step:
         """Return what ``step`` does, of an action (4,) and one random word."""
         found = one_kernel(self._transition_or_reset)(

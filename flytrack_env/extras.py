@@ -2,7 +2,11 @@
 
 from importlib.util import find_spec
 
-PACKAGES = {"PIL": "Pillow", "pygame": "pygame-ce", "rerun": "rerun-sdk"}  # where the module's name differs
+PACKAGES = {
+    "PIL": "Pillow",
+    "pygame": "pygame-ce",
+    "rerun": "rerun-sdk",
+}  # where the module's name differs
 OLDEST_GYMNAX = 1
 
 
@@ -15,7 +19,9 @@ def check_gymnax(found: str) -> None:
     """Raise ImportError if this version of gymnax has no step of six values."""
     if int(found.partition(".")[0]) < OLDEST_GYMNAX:
         how = f"pip install 'gymnax>={OLDEST_GYMNAX}'"
-        raise ImportError(f"gymnax: found version {found}, expected {OLDEST_GYMNAX}.0 or newer: {how}")
+        raise ImportError(
+            f"gymnax: found version {found}, expected {OLDEST_GYMNAX}.0 or newer: {how}"
+        )
 
 
 def check_installed(extra: str, who: str, *modules: str) -> None:

@@ -22,9 +22,8 @@ def user_cache_folder() -> Path:
 def open_file(path: Path, most_bytes: int) -> BinaryIO:
     """Return a file opened for reading.
 
-    Raises:
-        OSError: not a regular file (a pipe may never begin, a device never end), larger than ``most_bytes``,
-            or an error of the operating system.
+    Raises: OSError: not a regular file (a pipe may never begin, a device never end), larger than
+            ``most_bytes``, or an error of the operating system.
     """
     try:
         status = path.stat()
@@ -46,8 +45,8 @@ def read_at_most(path: Path, most_bytes: int) -> bytes:
 def write_atomically(path: str | Path, content: bytes) -> None:
     """Write a file under a temporary name beside it and rename it; makes missing folders.
 
-    Raises:
-        OSError: the path is a folder or a device, or an error of the operating system; nothing is left then.
+    Raises: OSError: the path is a folder or a device, or an error of the operating system; nothing
+        is left then.
     """
     path = Path(os.path.realpath(path))  # a link stays one
     if path.exists() and not path.is_file():
@@ -88,13 +87,12 @@ def fresh_folder(path: Path) -> Path:
 def locked_folder(folder: Path) -> Iterator[None]:
     """Hold a folder for one process, so that no two write into it at once.
 
-    An advisory lock of the operating system on a file beside the folder, which ends with the process. Where
-    there is none (Windows, some network file systems), a warning says so. A process that holds the folder
-    already goes on: a command holds what its training writes into.
+    An advisory lock of the operating system on a file beside the folder, which ends with the
+    process. Where there is none (Windows, some network file systems), a warning says so. A process
+    that holds the folder already goes on: a command holds what its training writes into.
 
-    Raises:
-        OSError: another process holds the folder; it names the folder, the process and its command. Or the
-            folder would lie in a file.
+    Raises: OSError: another process holds the folder; it names the folder, the process and its
+            command. Or the folder would lie in a file.
     """
     folder = Path(os.path.realpath(folder))
     try:
@@ -119,9 +117,13 @@ def locked_folder(folder: Path) -> Iterator[None]:
             except BlockingIOError:
                 file.seek(0)
                 holder = file.read().strip() or "another process"
-                raise OSError(f"{folder}: found in use by {holder}, expected a folder of its own") from None
+                raise OSError(
+                    f"{folder}: found in use by {holder}, expected a folder of its own"
+                ) from None
             except OSError as error:
-                warnings.warn(f"{folder}: not locked, as its file system refuses: {error}", stacklevel=3)
+                warnings.warn(
+                    f"{folder}: not locked, as its file system refuses: {error}", stacklevel=3
+                )
                 yield
                 return
             if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):

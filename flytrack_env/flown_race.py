@@ -1,7 +1,7 @@
 """The race that a recorded flight flew: gates passed and when, laps, the gate to fly next, why it ended.
 
-A rollout holds states and actions, not the race; the race follows from the positions by the environment's
-own rules.
+A rollout holds states and actions, not the race; the race follows from the positions by the
+environment's own rules.
 """
 
 import math
@@ -29,9 +29,10 @@ PADDED_TO = 1024  # steps: flights of about the same length share one compiled p
 class Pass(NamedTuple):
     """One gate passed, or a lap completed by it.
 
-    row: of the first state behind the gate; the number of states if that is after the last. time_s: of the
-    crossing, interpolated, s since the first state. gate: index in flying order. pos_w: where, (3,), world,
-    m. lap: that it completed, counted from 1, 0 if none. lap_time_s: of that lap, 0.0 if none.
+    row: of the first state behind the gate; the number of states if that is after the last. time_s:
+    of the crossing, interpolated, s since the first state. gate: index in flying order. pos_w:
+    where, (3,), world, m. lap: that it completed, counted from 1, 0 if none. lap_time_s: of that
+    lap, 0.0 if none.
     """
 
     row: int
@@ -45,10 +46,10 @@ class Pass(NamedTuple):
 class FlownRace(NamedTuple):
     """The race at each state of a flight, leaves (T,), and its events.
 
-    gate: index of the gate to fly next. gate_distance_m: to its centre. laps: completed. lap_start_s: time of
-    the crossing that began the lap. lap_time_s: of the last complete lap, 0 if none. is_frame, is_miss:
-    whether the step from this state on touches the frame of the gate or misses it; for the last state only
-    where that step is extrapolated. passes: in order.
+    gate: index of the gate to fly next. gate_distance_m: to its centre. laps: completed.
+    lap_start_s: time of the crossing that began the lap. lap_time_s: of the last complete lap, 0 if
+    none. is_frame, is_miss: whether the step from this state on touches the frame of the gate or
+    misses it; for the last state only where that step is extrapolated. passes: in order.
     """
 
     gate: np.ndarray
@@ -62,14 +63,17 @@ class FlownRace(NamedTuple):
 
 
 def follow_race(
-    positions: np.ndarray, track: Track, first_gate: int | None = None, last_vel_w: np.ndarray | None = None
+    positions: np.ndarray,
+    track: Track,
+    first_gate: int | None = None,
+    last_vel_w: np.ndarray | None = None,
 ) -> FlownRace:
     """Return the race of a flight at 100 Hz through these positions, by the rules of ``advance_race``.
 
-    positions: (T, 3), world, m, finite. first_gate: index of the gate to fly first; if None, gate 0 for a
-    flight that begins near the track's start or passes no gate, else the one that it passes first.
-    last_vel_w: (3,), m/s, of the last state: a rollout ends before its last step, often just before a gate,
-    and that step is extrapolated at this velocity, if it is finite.
+    positions: (T, 3), world, m, finite. first_gate: index of the gate to fly first; if None, gate 0
+    for a flight that begins near the track's start or passes no gate, else the one that it passes
+    first. last_vel_w: (3,), m/s, of the last state: a rollout ends before its last step, often just
+    before a gate, and that step is extrapolated at this velocity, if it is finite.
 
     Raises:
         ValueError: a track without gates.
@@ -127,16 +131,20 @@ def _padded(positions: np.ndarray) -> np.ndarray:
 def why_ended(states: np.ndarray, track: Track, race: FlownRace) -> str:
     """Return why the flight ended, as far as its last state tells.
 
-    A rollout's last row is the state before its last step, which is extrapolated at the last velocity. A
-    rollout does not state its battery: one that begins within the handout's voltages is taken to have the
-    handout's, and when any other is empty is not known.
-    states: (T, 21). race: as ``follow_race`` returns it for them with ``last_vel_w``.
+    A rollout's last row is the state before its last step, which is extrapolated at the last
+    velocity. A rollout does not state its battery: one that begins within the handout's voltages is
+    taken to have the handout's, and when any other is empty is not known. states: (T, 21). race: as
+    ``follow_race`` returns it for them with ``last_vel_w``.
     """
     start_v, handout = float(states[0, BATTERY]), Battery()
     is_handout = handout.empty_v <= start_v <= handout.full_v * (1.0 + ROUNDING)
     battery = handout if is_handout else handout._replace(empty_v=-np.inf)
     causes = _causes(
-        np.asarray(states[-1], np.float32), build_course(track), battery, race.is_frame[-1], race.is_miss[-1]
+        np.asarray(states[-1], np.float32),
+        build_course(track),
+        battery,
+        race.is_frame[-1],
+        race.is_miss[-1],
     )
     names = [name.replace("_", " ") for name, happened in causes._asdict().items() if happened]
     return ", ".join(names) or "all steps flown"
@@ -174,16 +182,26 @@ def _follow(
         second = cross_gate(race.next_gate, middle_w, end_w, DRONE_RADIUS_M).fraction
         fractions = jnp.stack([first, first + (1.0 - first) * second])
         start_time_s = segment[2] * STEP_S
-        race, events = advance_race(race, start_w, end_w, start_time_s, STEP_S, course, DRONE_RADIUS_M)
+        race, events = advance_race(
+            race, start_w, end_w, start_time_s, STEP_S, course, DRONE_RADIUS_M
+        )
         return race, (race, events, fractions)
 
     start = start_race(first_gate, course)
     indices = jnp.arange(len(positions) - 1)
-    _, (races, events, fractions) = jax.lax.scan(one, start, (positions[:-1], positions[1:], indices))
-    return jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), start, races), events, fractions
+    _, (races, events, fractions) = jax.lax.scan(
+        one, start, (positions[:-1], positions[1:], indices)
+    )
+    return (
+        jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), start, races),
+        events,
+        fractions,
+    )
 
 
-def _passes(races: Race, fractions: np.ndarray, positions: np.ndarray, num_gates: int) -> tuple[Pass, ...]:
+def _passes(
+    races: Race, fractions: np.ndarray, positions: np.ndarray, num_gates: int
+) -> tuple[Pass, ...]:
     """Return the gates passed, in order; of two in one step each has its own time and place."""
     found = []
     for step in np.flatnonzero(np.diff(races.gates_passed)):

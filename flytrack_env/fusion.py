@@ -15,7 +15,11 @@ import jax
 import jax.numpy as jnp
 from jax import core
 from jax.dtypes import float0
-from jax.experimental.custom_partitioning import ArrayMapping, SdyShardingRule, custom_partitioning_p
+from jax.experimental.custom_partitioning import (
+    ArrayMapping,
+    SdyShardingRule,
+    custom_partitioning_p,
+)
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters.partial_eval import dce_jaxpr, dce_rules
@@ -31,8 +35,8 @@ _compute_once_p.multiple_results = True
 def compute_once(tree: Tree) -> Tree:
     """Return the same pytree of arrays, computed once for all its users.
 
-    The identity, for ``jit``, ``vmap`` and differentiation too; a hint that matters for speed on the
-    CPU only.
+    The identity, for ``jit``, ``vmap`` and differentiation too; a hint that matters for speed on
+    the CPU only.
     """
     leaves, structure = jax.tree.flatten(tree)
     leaves = [jnp.asarray(leaf) for leaf in leaves]
@@ -52,7 +56,8 @@ def _is_number(leaf: jax.Array) -> bool:
 def vary_like(tree: Tree, source: Any) -> Tree:
     """Return a tree whose leaves vary, within ``shard_map``, over all the axes that those of another do.
 
-    The same numbers: what begins as a constant and is then carried by a loop needs the type of its end.
+    The same numbers: what begins as a constant and is then carried by a loop needs the type of its
+    end.
     """
     axes = frozenset().union(*(jax.typeof(leaf).mat.varying for leaf in jax.tree.leaves(source)))
 
@@ -75,7 +80,9 @@ def _fence(*leaves: jax.Array) -> tuple[jax.Array, ...]:
 
 
 def _lower_fence(ctx, *leaves):  # type: ignore[no-untyped-def]
-    if _is_partitioned(ctx):  # the probe of a loop that never runs would be sent between the devices
+    if _is_partitioned(
+        ctx
+    ):  # the probe of a loop that never runs would be sent between the devices
         return list(leaves)
     return _lower(_fence, ctx, *leaves)
 
@@ -89,7 +96,8 @@ def _lower(function: Callable[..., Any], ctx: Any, *values: Any) -> Any:
 def _is_partitioned(ctx: Any) -> bool:
     """Return whether XLA divides what is lowered now among devices.
 
-    Not in ``pmap``, nor in ``shard_map`` over all axes of its mesh, whose body is that of one device.
+    Not in ``pmap``, nor in ``shard_map`` over all axes of its mesh, whose body is that of one
+    device.
     """
     context = ctx.module_context.axis_context
     if hasattr(context, "manual_axes"):
@@ -103,7 +111,9 @@ def _batch(leaves, axes):  # type: ignore[no-untyped-def]
 
 def _jvp(primals, tangents):  # type: ignore[no-untyped-def]
     # Derivatives are shared as values are. Of integers there are none.
-    moves = [i for i, one in enumerate(tangents) if type(one) is not ad.Zero and one.dtype != float0]
+    moves = [
+        i for i, one in enumerate(tangents) if type(one) is not ad.Zero and one.dtype != float0
+    ]
     fenced = _compute_once_p.bind(*(tangents[i] for i in moves)) if moves else []
     found = dict(zip(moves, fenced, strict=True))
     return _compute_once_p.bind(*primals), [found.get(i, one) for i, one in enumerate(tangents)]
@@ -115,7 +125,9 @@ def _transpose(cotangents, *leaves):  # type: ignore[no-untyped-def]
 
 def _prune(is_used, equation):  # type: ignore[no-untyped-def]
     used = [i for i, one in enumerate(is_used) if one]
-    invars, outvars = ([variables[i] for i in used] for variables in (equation.invars, equation.outvars))
+    invars, outvars = (
+        [variables[i] for i in used] for variables in (equation.invars, equation.outvars)
+    )
     return list(is_used), equation.replace(invars=invars, outvars=outvars) if used else None
 
 
@@ -132,8 +144,8 @@ mlir.register_lowering(_compute_once_p, _lower_fence, platform="cpu")
 _one_kernel_p = Primitive("flytrack_one_kernel")
 _one_kernel_p.multiple_results = True
 
-# What XLA's CPU compiler can put into one function; anything else (a gather, a product of matrices, a
-# call of a library) keeps a kernel of its own.
+# What XLA's CPU compiler can put into one function; anything else (a gather, a product of matrices,
+# a call of a library) keeps a kernel of its own.
 SIMPLE = frozenset(
     """
     abs add add_any and broadcast_in_dim bitcast_convert_type ceil clamp concatenate
@@ -191,7 +203,9 @@ def one_kernel(function: Callable[..., Tree]) -> Callable[..., Tree]:
     return wrapped
 
 
-def _bind(function: Callable[..., Tree], leaves: Sequence[Any], element: "_Element | None" = None) -> Tree:
+def _bind(
+    function: Callable[..., Tree], leaves: Sequence[Any], element: "_Element | None" = None
+) -> Tree:
     """Return the results of a function of leaves, computed by a kernel if it is made of ``SIMPLE``.
 
     element: what the function is the batch of, if it is one.
@@ -233,29 +247,37 @@ class _Element(NamedTuple):
 def _divided(kernel: ClosedJaxpr, used: Sequence[int], element: _Element) -> ClosedJaxpr:
     """Return a kernel of a batch as an operation that XLA divides among devices along the batch.
 
-    Left to itself it divides what is within the kernel, and its compiler of such a call has no collectives.
-    used: indices of the batch's arguments that the kernel has.
+    Left to itself it divides what is within the kernel, and its compiler of such a call has no
+    collectives. used: indices of the batch's arguments that the kernel has.
     """
     dims = [element.dims[i] for i in used]
-    own = element._replace(dims=tuple(dim if i in used else None for i, dim in enumerate(element.dims)))
+    own = element._replace(
+        dims=tuple(dim if i in used else None for i, dim in enumerate(element.dims))
+    )
 
     def part(*leaves: jax.Array) -> Any:
         given = dict(zip(used, leaves, strict=True))
         avals = enumerate(own.jaxpr.in_avals)
-        return _bind(own.batch(), [given[i] if i in given else jnp.zeros(a.shape, a.dtype) for i, a in avals])
+        return _bind(
+            own.batch(), [given[i] if i in given else jnp.zeros(a.shape, a.dtype) for i, a in avals]
+        )
 
     def partition(mesh: Any, arguments: Any, results: Any) -> tuple[Any, ...]:
         shardings = [[one.sharding for one in shapes] for shapes in (results, arguments)]
         return mesh, part, *shardings
 
     def mapping(name: str, ndim: int, batch: int | None) -> ArrayMapping:
-        return ArrayMapping(*("batch" if axis == batch else f"{name}x{axis}" for axis in range(ndim)))
+        return ArrayMapping(
+            *("batch" if axis == batch else f"{name}x{axis}" for axis in range(ndim))
+        )
 
     arguments = [
         mapping(f"a{i}", aval.ndim, dim)
         for i, (aval, dim) in enumerate(zip(kernel.in_avals, dims, strict=True))
     ]
-    results = [mapping(f"r{i}", aval.ndim, aval.ndim - 1) for i, aval in enumerate(kernel.out_avals)]
+    results = [
+        mapping(f"r{i}", aval.ndim, aval.ndim - 1) for i, aval in enumerate(kernel.out_avals)
+    ]
     # In the order in which they occur, as Shardy asks.
     axes = (axis for array in (*arguments, *results) for axis in array)
     whole = tuple(dict.fromkeys(axis for axis in axes if axis != "batch"))
@@ -293,27 +315,34 @@ def _jvp_kernel(primals, tangents, *, jaxpr, divided):  # type: ignore[no-untype
         def of_moving(*moving: Any) -> Any:
             given = iter(moving)
             return jaxpr_as_fun(jaxpr)(
-                *(next(given) if does else still for does, still in zip(moves, primals, strict=True))
+                *(
+                    next(given) if does else still
+                    for does, still in zip(moves, primals, strict=True)
+                )
             )
 
         moving = [one for one, does in zip(primals, moves, strict=True) if does]
         return jax.jvp(of_moving, moving, directions)[1]
 
     # Apart, since a batch of directions has one result.
-    return _one_kernel_p.bind(*primals, jaxpr=jaxpr, divided=divided), derivative(list(primals), directions)
+    return _one_kernel_p.bind(*primals, jaxpr=jaxpr, divided=divided), derivative(
+        list(primals), directions
+    )
 
 
 def _lower_kernel(ctx, *args, jaxpr, divided):  # type: ignore[no-untyped-def]
     if _is_partitioned(ctx):
         return _lower(jaxpr_as_fun(divided or jaxpr), ctx, *args)
-    # XLA's compiler of such a call aborts on an argument that nothing reads, and simplifies reads away that
-    # JAX sees; it does on some constants, too. So one more result reads something of each argument, and what
-    # is small, as parameters are, is fenced.
+    # XLA's compiler of such a call aborts on an argument that nothing reads, and simplifies reads
+    # away that JAX sees; it does on some constants, too. So one more result reads something of each
+    # argument, and what is small, as parameters are, is fenced.
     small = [i for i, aval in enumerate(ctx.avals_in) if 0 < aval.size <= MOST_FENCED]
     given = dict(enumerate(args))
     if small:
         avals = [ctx.avals_in[i] for i in small]
-        fenced = _lower(_fence, ctx.replace(avals_in=avals, avals_out=avals), *(given[i] for i in small))
+        fenced = _lower(
+            _fence, ctx.replace(avals_in=avals, avals_out=avals), *(given[i] for i in small)
+        )
         given |= dict(zip(small, fenced, strict=True))
 
     def reading(*leaves: jax.Array) -> list[jax.Array]:
@@ -335,7 +364,9 @@ def _infer_kernel(*avals, jaxpr, divided):  # type: ignore[no-untyped-def]
     if not placed:
         return list(jaxpr.out_avals)
     # Within shard_map a result varies over the axes that any argument varies over.
-    manual_axes = type(placed[0].mat)(varying=frozenset().union(*(aval.mat.varying for aval in placed)))
+    manual_axes = type(placed[0].mat)(
+        varying=frozenset().union(*(aval.mat.varying for aval in placed))
+    )
     mesh = placed[0].sharding.mesh
 
     def vary(aval: Any) -> Any:

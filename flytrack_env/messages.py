@@ -36,5 +36,9 @@ def check_keywords(found: Iterable[str], expected: Sequence[str]) -> None:
     for name in found:
         if name not in expected:
             close = difflib.get_close_matches(name, expected, n=1)
-            hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(expected)}"
-            raise TypeError(f"make() got an unexpected keyword argument {quote_name(name)!r}; {hint}")
+            hint = (
+                f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(expected)}"
+            )
+            raise TypeError(
+                f"make() got an unexpected keyword argument {quote_name(name)!r}; {hint}"
+            )

@@ -84,7 +84,9 @@ def _read_effect(source: str, name: str, values: dict[str, Any]) -> Any:
         )
     if name not in effects.BY_NAME:
         known = ", ".join(effects.BY_NAME)
-        raise ModelFileError(f"{source}: effects.{quote_name(name)}: unknown; expected one of {known}")
+        raise ModelFileError(
+            f"{source}: effects.{quote_name(name)}: unknown; expected one of {known}"
+        )
     effect = effects.BY_NAME[name]
     kinds: dict[str, Any] = {
         parameter: Annotated[float, Meta(ge=bounds.low, le=bounds.high)]
@@ -94,7 +96,9 @@ def _read_effect(source: str, name: str, values: dict[str, Any]) -> Any:
         kinds[effect.static] = Any
     neutral = effect.parameters()._asdict()
     members = [(parameter, kind, neutral[parameter]) for parameter, kind in kinds.items()]
-    fields = convert(source, values, msgspec.defstruct(name, members, bases=(Fields,)), ModelFileError, field)
+    fields = convert(
+        source, values, msgspec.defstruct(name, members, bases=(Fields,)), ModelFileError, field
+    )
     found = msgspec.structs.asdict(fields)
     if effect.static in values and effect.read is not None:
         try:
@@ -110,7 +114,10 @@ def _read_json(path: Path) -> dict[str, Any]:
         data = json.loads(read_at_most(path, LARGEST_BYTES))
     except OSError as error:
         raise ModelFileError(f"{path}: cannot be read: {error_text(error)}") from error
-    except (ValueError, RecursionError) as error:  # ValueError: no text, no JSON, or too many digits
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # ValueError: no text, no JSON, or too many digits
         raise ModelFileError(f"{path}: not a JSON file: {error_text(error)}") from error
     return _object(str(path), data)
 
@@ -119,13 +126,14 @@ def load_model(path: str | Path) -> ModelParameters:
     """Return the parameters in a model file.
 
     The file is a JSON object with ``tau``, ``thrust_coeffs``, ``max_rate``, ``m``, ``g`` and
-    ``battery_drain_v_per_min`` at the top or under ``parameters``, units as in ``ModelParameters``; and
-    optionally ``effects``, an object of effects' names (``flytrack_env.effects``) with their parameters,
-    ``motion``, a value of ``Motion``, without which the model moves as the handout's, and ``battery``, an
-    object with the fields of ``Battery``, without which the handout's is assumed and a warning given.
+    ``battery_drain_v_per_min`` at the top or under ``parameters``, units as in ``ModelParameters``;
+    and optionally ``effects``, an object of effects' names (``flytrack_env.effects``) with their
+    parameters, ``motion``, a value of ``Motion``, without which the model moves as the handout's,
+    and ``battery``, an object with the fields of ``Battery``, without which the handout's is
+    assumed and a warning given.
 
-    Raises:
-        ModelFileError: missing file, not JSON, a newer version, a field missing, unknown or out of range.
+    Raises: ModelFileError: missing file, not JSON, a newer version, a field missing, unknown or out
+        of range.
     """
     data = _read_json(Path(path))
     model = model_from_json(data, path)
@@ -138,7 +146,9 @@ def load_model(path: str | Path) -> ModelParameters:
     return model
 
 
-def model_from_json(data: dict[str, Any], path: str | Path, dtype: Any = np.float32) -> ModelParameters:
+def model_from_json(
+    data: dict[str, Any], path: str | Path, dtype: Any = np.float32
+) -> ModelParameters:
     """Return the parameters in the JSON values of a model file, or of ``model_as_json``.
 
     path: where they come from, for messages. dtype: of the arrays.
@@ -197,7 +207,9 @@ def model_as_json(model: ModelParameters) -> dict[str, Any]:
     }
     return {
         "parameters": {name: np.asarray(getattr(model, name), float).tolist() for name in UNITS},
-        "effects": {name: _effect_as_json(name, parameters) for name, parameters in by_name.items()},
+        "effects": {
+            name: _effect_as_json(name, parameters) for name, parameters in by_name.items()
+        },
         "units": {**UNITS, **effect_units},
         "motion": model.motion.value,
         BATTERY: {name: float(volts) for name, volts in model.battery._asdict().items()},

@@ -9,10 +9,10 @@ import jax
 class Motion(Enum):
     """A static choice of a model: a pytree without leaves, so that each motion compiles its own program.
 
-    HANDOUT: the exercise's step, the contract of the registered ids: rates after the step turn the drone
-    over all of it, and the force has the attitude before it. SEMI_IMPLICIT: the same, but the force has the
-    attitude after the step, as in many simulators. CONTINUOUS: as drones move; rates and force change
-    within the step, of second order or better in its length.
+    HANDOUT: the exercise's step, the contract of the registered ids: rates after the step turn the
+    drone over all of it, and the force has the attitude before it. SEMI_IMPLICIT: the same, but the
+    force has the attitude after the step, as in many simulators. CONTINUOUS: as drones move; rates
+    and force change within the step, of second order or better in its length.
     """
 
     HANDOUT = "handout"

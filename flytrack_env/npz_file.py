@@ -35,7 +35,9 @@ def load_npz(source: Path | BinaryIO, most_bytes: int) -> dict[str, np.ndarray]:
             num_bytes = sum(member.file_size for member in members)
             if num_bytes > most_bytes:
                 raise NpzError(f"found arrays of {num_bytes} bytes, expected at most {most_bytes}")
-            arrays = {member.filename.removesuffix(".npy"): _read(archive, member) for member in members}
+            arrays = {
+                member.filename.removesuffix(".npy"): _read(archive, member) for member in members
+            }
     except NpzError:
         raise
     except Exception as error:  # damaged archives raise anything from struct.error to MemoryError

@@ -39,17 +39,21 @@ OBSERVATION = (
     Entry("rates", "angular velocity", 3, "body", "rad/s", 5.0, 3.0),
     Entry("applied", "previous applied action: roll, pitch, yaw, thrust", 4, "body", "1", 1.0, 1.0),
     Entry("battery", "battery voltage, from -1 at empty to 1 at full", 1, "-", "1", 1.0, 1.0),
-    Entry("next_gate", "next gate's centre relative to the gate's centre", 3, "gate", "m", 5.0, 20.0),
+    Entry(
+        "next_gate", "next gate's centre relative to the gate's centre", 3, "gate", "m", 5.0, 20.0
+    ),
     Entry("next_direction", "next gate's direction of flight", 3, "gate", "1", 1.0, 1.0),
 )
 OBSERVATION_SIZE = sum(entry.size for entry in OBSERVATION)
 
 
-def observe_race(drone: Drone, gate: GateFrame, next_gate: GateFrame, battery: Battery) -> list[jax.Array]:
+def observe_race(
+    drone: Drone, gate: GateFrame, next_gate: GateFrame, battery: Battery
+) -> list[jax.Array]:
     """Return the observation of a drone before ``gate``: OBSERVATION_SIZE scalars, float32.
 
-    ``drone`` is as the sensors report it. Scalars, so that wrappers can add to them and they are stacked
-    once: a concatenation of batches is slow.
+    ``drone`` is as the sensors report it. Scalars, so that wrappers can add to them and they are
+    stacked once: a concatenation of batches is slow.
     """
     left = compute_once(gate.left())
     frame = (gate.forward, left, gate.up)

@@ -17,8 +17,8 @@ from flytrack_env.rewards import RewardWeights
 from flytrack_env.tracks import Course
 from flytrack_env.tracks.track import LARGEST
 
-# Within these, numbers stay finite, attitudes unit quaternions and observations in their space; wider than
-# anything that flies. Effects and wrappers have ranges of their own.
+# Within these, numbers stay finite, attitudes unit quaternions and observations in their space;
+# wider than anything that flies. Effects and wrappers have ranges of their own.
 RANGES: Mapping[str, Range] = {
     "dt": Range(5e-4, 1.0, "s"),
     "drone_radius": Range(1e-3, 1e3, "m"),
@@ -54,9 +54,10 @@ UNIT_TOLERANCE = 1e-5  # of a norm
 class EnvParams:
     """Everything that may be fitted, randomised or tuned: a pytree without static fields.
 
-    model: the simulated drone. course: the track as arrays. reset: how episodes start. reward: weights.
-    dt: s. drone_radius: m. max_steps_in_episode: the time limit, steps. wrappers: the parameters of each
-    wrapper around the environment, by its name; documented by the wrapper's class.
+    model: the simulated drone. course: the track as arrays. reset: how episodes start. reward:
+    weights. dt: s. drone_radius: m. max_steps_in_episode: the time limit, steps. wrappers: the
+    parameters of each wrapper around the environment, by its name; documented by the wrapper's
+    class.
     """
 
     model: ModelParameters
@@ -77,8 +78,8 @@ class EnvParams:
     def check(self, delay_steps: int = USUAL_STEPS) -> None:
         """Raise ValueError, naming the field, for values that no episode can be flown with.
 
-        For concrete values, as nothing can be refused under ``jit``. Any may be batched, as for ``vmap``.
-        delay_steps: that the plant remembers (``flytrack_env.plants``).
+        For concrete values, as nothing can be refused under ``jit``. Any may be batched, as for
+        ``vmap``. delay_steps: that the plant remembers (``flytrack_env.plants``).
         """
         for name, bounds in RANGES.items():
             value = attrgetter(name)(self)
@@ -91,7 +92,9 @@ class EnvParams:
         for parameters in self.model.effects:
             check_parameters(parameters, self.dt, delay_steps)
         _check_course(self.course)
-        if not np.all(np.asarray(self.course.gates.half_opening) > np.asarray(self.drone_radius)[..., None]):
+        if not np.all(
+            np.asarray(self.course.gates.half_opening) > np.asarray(self.drone_radius)[..., None]
+        ):
             raise ValueError(
                 f"drone_radius: found {self.drone_radius}, expected less than half of every gate's opening"
             )

@@ -18,9 +18,10 @@ from flytrack_env.state import Action, Drone
 class Plant(ABC):
     """Pure functions for one drone; all of them work under ``jit``, ``vmap`` and ``scan``.
 
-    dt: the only time step that the plant can take, s; None if it takes any. A plant with a ``dt`` has its
-    parameters baked in and ignores ``model`` as well. delay_steps: how many commands delays of the model's
-    effects remember. battery: of a plant that has its own; None if it is the model's.
+    dt: the only time step that the plant can take, s; None if it takes any. A plant with a ``dt``
+    has its parameters baked in and ignores ``model`` as well. delay_steps: how many commands delays
+    of the model's effects remember. battery: of a plant that has its own; None if it is the
+    model's.
     """
 
     dt: float | None = None
@@ -77,6 +78,8 @@ class Simulator(Plant):
         """Return the drone."""
         return state.drone
 
-    def sensed(self, state: SimulatorState, drone: Drone, dt: Scalar, model: ModelParameters) -> Drone:
+    def sensed(
+        self, state: SimulatorState, drone: Drone, dt: Scalar, model: ModelParameters
+    ) -> Drone:
         """Return a drone as gyro and motion capture report it, with the memories of the state."""
         return sensed(drone, state.memories, dt, model)

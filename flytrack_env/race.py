@@ -13,11 +13,11 @@ from flytrack_env.tracks import Course, GateFrame, cross_gate
 class Race(NamedTuple):
     """Where the drone stands in the race, scalars.
 
-    gate_index: the gate to fly next, in [0, num_gates). gate, next_gate: its flight frame and that of the
-    gate after it, kept because looking them up is the most expensive part of a step. gates_passed: in this
-    episode.
-    laps: completed, a lap being num_gates gates from wherever the episode began.
-    lap_start_s: time of the crossing that began the lap. lap_time_s: the last complete lap, 0 if none.
+    gate_index: the gate to fly next, in [0, num_gates). gate, next_gate: its flight frame and that
+    of the gate after it, kept because looking them up is the most expensive part of a step.
+    gates_passed: in this episode. laps: completed, a lap being num_gates gates from wherever the
+    episode began. lap_start_s: time of the crossing that began the lap. lap_time_s: the last
+    complete lap, 0 if none.
     """
 
     gate_index: jax.Array
@@ -55,7 +55,9 @@ def start_race(gate_index: jax.Array, course: Course) -> Race:
     )
 
 
-def _count_pass(race: Race, is_pass: jax.Array, time_s: Scalar, course: Course) -> tuple[Race, jax.Array]:
+def _count_pass(
+    race: Race, is_pass: jax.Array, time_s: Scalar, course: Course
+) -> tuple[Race, jax.Array]:
     """Return the race after a possible pass, its gate frames not yet moved on, and whether a lap ended."""
     gates_passed = race.gates_passed + is_pass.astype(jnp.int32)
     is_lap = is_pass & (gates_passed == (race.laps + 1) * course.num_gates)
@@ -70,12 +72,18 @@ def _count_pass(race: Race, is_pass: jax.Array, time_s: Scalar, course: Course) 
 
 
 def advance_race(
-    race: Race, start_w: Vec3, end_w: Vec3, start_time_s: Scalar, dt: Scalar, course: Course, radius: Scalar
+    race: Race,
+    start_w: Vec3,
+    end_w: Vec3,
+    start_time_s: Scalar,
+    dt: Scalar,
+    course: Course,
+    radius: Scalar,
 ) -> tuple[Race, RaceEvents]:
     """Return the race after a step from ``start_w`` to ``end_w``, and what happened.
 
-    The segment meets the current gate and, behind that crossing, the next one: two gates in one step
-    both count, each at its own time.
+    The segment meets the current gate and, behind that crossing, the next one: two gates in one
+    step both count, each at its own time.
     """
     first = cross_gate(race.gate, start_w, end_w, radius)
     middle_w = start_w + (end_w - start_w).scale(first.fraction)

@@ -1,9 +1,9 @@
 """Cheap named random draws.
 
-Sampling a reset happens in every step of every environment (auto-reset selects it where an
-episode ended), and so does noise; a draw must cost a few integer operations. One word is drawn from the JAX
-key of an episode; every named draw hashes that word with the name. Not for cryptography, and not for
-drawing more than a few dozen numbers per word.
+Sampling a reset happens in every step of every environment (auto-reset selects it where an episode
+ended), and so does noise; a draw must cost a few integer operations. One word is drawn from the JAX
+key of an episode; every named draw hashes that word with the name. Not for cryptography, and not
+for drawing more than a few dozen numbers per word.
 """
 
 import zlib
@@ -42,7 +42,9 @@ def check_key(key: Any) -> None:
     elif dtype == jnp.uint32 and key.ndim:
         num_axes = 1
     else:
-        raise TypeError(f"key: found {quote_value(key)}, expected a key of JAX, such as jax.random.key(0)")
+        raise TypeError(
+            f"key: found {quote_value(key)}, expected a key of JAX, such as jax.random.key(0)"
+        )
     if key.ndim != num_axes:
         keys = key.shape[: key.ndim - num_axes]
         raise TypeError(
@@ -93,8 +95,9 @@ class Draws:
     def normal(self, name: str) -> jax.Array:
         """Return a float32, standard normal but for a distribution function off by up to 0.001; within 4.5.
 
-        The sum of a word's four bytes, stretched by an odd polynomial: noise is drawn in every step, twice,
-        and the inverse distribution function would cost more than the rest of the observation.
+        The sum of a word's four bytes, stretched by an odd polynomial: noise is drawn in every
+        step, twice, and the inverse distribution function would cost more than the rest of the
+        observation.
         """
         word = self.word(name)
         pairs = (word & EVEN_BYTES) + ((word >> 8) & EVEN_BYTES)

@@ -31,12 +31,15 @@ HISTORY = partial(ActionHistory, length=3)
 
 ENVIRONMENTS: dict[str, Variant] = {
     "FlyTrack-v0": Variant("The race with perfect sensors and one known drone."),
-    "FlyTrackNoisy-v0": Variant("The race seen through noisy sensors.", wrappers=(ObservationNoise,)),
+    "FlyTrackNoisy-v0": Variant(
+        "The race seen through noisy sensors.", wrappers=(ObservationNoise,)
+    ),
     "FlyTrackActionHistory-v0": Variant(
         "The race with the last three commands in the observation.", wrappers=(HISTORY,)
     ),
     "FlyTrackRandomized-v0": Variant(
-        "The race with another drone, and other air, in every episode.", wrappers=(DomainRandomization,)
+        "The race with another drone, and other air, in every episode.",
+        wrappers=(DomainRandomization,),
     ),
     "FlyTrackRobust-v0": Variant(
         "All of it: another drone in every episode, noisy sensors, the last three commands.",
@@ -48,8 +51,9 @@ ENVIRONMENTS: dict[str, Variant] = {
 def make(env_id: str, **overrides: Any) -> EpisodicEnvironment:
     """Return the environment of an id; ``overrides`` are arguments of ``FlyTrack``.
 
-    With a plant that has its parameters baked in (a black box), ids that randomise the model fly that plant
-    as it is, with the same observation: what was trained on the id can be flown on the plant.
+    With a plant that has its parameters baked in (a black box), ids that randomise the model fly
+    that plant as it is, with the same observation: what was trained on the id can be flown on the
+    plant.
 
     Raises:
         ValueError: unknown id.
@@ -68,7 +72,10 @@ def make(env_id: str, **overrides: Any) -> EpisodicEnvironment:
     return env
 
 
-RACES = {"FlyTrackDuel-v0": range(2, 3), "FlyTrackRace-v0": range(2, MOST_DRONES + 1)}  # numbers of drones
+RACES = {
+    "FlyTrackDuel-v0": range(2, 3),
+    "FlyTrackRace-v0": range(2, MOST_DRONES + 1),
+}  # numbers of drones
 
 
 def make_race(
@@ -81,17 +88,19 @@ def make_race(
 ) -> MultiDroneRace:
     """Return the race of an id: ``FlyTrackDuel-v0``, or ``FlyTrackRace-v0`` of 2 to 8 drones.
 
-    over, ghosts: as in ``flytrack_env.multi_drone.MultiDroneRace``. env_id, overrides: as in ``make``, for
-    the environment that each drone flies.
+    over, ghosts: as in ``flytrack_env.multi_drone.MultiDroneRace``. env_id, overrides: as in
+    ``make``, for the environment that each drone flies.
 
-    Raises:
-        ValueError: unknown id, or a number of drones that it does not have. TypeError: unknown argument.
+    Raises: ValueError: unknown id, or a number of drones that it does not have. TypeError: unknown
+        argument.
     """
     if race_id not in RACES:
         raise ValueError(f"race_id: found {race_id!r}, expected one of {', '.join(RACES)}")
     numbers = RACES[race_id]
     if num_drones not in numbers:
-        raise ValueError(f"num_drones: found {num_drones!r}, expected {numbers[0]} to {numbers[-1]}")
+        raise ValueError(
+            f"num_drones: found {num_drones!r}, expected {numbers[0]} to {numbers[-1]}"
+        )
     return MultiDroneRace(make(env_id, **overrides), num_drones, over, ghosts)
 
 
@@ -100,17 +109,19 @@ def make_versus(
 ) -> Versus:
     """Return gymnax's view of a race for one learner, drone 0.
 
-    opponents: of the others; by default time-optimal ghosts, each ``GHOST_DELAY_S`` after the one before.
-    arguments: of ``make_race``.
+    opponents: of the others; by default time-optimal ghosts, each ``GHOST_DELAY_S`` after the one
+    before. arguments: of ``make_race``.
 
-    Raises:
-        ValueError: as ``make_race`` and ``Versus``, and without opponents on a track without a time-optimal
-            lap.
+    Raises: ValueError: as ``make_race`` and ``Versus``, and without opponents on a track without a
+            time-optimal lap.
     """
     race = make_race(race_id, num_drones, "first", **arguments)
     if opponents is None:
         delays_s = {place: GHOST_DELAY_S * (place - 1) for place in range(1, num_drones)}
-        ghosts = {place: time_optimal_ghost(race.env.track, delay_s) for place, delay_s in delays_s.items()}
+        ghosts = {
+            place: time_optimal_ghost(race.env.track, delay_s)
+            for place, delay_s in delays_s.items()
+        }
         race = MultiDroneRace(race.env, num_drones, "first", ghosts)
         opponents = [idle(race)] * len(ghosts)
     return Versus(race, opponents)

@@ -20,15 +20,14 @@ LAST_SEGMENT_FRACTION = 0.8
 class ResetParams(NamedTuple):
     """Distribution of starts; every draw is uniform.
 
-    course_fraction: share of the starts that lie along the course; the others are at the start pose.
-    start_*: half ranges around the start pose, m, degrees; the height is only raised, by 0 to
-    start_height_noise.
-    course_offset: half range of the offset from the curve between two gates, per axis, m.
-    course_speed: speed from 0 to this along that curve, m/s, with a sideways part of 20 %.
-    course_yaw_deg: half range of the yaw about the direction of that curve.
-    course_tilt_deg: tilt from 0 to this towards any side.
-    course_stick: half range of the applied rate actions; applied thrust from course_thrust_low to
-    course_thrust_high. *_charge_low: battery from this to full, from 0 (empty) to 1 (full) in voltage.
+    course_fraction: share of the starts that lie along the course; the others are at the start
+    pose. start_*: half ranges around the start pose, m, degrees; the height is only raised, by 0 to
+    start_height_noise. course_offset: half range of the offset from the curve between two gates,
+    per axis, m. course_speed: speed from 0 to this along that curve, m/s, with a sideways part of
+    20 %. course_yaw_deg: half range of the yaw about the direction of that curve. course_tilt_deg:
+    tilt from 0 to this towards any side. course_stick: half range of the applied rate actions;
+    applied thrust from course_thrust_low to course_thrust_high. *_charge_low: battery from this to
+    full, from 0 (empty) to 1 (full) in voltage.
     """
 
     course_fraction: Scalar = 0.8
@@ -102,8 +101,8 @@ Choose = Callable[[Scalar, Scalar], jax.Array]
 def _point_on_course(draws: Draws, gate_index: jax.Array, course: Course) -> tuple[Vec3, Vec3]:
     """Return a point on the way from the gate before to a gate, and the unit direction of flight there.
 
-    The way is a cubic Hermite curve that leaves and meets the gates along their directions of flight,
-    with tangents as long as the gates are apart: about what a racing drone flies.
+    The way is a cubic Hermite curve that leaves and meets the gates along their directions of
+    flight, with tangents as long as the gates are apart: about what a racing drone flies.
     """
     before = course.gate(jnp.where(gate_index == 0, course.num_gates - 1, gate_index - 1))
     gate = course.gate(gate_index)

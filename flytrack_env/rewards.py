@@ -14,9 +14,9 @@ from flytrack_env.state import Drone
 class Transition(NamedTuple):
     """What the reward terms may look at; before, after: the drone before and after the step.
 
-    gate_centre_w: centre of the gate that was flown to when the step began, m.
-    num_passed: gates passed in this step. offset: how far off-centre, 0 at the centre, 1 at the edge
-    of the free opening. is_terminated: whether the episode terminates (not: is truncated).
+    gate_centre_w: centre of the gate that was flown to when the step began, m. num_passed: gates
+    passed in this step. offset: how far off-centre, 0 at the centre, 1 at the edge of the free
+    opening. is_terminated: whether the episode terminates (not: is truncated).
     """
 
     before: Drone
@@ -51,7 +51,11 @@ def make_weights(changes: Mapping[str, float]) -> RewardWeights:
         if name not in RewardWeights._fields:
             expected = ", ".join(RewardWeights._fields)
             raise ValueError(f"reward: found {name!r}, expected one of {expected}")
-        if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not math.isfinite(weight):
+        if (
+            isinstance(weight, bool)
+            or not isinstance(weight, (int, float))
+            or not math.isfinite(weight)
+        ):
             raise ValueError(f"reward.{name}: found {weight!r}, expected a finite number")
     return RewardWeights()._replace(**{name: float(weight) for name, weight in changes.items()})
 

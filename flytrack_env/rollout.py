@@ -1,8 +1,9 @@
 """Rollout files: the states and actions of one flight as a plain numeric ``.npy``.
 
-A row is one step, ``[x (21) | u (4)]``, laid out and in the units of ``flytrack_env.state``. Rows of 22,
-which have only the thrust of the applied action, are read as well, and, if the caller allows it, pickled
-arrays of (x, u) pairs such as the handout's. Nothing else is unpickled, so a foreign rollout cannot run code.
+A row is one step, ``[x (21) | u (4)]``, laid out and in the units of ``flytrack_env.state``. Rows
+of 22, which have only the thrust of the applied action, are read as well, and, if the caller allows
+it, pickled arrays of (x, u) pairs such as the handout's. Nothing else is unpickled, so a foreign
+rollout cannot run code.
 """
 
 import io
@@ -35,9 +36,8 @@ def save_rollout(path: str | Path, states: ArrayLike, actions: ArrayLike) -> Non
 
     states: (T, 21), actions: (T, 4); row t is the state and the action commanded in it.
 
-    Raises:
-        RolloutError: wrong shapes, no steps or more than MOST_STEPS, or a number that is not finite.
-        OSError: the file cannot be written.
+    Raises: RolloutError: wrong shapes, no steps or more than MOST_STEPS, or a number that is not
+        finite. OSError: the file cannot be written.
     """
     path = Path(path)
     states, actions = np.asarray(states), np.asarray(actions)
@@ -47,7 +47,9 @@ def save_rollout(path: str | Path, states: ArrayLike, actions: ArrayLike) -> Non
     for name, array, size in (("states", states, STATE_SIZE), ("actions", actions, ACTION_SIZE)):
         if array.shape != (steps, size) or steps == 0 or array.dtype.kind not in "fiu":
             found = f"{array.dtype} of shape {array.shape}"
-            raise RolloutError(f"{path}: {name}: found {found}, expected (T, {size}) numbers, T >= 1")
+            raise RolloutError(
+                f"{path}: {name}: found {found}, expected (T, {size}) numbers, T >= 1"
+            )
     content = io.BytesIO()
     np.save(content, _as_rows(path, np.concatenate([states, actions], axis=1)), allow_pickle=False)
     write_atomically(path, content.getvalue())
@@ -56,13 +58,13 @@ def save_rollout(path: str | Path, states: ArrayLike, actions: ArrayLike) -> Non
 def load_rollout(path: str | Path, allow_pickle: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Return the states (T, 21) and the actions (T, 4) of a rollout file, float32.
 
-    The applied roll, pitch and yaw are NaN if the file lacks them (rows of 22).
-    allow_pickle: also read files of pickled objects, which runs whatever code they hold; only for files
-    from people you trust.
+    The applied roll, pitch and yaw are NaN if the file lacks them (rows of 22). allow_pickle: also
+    read files of pickled objects, which runs whatever code they hold; only for files from people
+    you trust.
 
-    Raises:
-        RolloutError: missing file, not an ``.npy``, pickled objects unless allowed, another shape, no
-            steps or more than MOST_STEPS, a file cut short, or a number that is not finite.
+    Raises: RolloutError: missing file, not an ``.npy``, pickled objects unless allowed, another
+            shape, no steps or more than MOST_STEPS, a file cut short, or a number that is not
+            finite.
     """
     path = Path(path)
     try:
@@ -96,7 +98,9 @@ def load_named_rollouts(
     if len(set(names)) < len(names):
         names = [f"{file.resolve().parent.name}_{file.stem}" for file in files]
     if len(set(names)) < len(names):
-        raise RolloutError(f"found files of the same names: {', '.join(names)}; expected different ones")
+        raise RolloutError(
+            f"found files of the same names: {', '.join(names)}; expected different ones"
+        )
     return {name: load_rollout(file, allow_pickle) for name, file in zip(names, files, strict=True)}
 
 
@@ -120,7 +124,9 @@ def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
     if len(shape) != 2 or shape[1] not in (ROW_SIZE, SHORT_ROW_SIZE) or shape[0] < 1:
         raise RolloutError(f"{path}: found shape {quote_value(shape)}, expected {EXPECTED}")
     if shape[0] > MOST_STEPS:
-        raise RolloutError(f"{path}: found {quote_value(shape[0])} steps, expected at most {MOST_STEPS}")
+        raise RolloutError(
+            f"{path}: found {quote_value(shape[0])} steps, expected at most {MOST_STEPS}"
+        )
     return False
 
 
@@ -131,7 +137,9 @@ def _rows_of_pairs(path: Path, pairs: np.ndarray) -> np.ndarray:
     try:
         rows = [(np.asarray(x, float), np.asarray(u, float)) for x, u in pairs]
     except (TypeError, ValueError) as error:
-        raise RolloutError(f"{path}: found {error_text(error)}, expected pairs of {expected}") from error
+        raise RolloutError(
+            f"{path}: found {error_text(error)}, expected pairs of {expected}"
+        ) from error
     shapes = {(x.shape, u.shape) for x, u in rows}
     if len(shapes) != 1 or shapes.isdisjoint(((size,), (ACTION_SIZE,)) for size in sizes):
         raise RolloutError(
@@ -142,7 +150,9 @@ def _rows_of_pairs(path: Path, pairs: np.ndarray) -> np.ndarray:
 
 def _as_rows(path: Path, rows: np.ndarray) -> np.ndarray:
     """Return rows as contiguous float32, all finite."""
-    with np.errstate(over="ignore"):  # a double too large for float32 becomes inf, which is refused below
+    with np.errstate(
+        over="ignore"
+    ):  # a double too large for float32 becomes inf, which is refused below
         rows = np.ascontiguousarray(rows, np.float32)
     if not np.isfinite(rows).all():
         step, column = np.argwhere(~np.isfinite(rows))[0]

@@ -1,8 +1,8 @@
 """Running a function on untrusted bytes in a process of its own, with limits on time and memory.
 
-Each call starts a Python interpreter, which runs this file as a script and imports one other file. It imports
-neither the caller's ``__main__``, so a script needs no guard, nor this package, which would take seconds.
-macOS does not limit the memory; Windows limits the time only, by the clock.
+Each call starts a Python interpreter, which runs this file as a script and imports one other file.
+It imports neither the caller's ``__main__``, so a script needs no guard, nor this package, which
+would take seconds. macOS does not limit the memory; Windows limits the time only, by the clock.
 """
 
 import importlib.util
@@ -16,7 +16,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-LONGEST_MESSAGE = 1000  # characters of an exception's message, which a foreign file may have written
+# characters of an exception's message, which a foreign file may have written
+LONGEST_MESSAGE = 1000
 RETURNED, RAISED = b"R", b"E"  # first byte of the output
 MEMORY_STATUS = Path("/proc/self/status")
 
@@ -24,8 +25,8 @@ MEMORY_STATUS = Path("/proc/self/status")
 class ResourceLimits(NamedTuple):
     """What a call may use.
 
-    cpu_s: whole seconds of processor time. memory_bytes: beyond what the process has once it has imported
-    the function. wall_s: s on the clock, imports included.
+    cpu_s: whole seconds of processor time. memory_bytes: beyond what the process has once it has
+    imported the function. wall_s: s on the clock, imports included.
     """
 
     cpu_s: int = 4
@@ -51,8 +52,8 @@ def run(
 ) -> bytes:
     """Return ``function(argument, content)``, a function of a file that does not import this package.
 
-    argument: JSON values. environment: added to that of this process. The function can write no files; what
-    it prints is discarded.
+    argument: JSON values. environment: added to that of this process. The function can write no
+    files; what it prints is discarded.
 
     Raises:
         SandboxError: the function raised, exceeded a limit, or crashed; the message says which.
@@ -81,7 +82,11 @@ def run(
         raise SandboxError(f"needs more than {limits.memory_bytes / 2**30:g} GiB of memory")
     if done.returncode == -getattr(signal, "SIGXCPU", 0):
         raise SandboxError(f"took more than {limits.cpu_s} s of processor time")
-    how = f"status {done.returncode}" if done.returncode >= 0 else signal.Signals(-done.returncode).name
+    how = (
+        f"status {done.returncode}"
+        if done.returncode >= 0
+        else signal.Signals(-done.returncode).name
+    )
     raise SandboxError(f"crashed the process that it was tried in ({how})")
 
 
@@ -98,7 +103,9 @@ def _limit(name: str, value: int) -> None:
 
         kind = getattr(resource, name)
         hard = resource.getrlimit(kind)[1]
-        resource.setrlimit(kind, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
+        resource.setrlimit(
+            kind, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard)
+        )
 
 
 def main() -> None:
@@ -119,7 +126,9 @@ def main() -> None:
             _limit("RLIMIT_CORE", 0)
             output.write(RETURNED + getattr(module, call["function"])(call["argument"], content))
         except BaseException as error:  # reported to the caller, whatever it is
-            output.write(RAISED + json.dumps([type(error).__name__, str(error)[:LONGEST_MESSAGE]]).encode())
+            output.write(
+                RAISED + json.dumps([type(error).__name__, str(error)[:LONGEST_MESSAGE]]).encode()
+            )
 
 
 if __name__ == "__main__":

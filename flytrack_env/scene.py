@@ -40,14 +40,18 @@ FLIGHT_COLOURS: tuple[Colour, ...] = (
     (200, 160, 255),
 )
 # Blue, cyan, green, yellow, red: slow to fast.
-SPEED_STOPS = np.array([(70, 110, 255), (60, 200, 240), (80, 220, 110), (250, 215, 60), (255, 70, 60)])
+SPEED_STOPS = np.array(
+    [(70, 110, 255), (60, 200, 240), (80, 220, 110), (250, 215, 60), (255, 70, 60)]
+)
 FASTEST_M_S = 20.0  # and above: the last of the speed colours
 NUM_SPEED_COLOURS = 64
 
 UP_W = np.array([0.0, 0.0, 1.0])
 SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))  # corners in order around it
 # Body frame, m: x forward, y left, z up. Motors: front left, front right, back left, back right.
-MOTORS_B = np.array([(0.15, 0.09, 0.0), (0.15, -0.09, 0.0), (-0.15, 0.14, 0.0), (-0.15, -0.14, 0.0)])
+MOTORS_B = np.array(
+    [(0.15, 0.09, 0.0), (0.15, -0.09, 0.0), (-0.15, 0.14, 0.0), (-0.15, -0.14, 0.0)]
+)
 ARMS_B = MOTORS_B[[[0, 3], [1, 2]]]
 ROTOR_M = 0.08  # radius
 CAMERA_PITCH_DEG = 40.0  # upwards
@@ -56,8 +60,8 @@ CAMERA_PITCH_DEG = 40.0  # upwards
 class Gates(NamedTuple):
     """The gates of a course in flying order, world frame, m.
 
-    centres, forward: (n, 3); forward is the direction of flight. outer, inner: (n, 4, 3), the corners
-    of frame and opening, in order around the square.
+    centres, forward: (n, 3); forward is the direction of flight. outer, inner: (n, 4, 3), the
+    corners of frame and opening, in order around the square.
     """
 
     centres: np.ndarray
@@ -81,7 +85,9 @@ def gates_of(course: Course) -> Gates:
     return Gates(centres, forward, corners(frames.half_frame), corners(frames.half_opening))
 
 
-def squares(centres: np.ndarray, first: np.ndarray, second: np.ndarray, half_edge: np.ndarray) -> np.ndarray:
+def squares(
+    centres: np.ndarray, first: np.ndarray, second: np.ndarray, half_edge: np.ndarray
+) -> np.ndarray:
     """Return the corners of squares, (n, 4, 3).
 
     centres: (n, 3), m. first, second: (n, 3), unit vectors along the edges. half_edge: (n,), m.
@@ -110,9 +116,13 @@ def ground_grid(low: np.ndarray, high: np.ndarray, spacing_m: float) -> np.ndarr
 
 def speed_colours(speeds_m_s: np.ndarray) -> list[Colour]:
     """Return the trail's colour at each speed (n,), m/s."""
-    steps = np.clip(speeds_m_s * (NUM_SPEED_COLOURS / FASTEST_M_S), 0, NUM_SPEED_COLOURS - 1).astype(int)
+    steps = np.clip(
+        speeds_m_s * (NUM_SPEED_COLOURS / FASTEST_M_S), 0, NUM_SPEED_COLOURS - 1
+    ).astype(int)
     places = np.linspace(0.0, len(SPEED_STOPS) - 1.0, NUM_SPEED_COLOURS)[steps]
-    channels = [np.interp(places, np.arange(len(SPEED_STOPS)), channel) for channel in SPEED_STOPS.T]
+    channels = [
+        np.interp(places, np.arange(len(SPEED_STOPS)), channel) for channel in SPEED_STOPS.T
+    ]
     return [(int(r), int(g), int(b)) for r, g, b in zip(*channels, strict=True)]
 
 

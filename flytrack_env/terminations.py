@@ -13,9 +13,9 @@ from flytrack_env.tracks import Course
 class Causes(NamedTuple):
     """Causes of termination, each a bool; several can hold at once.
 
-    crash: the drone touched a gate's frame, or was given an action that is not a number.
-    ground: below the floor of the bounds. out_of_bounds: beyond any other side.
-    missed_gate: crossed the gate's plane outside its frame. battery_empty: below the battery's empty voltage.
+    crash: the drone touched a gate's frame, or was given an action that is not a number. ground:
+    below the floor of the bounds. out_of_bounds: beyond any other side. missed_gate: crossed the
+    gate's plane outside its frame. battery_empty: below the battery's empty voltage.
     """
 
     crash: jax.Array

@@ -28,5 +28,7 @@ def hover_action(coeffs: Any, weight_n: float, battery_v: float) -> float:
         battery_v: voltage under load, V.
     """
     thrusts_n = collective_thrust(THRUST_ACTIONS, battery_v, np.asarray(coeffs, float))
-    rising_n = np.maximum.accumulate(np.asarray(thrusts_n))  # a fitted curve may dip at its lower end
+    rising_n = np.maximum.accumulate(
+        np.asarray(thrusts_n)
+    )  # a fitted curve may dip at its lower end
     return float(np.interp(weight_n, rising_n, THRUST_ACTIONS))

@@ -34,5 +34,8 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise TomlError(f"found lines of very many dots, expected at most {MOST_DOTS} on one line")
     try:
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # TOMLDecodeError, too many digits, too deeply nested
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # TOMLDecodeError, too many digits, too deeply nested
         raise TomlError(str(error)) from error

@@ -1,8 +1,8 @@
 """Validating what JSON and TOML files hold by types and limits of ``msgspec``, with one form of message.
 
-A message names file, field, what was found and what is expected: ``a.toml: rows.every: found 0, expected a
-whole number from 1``. Checks between fields are in a struct's ``__post_init__``, which raises
-ValueError: ``field: found ..., expected ...``, or ``expected ...`` of the table itself.
+A message names file, field, what was found and what is expected: ``a.toml: rows.every: found 0,
+expected a whole number from 1``. Checks between fields are in a struct's ``__post_init__``, which
+raises ValueError: ``field: found ..., expected ...``, or ``expected ...`` of the table itself.
 """
 
 import re
@@ -35,19 +35,21 @@ def convert(
 
     Whole floats count as integers, so that 2e7 is one.
 
-    Args:
-        where: file or object that the values are from, for messages; empty where the caller names it.
-        values: dictionaries, lists, text and numbers.
-        kind: struct, dataclass or other type; ``Annotated[..., msgspec.Meta(...)]`` sets limits.
-        error: what is raised for a value that does not fit.
-        field: where in the file the values are, for messages.
+    Args: where: file or object that the values are from, for messages; empty where the caller names
+        it. values: dictionaries, lists, text and numbers. kind: struct, dataclass or other type;
+        ``Annotated[..., msgspec.Meta(...)]`` sets limits. error: what is raised for a value that
+        does not fit. field: where in the file the values are, for messages.
     """
     try:
         return msgspec.convert(_with_integers(values), kind)
     except msgspec.ValidationError as problem:
         try:
             text = _describe(str(problem), values, kind, field)
-        except (LookupError, StopIteration, ValueError):  # a name in the file that reads like a path
+        except (
+            LookupError,
+            StopIteration,
+            ValueError,
+        ):  # a name in the file that reads like a path
             text = f"{field}: {error_text(problem)}".removeprefix(": ")
         raise error(f"{where}: {text}".removeprefix(": ")) from problem
     except RecursionError as problem:
@@ -82,7 +84,11 @@ def _describe(problem: str, value: Any, kind: Any, field: str) -> str:
         unknown = next(name for name in value if name not in known)
         return f"{_join(field, quote_name(unknown))}: unknown; expected one of {', '.join(known)}"
     if re.match("Expected|Invalid|Number out of range", text):
-        return f"{field}: found {quote_value(value)}, expected {describe_type(expected)}".removeprefix(": ")
+        return (
+            f"{field}: found {quote_value(value)}, expected {describe_type(expected)}".removeprefix(
+                ": "
+            )
+        )
     return join_text(field, text)
 
 
@@ -122,7 +128,9 @@ def _members(kind: inspect.Type) -> tuple[inspect.Type, ...]:
 
 def _field_types(kind: inspect.Type) -> dict[str, inspect.Type]:
     """Return the fields of the struct that a table has to be."""
-    (struct,) = (one for one in _members(kind) if isinstance(one, inspect.StructType | inspect.DataclassType))
+    (struct,) = (
+        one for one in _members(kind) if isinstance(one, inspect.StructType | inspect.DataclassType)
+    )
     return {field.encode_name: field.type for field in struct.fields}
 
 
@@ -168,4 +176,6 @@ def _words(kind: inspect.Type) -> str:
 
 
 def _is_stated(limit: float | None) -> bool:
-    return limit is not None and abs(limit) < 1e30  # larger ones only refuse what is no finite number
+    return (
+        limit is not None and abs(limit) < 1e30
+    )  # larger ones only refuse what is no finite number

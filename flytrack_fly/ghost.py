@@ -43,7 +43,11 @@ class Ghost(NamedTuple):
 
     def lap_begin_s(self, laps: int) -> float:
         """Return when it has flown so many laps, s since its start."""
-        return float(self.first.gate_times_s[-1] + (laps - 1) * self.flying.gate_times_s[-1]) if laps else 0.0
+        return (
+            float(self.first.gate_times_s[-1] + (laps - 1) * self.flying.gate_times_s[-1])
+            if laps
+            else 0.0
+        )
 
     def state_at(self, laps: int, time_s: float) -> np.ndarray:
         """Return the state (21,) so many s after the pilot's lap began; through with a lap, it flies on."""
@@ -55,7 +59,9 @@ class Ghost(NamedTuple):
 
 def _lap(states: np.ndarray, first_s: float, gate_times_s: np.ndarray) -> GhostLap:
     """Return the lap of states (N, 21), the first of them at a time since the lap began, s."""
-    return GhostLap(make_interp_spline(first_s + STEP_S * np.arange(len(states)), states, k=1), gate_times_s)
+    return GhostLap(
+        make_interp_spline(first_s + STEP_S * np.arange(len(states)), states, k=1), gate_times_s
+    )
 
 
 def still_start(params: EnvParams, num_steps: int) -> EnvParams:
@@ -76,8 +82,12 @@ def make_ghost(
         states, _, model = fly_champion(track, model)
         laps = cut_laps(states, track)
         if len(laps) < 2:
-            raise ValueError(f"--ghost champion: {len(laps)} laps of {track.name}, {CHAMPION_NEEDS}")
-        return Ghost(kind, laps[0], min(laps[1:], key=lambda lap: float(lap.gate_times_s[-1]))), model
+            raise ValueError(
+                f"--ghost champion: {len(laps)} laps of {track.name}, {CHAMPION_NEEDS}"
+            )
+        return Ghost(
+            kind, laps[0], min(laps[1:], key=lambda lap: float(lap.gate_times_s[-1]))
+        ), model
     model = model or nominal_parameters()
     if kind == "none":
         return None, model

@@ -13,7 +13,12 @@ from flytrack_fly.sticks import NAMES, Gamepad, move_by_keys
 PICTURES_PER_S = 60
 # Which stick a key pulls, and where to.
 KEYS = {
-    **{pygame.K_RIGHT: (0, 1.0), pygame.K_LEFT: (0, -1.0), pygame.K_UP: (1, 1.0), pygame.K_DOWN: (1, -1.0)},
+    **{
+        pygame.K_RIGHT: (0, 1.0),
+        pygame.K_LEFT: (0, -1.0),
+        pygame.K_UP: (1, 1.0),
+        pygame.K_DOWN: (1, -1.0),
+    },
     **{pygame.K_a: (2, 1.0), pygame.K_d: (2, -1.0), pygame.K_w: (3, 1.0), pygame.K_s: (3, -1.0)},
 }
 SHIFTS = {pygame.K_LSHIFT, pygame.K_RSHIFT}
@@ -37,7 +42,11 @@ class Controls:
     def __init__(self, gamepad: Gamepad):
         self.held: set[int] = set()
         self.is_over = self.is_restart = self.shows_help = False
-        self._keys, self._values, self._gamepad = np.zeros(len(NAMES)), np.zeros(len(NAMES)), gamepad
+        self._keys, self._values, self._gamepad = (
+            np.zeros(len(NAMES)),
+            np.zeros(len(NAMES)),
+            gamepad,
+        )
         self._joystick: Any = None
         if gamepad.gamepad is not None:
             self._joystick = _open(gamepad, gamepad.gamepad)
@@ -77,16 +86,22 @@ def _open(gamepad: Gamepad, number: int) -> "pygame.joystick.JoystickType":
     joystick = pygame.joystick.Joystick(number)
     most = joystick.get_numaxes() - 1
     if not all(0 <= axis <= most for axis in gamepad.axes):
-        raise ValueError(f"--axes: found {gamepad.axes}, expected 0 to {most} of {joystick.get_name()}")
+        raise ValueError(
+            f"--axes: found {gamepad.axes}, expected 0 to {most} of {joystick.get_name()}"
+        )
     return joystick
 
 
 def play(
-    session: Session, controls: Controls, show: Callable[[np.ndarray], None], tick: Callable[[], float]
+    session: Session,
+    controls: Controls,
+    show: Callable[[np.ndarray], None],
+    tick: Callable[[], float],
 ) -> None:
     """Let a pilot fly in real time until he quits.
 
-    show: shows a picture. tick: waits until the next one is due; returns the time since the last one, s.
+    show: shows a picture. tick: waits until the next one is due; returns the time since the last
+    one, s.
     """
     renderer, behind_s = make_renderer(session.params.course, session.gate_ids), 0.0
     while not controls.is_over:

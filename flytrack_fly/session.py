@@ -40,7 +40,8 @@ def steps_due(behind_s: float, frame_s: float, step_s: float) -> tuple[int, floa
 class Flight:
     """A flight from the start: log and commands (4,) of its steps, lap times, gates passed, why it ended.
 
-    gap: index of the last gate that was passed, and how much later within the lap than the ghost, s.
+    gap: index of the last gate that was passed, and how much later within the lap than the ghost,
+    s.
     """
 
     log: FlightLog
@@ -58,16 +59,21 @@ class Flight:
 class Session:
     """Flights of FlyTrack-v0, each from rest at the start pose; the step is compiled at once.
 
-    A flight begins when the throttle goes up from its middle or below. A gate that is missed stays the next.
-    is_race: the ghost starts once with the pilot, who has a place beside and behind it, and can be hit.
+    A flight begins when the throttle goes up from its middle or below. A gate that is missed stays
+    the next. is_race: the ghost starts once with the pilot, who has a place beside and behind it,
+    and can be hit.
 
     Raises:
         ValueError: a track or model that cannot be flown, or a race without a ghost.
     """
 
-    def __init__(self, track: Track, model: ModelParameters, ghost: Ghost | None, is_race: bool = False):
+    def __init__(
+        self, track: Track, model: ModelParameters, ghost: Ghost | None, is_race: bool = False
+    ):
         if is_race and ghost is None:
-            raise ValueError("--race: found --ghost none, expected an opponent: reference or champion")
+            raise ValueError(
+                "--race: found --ghost none, expected an opponent: reference or champion"
+            )
         self.ghost, self.is_race = ghost, is_race
         self.gate_ids = [gate.id for gate in track.gates]
         self.env = make("FlyTrack-v0", track=track, model=model, missed_gate="fly_on")
@@ -83,7 +89,9 @@ class Session:
         self.flights: list[Flight] = []
         self.restart()
 
-    def _advance_state(self, state: Any, command: jax.Array, opponent_w: jax.Array) -> tuple[Any, ...]:
+    def _advance_state(
+        self, state: Any, command: jax.Array, opponent_w: jax.Array
+    ) -> tuple[Any, ...]:
         """Return the next state, its row, the time of crossing the next gate's plane, causes of an end.
 
         opponent_w: where an opponent is before and after the step, (2, 3); NaN: nowhere.
@@ -103,7 +111,9 @@ class Session:
         self.flights = [one for one in self.flights if one.commands]
         self.flights.append(Flight(FlightLog(self.step_s)))
         self.state, self._is_armed = self._start, False
-        self.now.log.append(np.asarray(scene_row(self.env.drone(self.state), self.env.race(self.state))))
+        self.now.log.append(
+            np.asarray(scene_row(self.env.drone(self.state), self.env.race(self.state)))
+        )
 
     @property
     def now(self) -> Flight:
@@ -155,7 +165,9 @@ class Session:
         if self.ghost is None or not self.is_race:
             return np.full((2, 3), np.nan, np.float32)
         times_s = (self.now.log.time_s, self.now.log.time_s + self.step_s)
-        return np.stack([self.ghost.state_at(0, time_s)[POSITION] for time_s in times_s]).astype(np.float32)
+        return np.stack([self.ghost.state_at(0, time_s)[POSITION] for time_s in times_s]).astype(
+            np.float32
+        )
 
     def notes(self) -> str:
         """Return what the picture says besides its bar: best lap, gap to the ghost, how to start."""

@@ -1,7 +1,7 @@
 """From what a pilot does to a command: keys and axes move sticks, sticks become a command.
 
-Sticks are arrays (4,) in [-1, 1], 0 in the middle: roll to the right, pitch nose down, yaw to the left,
-throttle up. A command is laid out like ``flytrack_env.state.Action``.
+Sticks are arrays (4,) in [-1, 1], 0 in the middle: roll to the right, pitch nose down, yaw to the
+left, throttle up. A command is laid out like ``flytrack_env.state.Action``.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,9 @@ import numpy as np
 import tyro
 
 NAMES = ("roll", "pitch", "yaw", "throttle")
-KEY_REACH = np.array([0.4, 0.4, 1.0, 0.25])  # where a held key takes a stick; Shift takes it all the way
+KEY_REACH = np.array(
+    [0.4, 0.4, 1.0, 0.25]
+)  # where a held key takes a stick; Shift takes it all the way
 OUT_PER_S, BACK_PER_S = 3.0, 6.0  # speeds of a stick that keys move, outwards and to the middle
 
 
@@ -19,7 +21,9 @@ OUT_PER_S, BACK_PER_S = 3.0, 6.0  # speeds of a stick that keys move, outwards a
 class Gamepad:
     """Which gamepad is flown with, and how its axes become sticks."""
 
-    gamepad: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(optional)")] = None
+    gamepad: Annotated[
+        int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(optional)")
+    ] = None
     """Number of a gamepad, from 0, to fly with besides the keyboard."""
     axes: tuple[int, int, int, int] = (3, 4, 0, 1)
     """Its axes for roll, pitch, yaw and throttle."""

@@ -39,8 +39,8 @@ class Loop(NamedTuple):
     """The results of the loop on a plant.
 
     before, after: policies of the minimal and of the extended model, the same if nothing was named.
-    diagnosis: of race_log, flights of the first policy, together with the excitation. held_out: more flights
-    of it, used for testing only.
+    diagnosis: of race_log, flights of the first policy, together with the excitation. held_out:
+    more flights of it, used for testing only.
     """
 
     before: Stage
@@ -68,18 +68,20 @@ def close_loop(
 ) -> Loop:
     """Close the loop on a plant; write logs, models, diagnosis, trainings and ``loop.json`` into ``out``.
 
-    plant: a black box, or any ``flytrack_env.plants.Plant``. config: of both
-    trainings. report: called with a line per step. start: the model to fit from, and how it moves; the
-    nominal one, moving as fits the log, if None.
+    plant: a black box, or any ``flytrack_env.plants.Plant``. config: of both trainings. report:
+    called with a line per step. start: the model to fit from, and how it moves; the nominal one,
+    moving as fits the log, if None.
 
-    Raises:
-        ValueError: a plant that does not fly, settings that cannot be used, ``out`` with another run in it.
+    Raises: ValueError: a plant that does not fly, settings that cannot be used, ``out`` with
+        another run in it.
     """
     config.check()
     out.mkdir(parents=True, exist_ok=True)
     seeds = seeds_of(seed)
     report("1/6 collect and fit the minimal model")
-    excitation = collect(plant, settings.minutes, seeds["collect"], settings.noise, ProgressBar("flights"))
+    excitation = collect(
+        plant, settings.minutes, seeds["collect"], settings.noise, ProgressBar("flights")
+    )
     save_log(out / "excitation.npz", excitation)
     motion = None if start is None else start.motion
     if start is None:
@@ -112,7 +114,9 @@ def close_loop(
         after = before._replace(name="after")
     loop = Loop(before, found, after, excitation, race_log, held_out)
     report("6/6 flown again")
-    content = json.dumps(loop_as_json(loop, seed, config, settings), indent=2, allow_nan=False) + "\n"
+    content = (
+        json.dumps(loop_as_json(loop, seed, config, settings), indent=2, allow_nan=False) + "\n"
+    )
     write_atomically(out / "loop.json", content.encode())
     return loop
 

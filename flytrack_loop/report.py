@@ -27,7 +27,10 @@ def describe(loop: Loop) -> str:
     before, after = loop.before, loop.after
 
     def line(label: str, first: float | None, second: float | None, form: str) -> str:
-        cells = ("-" if one is None or not np.isfinite(one) else format(one, form) for one in (first, second))
+        cells = (
+            "-" if one is None or not np.isfinite(one) else format(one, form)
+            for one in (first, second)
+        )
         return f"{label:58}" + "".join(f"{cell:>12}" for cell in cells)
 
     lines = [f"{'':58}{'before':>12}{'after':>12}"]
@@ -41,13 +44,20 @@ def describe(loop: Loop) -> str:
     for side in ("simulator", "plant"):
         first, second = getattr(before.gap, side), getattr(after.gap, side)
         lines.append(
-            line(f"{side}: starts that finish {NUM_LAPS} laps", first.success, second.success, ".1%")
+            line(
+                f"{side}: starts that finish {NUM_LAPS} laps", first.success, second.success, ".1%"
+            )
         )
         for name in ("first_lap_s", "flying_lap_s"):
             label = f"{side}: {name.removesuffix('_s').replace('_', ' ')}, s"
             lines.append(line(label, getattr(first, name), getattr(second, name), ".3f"))
     lines.append(
-        line("lap gap, plant against simulator, %", before.gap.lap_percent, after.gap.lap_percent, "+.2f")
+        line(
+            "lap gap, plant against simulator, %",
+            before.gap.lap_percent,
+            after.gap.lap_percent,
+            "+.2f",
+        )
     )
     return "\n".join(lines)
 
@@ -55,7 +65,9 @@ def describe(loop: Loop) -> str:
 def fly_one(stage: Stage, env: EpisodicEnvironment, seed: int) -> Rollout:
     """Return one flight of a stage's policy from a noisy start."""
     params = start_pose_params(with_model_as_given(env.default_params), NUM_STEPS)
-    return fly_episode(env, stage.checkpoint.policy, jax.random.key(seed), params, NUM_STEPS, NUM_LAPS)
+    return fly_episode(
+        env, stage.checkpoint.policy, jax.random.key(seed), params, NUM_STEPS, NUM_LAPS
+    )
 
 
 def write_flights(out: Path, loop: Loop, plant: Plant, seed: int) -> list[Path]:

@@ -24,8 +24,9 @@ BATCH = 16  # flights that are flown at once
 class Errors(NamedTuple):
     """What a model gets wrong on flights that it has not seen.
 
-    one_step_nrmse: by channel; 1 is as bad as "nothing changes" or the mean. position_m: median error of
-    free flight, by seconds. Both lack what the log cannot tell: flights end where the drone crashes.
+    one_step_nrmse: by channel; 1 is as bad as "nothing changes" or the mean. position_m: median
+    error of free flight, by seconds. Both lack what the log cannot tell: flights end where the
+    drone crashes.
     """
 
     one_step_nrmse: dict[str, float]
@@ -50,8 +51,8 @@ class Gap(NamedTuple):
 class Stage(NamedTuple):
     """A model and the policy that was trained on it.
 
-    name: of the stage, and of the training's folder. checkpoint: of the policy. gap: its race. errors: of the
-    model, None where there was no log to judge it by.
+    name: of the stage, and of the training's folder. checkpoint: of the policy. gap: its race.
+    errors: of the model, None where there was no log to judge it by.
     """
 
     name: str
@@ -64,7 +65,9 @@ class Stage(NamedTuple):
 def errors_of(model: ModelParameters, log: FlightLog) -> Errors:
     """Return what a model gets wrong on a log, all of which is judged."""
     found = validate(model, log)
-    one_step = {name: one.nrmse for name, one in found.one_step.channels.items() if one.nrmse is not None}
+    one_step = {
+        name: one.nrmse for name, one in found.one_step.channels.items() if one.nrmse is not None
+    }
     position = {
         f"{rollout.horizon_s:g}": rollout.errors["position"].median
         for rollout in found.rollouts
@@ -73,13 +76,17 @@ def errors_of(model: ModelParameters, log: FlightLog) -> Errors:
     return Errors(one_step, position)
 
 
-def race(checkpoint: Checkpoint, env: EpisodicEnvironment, seed: int, episodes: int = NUM_EPISODES) -> Score:
+def race(
+    checkpoint: Checkpoint, env: EpisodicEnvironment, seed: int, episodes: int = NUM_EPISODES
+) -> Score:
     """Return how a policy races from perturbed starts: share that finishes 3 laps, mean lap times."""
     keys, params = start_keys(seed, episodes), with_model_as_given(env.default_params)
     return score(race_many(env, checkpoint.policy, keys, NUM_STEPS, NUM_LAPS, params))
 
 
-def measure_gap(checkpoint: Checkpoint, plant: Plant, seed: int, episodes: int = NUM_EPISODES) -> Gap:
+def measure_gap(
+    checkpoint: Checkpoint, plant: Plant, seed: int, episodes: int = NUM_EPISODES
+) -> Gap:
     """Return the race in the simulator and on the plant."""
     return Gap(
         race(checkpoint, simulated_env(checkpoint), seed, episodes),
@@ -92,9 +99,9 @@ def fly_log(
 ) -> FlightLog:
     """Return the log of a policy's flights on a plant, from noisy starts, a segment per flight.
 
-    seconds: flights are added until the log is that long, or there were 16 of them. noise: 0 logs states as
-    they are, 1 as common sensors would (``flytrack_sysid.sensors``). Three laps end a flight, or 25 s, or a
-    crash.
+    seconds: flights are added until the log is that long, or there were 16 of them. noise: 0 logs
+    states as they are, 1 as common sensors would (``flytrack_sysid.sensors``). Three laps end a
+    flight, or 25 s, or a crash.
 
     Raises:
         ValueError: no flight lasts half a second.
@@ -104,7 +111,9 @@ def fly_log(
     return log_of_flights(flights, float(env.default_params.dt), seed, seconds, noise)
 
 
-def log_of_flights(flights: Rollout, dt: float, seed: int, seconds: float, noise: float) -> FlightLog:
+def log_of_flights(
+    flights: Rollout, dt: float, seed: int, seconds: float, noise: float
+) -> FlightLog:
     """Return flights, leaves (num_flights, num_steps, ...), as ``fly_log`` does; seed: of the noise."""
     is_flying = np.asarray(flights.is_flying)
     kept: list[tuple[np.ndarray, np.ndarray]] = []
@@ -153,7 +162,9 @@ def judge(
 ) -> Stage:
     """Return the stage of a policy that is trained already."""
     gap = measure_gap(checkpoint, plant, evaluation_seed)
-    return Stage(name, model, checkpoint, gap, None if held_out is None else errors_of(model, held_out))
+    return Stage(
+        name, model, checkpoint, gap, None if held_out is None else errors_of(model, held_out)
+    )
 
 
 def rounded(value: float) -> float | None:
@@ -166,7 +177,10 @@ def stage_as_json(stage: Stage) -> dict[str, Any]:
     sides = {"simulator": stage.gap.simulator, "plant": stage.gap.plant}
     return {
         "name": stage.name,
-        **{side: {key: rounded(v) for key, v in one._asdict().items()} for side, one in sides.items()},
+        **{
+            side: {key: rounded(v) for key, v in one._asdict().items()}
+            for side, one in sides.items()
+        },
         "lap_gap_percent": rounded(stage.gap.lap_percent),
         "errors": stage.errors
         and {

@@ -1,13 +1,14 @@
 """Offsets between the clocks of sensors that measure the same motion.
 
-Only sensors are compared: attitude with gyroscope, velocity with accelerometer, position with velocity.
-Commands are not: how late the motion follows them is the plant's lag. But a drone that turns before it is
-told to has commands from a clock that is late. A slow estimator looks like a late clock and is corrected as
-one.
+Only sensors are compared: attitude with gyroscope, velocity with accelerometer, position with
+velocity. Commands are not: how late the motion follows them is the plant's lag. But a drone that
+turns before it is told to has commands from a clock that is late. A slow estimator looks like a
+late clock and is corrected as one.
 
-Of a pair, one is the integral of the other. Both are taken as changes over the same windows of 0.1 s, so
-that both are filtered alike; the offset minimises the squared difference (Gauss-Newton from the best of a
-grid), and a jackknife over blocks of 2 s gives its standard error (Efron and Tibshirani 1993, chapter 11).
+Of a pair, one is the integral of the other. Both are taken as changes over the same windows of 0.1
+s, so that both are filtered alike; the offset minimises the squared difference (Gauss-Newton from
+the best of a grid), and a jackknife over blocks of 2 s gives its standard error (Efron and
+Tibshirani 1993, chapter 11).
 """
 
 from collections.abc import Callable, Sequence
@@ -41,8 +42,9 @@ LEAST_STEPS = 0.1  # of the log's step: smaller offsets change less than the ste
 class ClockOffset(NamedTuple):
     """How late one channel's clock is against another's.
 
-    channel, reference: of ``CHANNELS``. offset_s: what ``channel`` shows at t happened at t - offset_s, s.
-    sigma_s: its standard error, s. correlation: of the changes in both. verdict: what was done.
+    channel, reference: of ``CHANNELS``. offset_s: what ``channel`` shows at t happened at t -
+    offset_s, s. sigma_s: its standard error, s. correlation: of the changes in both. verdict: what
+    was done.
     """
 
     channel: str
@@ -92,8 +94,8 @@ def _acceleration(log: FlightLog) -> np.ndarray:
     return force_w - np.array([0.0, 0.0, GRAVITY])
 
 
-# Channel, reference, required channels, and both as functions of the log. In this order each reference has
-# been corrected before it is used.
+# Channel, reference, required channels, and both as functions of the log. In this order each
+# reference has been corrected before it is used.
 PAIRS = (
     ("q", "w", ("q", "w"), _turns, lambda log: log["w"]),
     ("v", "f", ("v", "f", "q"), lambda log: log["v"], _acceleration),
@@ -120,7 +122,9 @@ def _stretches(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> list[_Str
     edges = np.flatnonzero(np.append(is_gap | log.is_start()[1:], True)) + 1
     for start, end in pairwise([0, *edges]):
         rows, time = slice(start, end), log.time[start:end]
-        is_start = (time - time[0] >= LARGEST_OFFSET_S) & (time[-1] - time >= LARGEST_OFFSET_S + WINDOW_S)
+        is_start = (time - time[0] >= LARGEST_OFFSET_S) & (
+            time[-1] - time >= LARGEST_OFFSET_S + WINDOW_S
+        )
         starts = time[is_start]
         if len(starts) < 2:
             continue
@@ -145,7 +149,9 @@ def _sums(stretches: list[_Stretch], offset_s: float) -> tuple[np.ndarray, np.nd
     numerator, denominator, products = [], [], np.zeros(3)
     for stretch in stretches:
         change, integral, slope = stretch.differences(offset_s)
-        _, block = np.unique(stretch.block, return_inverse=True)  # none is empty, however long the gaps
+        _, block = np.unique(
+            stretch.block, return_inverse=True
+        )  # none is empty, however long the gaps
         numerator.append(np.bincount(block, np.sum(slope * (change - integral), axis=1)))
         denominator.append(np.bincount(block, np.sum(slope**2, axis=1)))
         products += [np.sum(change * integral), np.sum(change**2), np.sum(integral**2)]
@@ -153,7 +159,9 @@ def _sums(stretches: list[_Stretch], offset_s: float) -> tuple[np.ndarray, np.nd
     return np.concatenate(numerator), np.concatenate(denominator), float(correlation)
 
 
-def offset_between(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> tuple[float, float, float, str]:
+def offset_between(
+    log: FlightLog, sums: np.ndarray, rates: np.ndarray
+) -> tuple[float, float, float, str]:
     """Return offset, standard error and correlation, or why they are unknown (else empty)."""
     unknown = np.nan, np.nan, np.nan
     stretches = _stretches(log, sums, rates)
@@ -180,7 +188,9 @@ def offset_between(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> tuple
     return offset, sigma, correlation, ""
 
 
-def read_later(log: FlightLog, channels: Sequence[str], offset_s: float) -> tuple[FlightLog, np.ndarray]:
+def read_later(
+    log: FlightLog, channels: Sequence[str], offset_s: float
+) -> tuple[FlightLog, np.ndarray]:
     """Return the log with some channels read ``offset_s`` later, and the rows where that is known.
 
     Interpolated; what is not known, (num_rows,) bool False, is anything.
@@ -201,9 +211,9 @@ def read_later(log: FlightLog, channels: Sequence[str], offset_s: float) -> tupl
 def align_clocks(log: FlightLog, correct: bool = True) -> tuple[FlightLog, tuple[ClockOffset, ...]]:
     """Return a log with its sensors on one clock, and the offset of each pair that can be compared.
 
-    Offsets above three standard errors and a tenth of the log's step are corrected by reading the channel
-    later, interpolated; others, and all without ``correct``, are only reported. Rates, specific force and
-    commands count as one clock.
+    Offsets above three standard errors and a tenth of the log's step are corrected by reading the
+    channel later, interpolated; others, and all without ``correct``, are only reported. Rates,
+    specific force and commands count as one clock.
     """
     aligned, found = log, []
     for channel, reference, needed, sums, rates in PAIRS:
@@ -211,7 +221,9 @@ def align_clocks(log: FlightLog, correct: bool = True) -> tuple[FlightLog, tuple
             continue
         offset, sigma, correlation, verdict = offset_between(aligned, sums(aligned), rates(aligned))
         step = float(np.median(usual_step(aligned)))
-        if not verdict and (abs(offset) <= SIGNIFICANT * sigma or abs(offset) <= LEAST_STEPS * step):
+        if not verdict and (
+            abs(offset) <= SIGNIFICANT * sigma or abs(offset) <= LEAST_STEPS * step
+        ):
             verdict = "not significant, left"
         elif not verdict:
             shifted, is_known = read_later(aligned, (channel,), offset)
@@ -224,11 +236,14 @@ def align_clocks(log: FlightLog, correct: bool = True) -> tuple[FlightLog, tuple
 def on_one_clock(log: FlightLog) -> tuple[FlightLog, np.ndarray, list[str]]:
     """Return a log, which of its rows it still has, (num_rows,) bool, and a sentence on each clock corrected.
 
-    Velocity is compared with the accelerometer as attitude is with the gyro: half a step of a simulator, and
-    a latency of both inertial sensors, are no clocks apart. Position is compared with velocity.
+    Velocity is compared with the accelerometer as attitude is with the gyro: half a step of a
+    simulator, and a latency of both inertial sensors, are no clocks apart. Position is compared
+    with velocity.
     """
     pose_s, notes, kept = 0.0, [], np.ones(len(log), bool)
-    slack_s = 0.5 * float(np.median(usual_step(log)))  # a simulator's force may be that of half a step before
+    slack_s = 0.5 * float(
+        np.median(usual_step(log))
+    )  # a simulator's force may be that of half a step before
     for channel, reference, needed, sums, rates in PAIRS:
         if any(name not in log for name in needed):
             continue
@@ -244,15 +259,19 @@ def on_one_clock(log: FlightLog) -> tuple[FlightLog, np.ndarray, list[str]]:
         kept &= is_known
         other = "attitude" if reference == "f" else "velocity"
         name = {"v": "velocity", "p": "position"}[channel]
-        notes.append(f"the clock of {name} was {1e3 * late_s:.0f} ms late against that of {other}: corrected")
+        notes.append(
+            f"the clock of {name} was {1e3 * late_s:.0f} ms late against that of {other}: corrected"
+        )
     return (log.select(kept), kept, notes) if notes else (log, kept, [])
 
 
-def with_causal_commands(log: FlightLog, model: ModelParameters) -> tuple[FlightLog, np.ndarray, list[str]]:
+def with_causal_commands(
+    log: FlightLog, model: ModelParameters
+) -> tuple[FlightLog, np.ndarray, list[str]]:
     """Return a log whose commands come before the turns they cause, the rows it still has, and a sentence.
 
-    model: its mean lag of roll and pitch is what remains between commands and turns, in whole rows, where the
-    commands were late.
+    model: its mean lag of roll and pitch is what remains between commands and turns, in whole rows,
+    where the commands were late.
     """
     every = np.ones(len(log), bool)
     if "w" not in log:

@@ -1,10 +1,11 @@
 """Collection of flight logs: an excitation or a script flown on a plant.
 
-A plant is a ``flytrack_env.plants.Plant`` or a function ``step(x, u)`` of the handout's vectors. Only its
-outputs are used.
+A plant is a ``flytrack_env.plants.Plant`` or a function ``step(x, u)`` of the handout's vectors.
+Only its outputs are used.
 
-Envelope: a flight ends where the drone would become faster than 20 m/s, leave heights between 10 and
-110 m, or leave the plant's battery, 22 to 24 V if it does not say. A script may go down to 0.1 m.
+Envelope: a flight ends where the drone would become faster than 20 m/s, leave heights between 10
+and 110 m, or leave the plant's battery, 22 to 24 V if it does not say. A script may go down to 0.1
+m.
 """
 
 from collections.abc import Callable
@@ -36,7 +37,9 @@ class CollectError(ValueError):
     """A plant that cannot be flown, or a request that cannot be met."""
 
 
-def states_flown(plant: Plant, model: ModelParameters, start: jax.Array, command: jax.Array) -> jax.Array:
+def states_flown(
+    plant: Plant, model: ModelParameters, start: jax.Array, command: jax.Array
+) -> jax.Array:
     """Return the states (T + 1, 21) that commands (T, 4) lead to, from a start (21,), that one included."""
 
     def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
@@ -72,7 +75,9 @@ def _fly_function(step: StepFunction, report: Report) -> Fly:
         except Exception as error:  # whatever a user's function raises
             raise CollectError(f"step: {type(error).__name__}: {error}") from error
         if after.shape != (STATE_SIZE,):
-            raise CollectError(f"step: found a state of shape {after.shape}, expected ({STATE_SIZE},)")
+            raise CollectError(
+                f"step: found a state of shape {after.shape}, expected ({STATE_SIZE},)"
+            )
         return after
 
     def fly(starts: np.ndarray, commands: np.ndarray) -> np.ndarray:
@@ -96,7 +101,9 @@ def find_hover(fly: Fly, middle_v: float = MIDDLE_V) -> float:
     """Return the thrust action that holds the weight, level at rest at a voltage; else raise CollectError."""
     actions = np.linspace(-1.0, 1.0, 41)
     rng = np.random.default_rng(0)
-    starts = np.stack([excitation.start_state(rng, middle_v, action, 0.0, 0.0) for action in actions])
+    starts = np.stack(
+        [excitation.start_state(rng, middle_v, action, 0.0, 0.0) for action in actions]
+    )
     commands = np.zeros((len(actions), 1, 4), np.float32)
     commands[:, 0, 3] = actions
     climb = fly(starts.astype(np.float32), commands)[:, -1, ACCELERATION][:, 2]
@@ -120,12 +127,13 @@ def collect(
 ) -> FlightLog:
     """Fly the excitation, or a script instead, on a plant and return the log, a segment per flight.
 
-    plant: a plant, or a function ``(x (21,), u (4,)) -> x (21,)`` of a step of 0.01 s, started from chosen
-    states. minutes: of flight before the envelope cuts any, at least 1. noise: 0 logs the state itself, 1
-    what common sensors measure (``flytrack_sysid.sensors``). report: called with the flights done and in all.
+    plant: a plant, or a function ``(x (21,), u (4,)) -> x (21,)`` of a step of 0.01 s, started from
+    chosen states. minutes: of flight before the envelope cuts any, at least 1. noise: 0 logs the
+    state itself, 1 what common sensors measure (``flytrack_sysid.sensors``). report: called with
+    the flights done and in all.
 
-    Raises:
-        CollectError, ScriptError: arguments out of range, or a plant or script that cannot be flown.
+    Raises: CollectError, ScriptError: arguments out of range, or a plant or script that cannot be
+        flown.
     """
     if not FEWEST_MINUTES <= minutes < np.inf:
         raise CollectError(f"minutes: found {minutes}, expected at least {FEWEST_MINUTES:g}")
@@ -140,7 +148,10 @@ def collect(
     if script is None:
         hover = find_hover(_fly_any(plant, lambda done, total: None), 0.5 * sum(voltages))
         number = round(minutes * 60.0 / SECONDS_PER_FLIGHT)
-        flown, heights = script_of(excitation.script(number, hover, rng, voltages)), excitation.HEIGHTS
+        flown, heights = (
+            script_of(excitation.script(number, hover, rng, voltages)),
+            excitation.HEIGHTS,
+        )
     else:
         check_script(script)
         flown, heights = script, excitation.SCRIPT_HEIGHTS
@@ -153,7 +164,8 @@ def collect(
 def _states(fly: Fly, flown: Script) -> tuple[np.ndarray, np.ndarray]:
     """Return the states (N, T, 21) of a script's flights and their commands (N, T, 4), float32."""
     starts, commands = flown.starts.astype(np.float32), flown.commands.astype(np.float32)
-    # One step ahead of the log, so that the first row's acceleration is the plant's, not the start's.
+    # One step ahead of the log, so that the first row's acceleration is the plant's, not the
+    # start's.
     states = fly(starts, np.concatenate([commands[:, :1], commands], axis=1))
     if not np.isfinite(states).all():
         flight, row, column = np.argwhere(~np.isfinite(states))[0]
@@ -165,12 +177,19 @@ def _states(fly: Fly, flown: Script) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cut(
-    states: np.ndarray, commands: np.ndarray, heights: tuple[float, float], voltages: tuple[float, float]
+    states: np.ndarray,
+    commands: np.ndarray,
+    heights: tuple[float, float],
+    voltages: tuple[float, float],
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the part of each flight before it leaves the envelope, without those of less than two rows."""
     inside = excitation.is_inside(states, heights, voltages)
     lengths = np.where(inside.all(axis=1), states.shape[1], np.argmin(inside, axis=1))
-    kept = [(x[:n], u[:n]) for x, u, n in zip(states, commands, lengths, strict=True) if n >= FEWEST_STEPS]
+    kept = [
+        (x[:n], u[:n])
+        for x, u, n in zip(states, commands, lengths, strict=True)
+        if n >= FEWEST_STEPS
+    ]
     if not kept:
         raise CollectError("plant: no flight stayed within the envelope for more than a step")
     return kept

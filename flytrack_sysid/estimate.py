@@ -1,8 +1,8 @@
 """Least squares over all channels of a log, each weighted by the noise that it turns out to have.
 
-A fit replays a log and searches as the diagnosis does, but weights each component by one noise, and sums
-steps up in short windows: so positions count without velocities, and what a model lacks has no part in the
-weights.
+A fit replays a log and searches as the diagnosis does, but weights each component by one noise, and
+sums steps up in short windows: so positions count without velocities, and what a model lacks has no
+part in the weights.
 
 ========  ==============================================================================  =======
 channel   residual                                                                        unit
@@ -39,7 +39,11 @@ TURNS, FORCES, BATTERY = AXES
 # Noise that the first round assumes, (NUM_AXES, 2), in the channels' units: that of common sensors.
 FIRST_NOISE = np.array([[0.1, 0.01]] * 3 + [[1.5, 0.05]] * 3 + [[1.0, 0.02]])
 LEAST_NOISE = 1e-12
-LAST_STEPS = (0, 0, 3)  # full Gauss-Newton steps at the end of each round: only the last is to be exact
+LAST_STEPS = (
+    0,
+    0,
+    3,
+)  # full Gauss-Newton steps at the end of each round: only the last is to be exact
 LAST_RISE = 1e-10  # of the cost, which rounding may add to such a step
 
 
@@ -86,7 +90,10 @@ class Windows(NamedTuple):
         """Return values less their regression on time, (all rows, 1), over the rows that count."""
         values, time = self.centred(values), self.centred(time)
         spread = self.sums(time * time * self.counts)
-        return values - self.sums(time * values * self.counts) / np.where(spread > 0.0, spread, 1.0) * time
+        return (
+            values
+            - self.sums(time * values * self.counts) / np.where(spread > 0.0, spread, 1.0) * time
+        )
 
     def num_used(self) -> int:
         """Return the number of windows in which anything counts."""
@@ -97,8 +104,8 @@ class Windows(NamedTuple):
 class Channels(Problem):
     """A log and the residuals of its channels, in the axes and windows that the table of this module says.
 
-    noise: (NUM_AXES, 2), a standard deviation each. levels: the windows of turns, forces and battery.
-    has_position: of forces, the level is position and not velocity.
+    noise: (NUM_AXES, 2), a standard deviation each. levels: the windows of turns, forces and
+    battery. has_position: of forces, the level is position and not velocity.
     """
 
     levels: tuple[Windows, ...] = ()
@@ -107,7 +114,10 @@ class Channels(Problem):
     @classmethod
     def of_log(cls, log: FlightLog, judged: np.ndarray, model: ModelParameters) -> "Channels":
         """Return the judged rows of a log, (num_rows,) bool, for a model and the effects that it has."""
-        tau, has_position = np.asarray(model.tau, float), "p" in log and "q" in log and "v" not in log
+        tau, has_position = (
+            np.asarray(model.tau, float),
+            "p" in log and "q" in log and "v" not in log,
+        )
         lanes = make_lanes(log, np.ones(len(log), bool), tau, float(model.g))
         certain = is_applied_certain(make_record(log), tau)[lanes.row]
         lanes = lanes._replace(counts=_counts(lanes, judged, certain, has_position))
@@ -118,12 +128,16 @@ class Channels(Problem):
         found = super().residuals(vectors)
         for left in found:
             in_line = self._of_channels(_in_line(left))
-            left[lead_in_of(len(left)) :] = in_line.reshape(left.shape[1], -1, *left.shape[2:]).swapaxes(0, 1)
+            left[lead_in_of(len(left)) :] = in_line.reshape(
+                left.shape[1], -1, *left.shape[2:]
+            ).swapaxes(0, 1)
         return found * self.counts
 
     def _of_channels(self, left: np.ndarray) -> np.ndarray:
         """Return the channels' residuals from those of single steps, (all rows, NUM_AXES, 2)."""
-        before = Rotation.from_quat(_in_line(np.roll(self.lanes.record.quat, 1, axis=0)), scalar_first=True)
+        before = Rotation.from_quat(
+            _in_line(np.roll(self.lanes.record.quat, 1, axis=0)), scalar_first=True
+        )
         found, turn = left.copy(), left[:, TURNS, 1]
         for axes in (TURNS, FORCES):
             found[:, axes, 0] = before.apply(left[:, axes, 0], inverse=True)
@@ -155,7 +169,9 @@ class Channels(Problem):
         """Return the rms that a model leaves, (NUM_AXES, 2), with what was taken out counted as fitted."""
         number = self.counts.sum(axis=(0, 1))
         for axes, windows in zip(AXES, self.levels, strict=True):
-            number[axes, 1] -= windows.num_used() * (2 if self.has_position and axes is FORCES else 1)
+            number[axes, 1] -= windows.num_used() * (
+                2 if self.has_position and axes is FORCES else 1
+            )
         squares = np.square(self.residuals(vector[None])[0]).sum(axis=(0, 1))
         return np.maximum(np.sqrt(squares / np.maximum(number, 1)), LEAST_NOISE)
 
@@ -167,17 +183,27 @@ class Channels(Problem):
             for side, names in enumerate((DIRECT, level))
             for name, axes in zip(names, AXES, strict=True)
         )
-        return {name: own[:, side] for name, own, counts, side in sides if name and counts[..., side].any()}
+        return {
+            name: own[:, side]
+            for name, own, counts, side in sides
+            if name and counts[..., side].any()
+        }
 
 
-def _counts(lanes: Lanes, judged: np.ndarray, certain: np.ndarray, has_position: bool) -> np.ndarray:
+def _counts(
+    lanes: Lanes, judged: np.ndarray, certain: np.ndarray, has_position: bool
+) -> np.ndarray:
     """Return what counts of judged rows; certain: where applied actions are known, (rows, lanes, 4)."""
     source = lanes.record.source_row
     is_judged = judged[source] & (source >= 0) & (lanes.row >= 0)
     is_judged[: lead_in_of(len(is_judged))] = False
-    behind = judged[np.maximum.accumulate(source, axis=0)]  # of a filled row, the one before the gap
+    behind = judged[
+        np.maximum.accumulate(source, axis=0)
+    ]  # of a filled row, the one before the gap
     counts = lanes.counts & is_judged[..., None, None]
-    counts[1:, :, FORCES, 0] &= behind[:-1, :, None]  # a force is that of a step from measured values
+    counts[1:, :, FORCES, 0] &= behind[
+        :-1, :, None
+    ]  # a force is that of a step from measured values
     if "w" in lanes.measured:
         counts[..., TURNS, 0] = certain[..., :3] & (is_judged & lanes.is_joined)[..., None]
     if has_position:
@@ -201,9 +227,9 @@ def _levels(lanes: Lanes) -> tuple[Windows, ...]:
 def _covariance(found: Linearization) -> np.ndarray:
     """Return the covariance of the parameters, widened where residuals within a flight are correlated.
 
-    That of independent residuals of the noise assumed, in which each standard deviation is raised to
-    that of the cluster-robust (sandwich) estimate over pieces of a flight, if that is larger: what
-    the model lacks shows as residuals that agree within a piece.
+    That of independent residuals of the noise assumed, in which each standard deviation is raised
+    to that of the cluster-robust (sandwich) estimate over pieces of a flight, if that is larger:
+    what the model lacks shows as residuals that agree within a piece.
     """
     problem, white = found.problem, found.white * robust_weight(found.white)
     bread = solve(found.total, np.eye(len(found.total)))
@@ -228,15 +254,17 @@ def _acting(found: Linearization, free: tuple[str, ...], may_be_idle: bool) -> l
     names = [found.problem.names[found.places[column]] for column in acts]
     idle = [name for name in free if name not in names]
     if idle and not may_be_idle:
-        raise FitError(f"{', '.join(idle)}: nothing that the log measured depends on it; expected it fixed")
+        raise FitError(
+            f"{', '.join(idle)}: nothing that the log measured depends on it; expected it fixed"
+        )
     return found.problem.index(names)
 
 
 def _polished(problem: Problem, vector: np.ndarray, places: list[int], steps: int) -> Linearization:
     """Return where the slope of the cost, and not only its change, is rounding: so many full steps on.
 
-    The cost is flat at its least, so that a search which compares costs ends where the order of summation
-    decides: another number of threads, another model.
+    The cost is flat at its least, so that a search which compares costs ends where the order of
+    summation decides: another number of threads, another model.
     """
     found = Linearization(problem, problem.slopes(vector, places))
     for _ in range(steps):
@@ -277,7 +305,9 @@ def estimate(
             found = _polished(problem, vector, places, steps)
             noise = problem.spread(found.vector)
             names = tuple(problem.names[place] for place in places)
-            model = parameters.with_values(model, dict(zip(names, found.vector[places], strict=True)))
+            model = parameters.with_values(
+                model, dict(zip(names, found.vector[places], strict=True))
+            )
             report(number + 1, len(LAST_STEPS))
     count = int(problem.counts.sum())
     return Estimate(model, names, _covariance(found), problem.by_channel(noise), count)

@@ -28,8 +28,9 @@ FLIGHT_STEPS = 2 * SLOT_STEPS
 FLIGHTS_PER_KIND = 4
 KINDS = ("roll", "pitch", "yaw", "thrust", "free", "leg")
 AMPLITUDES = (0.1, 0.3, 0.6, 1.0)
-# The index at which each wave starts to cycle through the amplitudes: the last of four flights, which may be
-# held out, has a large step, and no full stick, which is the most informative for the fit.
+# The index at which each wave starts to cycle through the amplitudes: the last of four flights,
+# which may be held out, has a large step, and no full stick, which is the most informative for the
+# fit.
 FIRST_AMPLITUDE = {"chirp": 2, "step": 3, "doublet": 3, "sine": 2}
 FREE_AMPLITUDES = (0.3, 0.5, 0.8, 1.0)
 LEG_SPEEDS = (3.0, 7.0, 11.0, 15.0)  # m/s
@@ -42,7 +43,9 @@ RESERVE_V = 0.1
 
 
 def is_inside(
-    states: np.ndarray, heights: tuple[float, float] = HEIGHTS, voltages: tuple[float, float] = VOLTAGES
+    states: np.ndarray,
+    heights: tuple[float, float] = HEIGHTS,
+    voltages: tuple[float, float] = VOLTAGES,
 ) -> np.ndarray:
     """Return where states (..., 21) are within the envelope, heights in m, voltages in V; NaN is not."""
     height, battery_v = states[..., layout.POSITION][..., 2], states[..., layout.BATTERY]
@@ -106,7 +109,9 @@ def start_state(
     return start_at(tilt * Rotation.from_euler("z", yaw), hover, voltage, vel_w)
 
 
-def _axis_command(axis: int, turn: int, number: int, hover: float, rng: np.random.Generator) -> np.ndarray:
+def _axis_command(
+    axis: int, turn: int, number: int, hover: float, rng: np.random.Generator
+) -> np.ndarray:
     """Return two waves on one axis; kinds of waves alternate by turn, amplitudes cycle by number."""
     names = ("chirp", "step") if turn % 2 == 0 else ("doublet", "sine")
     command = np.tile([0.0, 0.0, 0.0, hover], (FLIGHT_STEPS, 1))
@@ -122,20 +127,29 @@ def _flight(
     """Return one flight of a kind; ``number`` counts within the four of its turn."""
     if kind in KINDS[:3]:
         start = start_state(rng, voltage, hover, 0.0, 0.0)
-        return ScriptedFlight(kind, start, _axis_command(KINDS.index(kind), turn, number, hover, rng))
+        return ScriptedFlight(
+            kind, start, _axis_command(KINDS.index(kind), turn, number, hover, rng)
+        )
     command = np.tile([0.0, 0.0, 0.0, hover], (FLIGHT_STEPS, 1))
     if kind == "thrust":
         name = ("sine", "step", "doublet", "chirp")[number]
         command[:, 3] = np.append(wave(name, rng), switching(rng, 0.5, SLOW_STEPS)[SLOT_STEPS:])
-        return ScriptedFlight(kind, start_state(rng, voltage, hover, rng.uniform(0.0, 20.0), 0.0), command)
+        return ScriptedFlight(
+            kind, start_state(rng, voltage, hover, rng.uniform(0.0, 20.0), 0.0), command
+        )
     command[:, 2] = switching(rng)
     if kind == "free":
         amplitude = FREE_AMPLITUDES[number]
         command[:, :2] = amplitude * np.stack([switching(rng), switching(rng)], axis=1)
         command[:, 3] = switching(rng, smallest=0.0)
-        return ScriptedFlight(kind, start_state(rng, voltage, hover, rng.uniform(20.0, 80.0), 0.0), command)
+        return ScriptedFlight(
+            kind, start_state(rng, voltage, hover, rng.uniform(20.0, 80.0), 0.0), command
+        )
     time = np.arange(FLIGHT_STEPS) * DT_S
-    slow = [np.sin(2 * np.pi * rng.uniform(0.5, 1.5) * time + rng.uniform(0, 2 * np.pi)) for _ in range(3)]
+    slow = [
+        np.sin(2 * np.pi * rng.uniform(0.5, 1.5) * time + rng.uniform(0, 2 * np.pi))
+        for _ in range(3)
+    ]
     command[:, :2] = LEG_STICK * np.stack(slow[:2], axis=1)
     command[:, 3] += LEG_SWING * slow[2]
     return ScriptedFlight(
@@ -143,12 +157,14 @@ def _flight(
     )
 
 
-def _voltages(kind: str, turns: int, rng: np.random.Generator, voltages: tuple[float, float]) -> np.ndarray:
+def _voltages(
+    kind: str, turns: int, rng: np.random.Generator, voltages: tuple[float, float]
+) -> np.ndarray:
     """Return the voltages of a kind's flights, (turns, 4), between nearly empty and full.
 
-    Denser towards both ends, which are the most informative on how thrust depends on the voltage. In random
-    order, except for the last of every four, which may be held out: these are spread over the range by turn
-    and kind.
+    Denser towards both ends, which are the most informative on how thrust depends on the voltage.
+    In random order, except for the last of every four, which may be held out: these are spread over
+    the range by turn and kind.
     """
     lowest, count = voltages[0] + RESERVE_V, turns * FLIGHTS_PER_KIND
     share = 0.5 - 0.5 * np.cos(np.pi * np.arange(count) / (count - 1))
@@ -159,7 +175,10 @@ def _voltages(kind: str, turns: int, rng: np.random.Generator, voltages: tuple[f
 
 
 def script(
-    num_flights: int, hover: float, rng: np.random.Generator, battery: tuple[float, float] = VOLTAGES
+    num_flights: int,
+    hover: float,
+    rng: np.random.Generator,
+    battery: tuple[float, float] = VOLTAGES,
 ) -> list[ScriptedFlight]:
     """Return the flights of an excitation.
 
@@ -177,4 +196,7 @@ def script(
         for kind in KINDS
         for number in range(FLIGHTS_PER_KIND)
     ]
-    return [flight._replace(command=np.clip(flight.command, -1.0, 1.0)) for flight in flights[:num_flights]]
+    return [
+        flight._replace(command=np.clip(flight.command, -1.0, 1.0))
+        for flight in flights[:num_flights]
+    ]

@@ -15,7 +15,13 @@ from flytrack_env.motion import Motion
 from flytrack_sysid.estimate import Estimate, FitError, estimate
 from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
 from flytrack_sysid.log_motion import motion_notes, required_motion
-from flytrack_sysid.log_voltage import fitted_battery, flown_voltages, is_within, voltage_notes, with_voltage
+from flytrack_sysid.log_voltage import (
+    fitted_battery,
+    flown_voltages,
+    is_within,
+    voltage_notes,
+    with_voltage,
+)
 from flytrack_sysid.parameters import (
     DRAIN,
     TAU_RANGE,
@@ -34,11 +40,13 @@ from flytrack_sysid.plausibility import check_plausible
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
 TWO_SIDED_95 = 1.959964  # standard deviations of a normal distribution
-# What makes a warning: half the width of the 95 % interval, relative to a time constant, to full thrust.
+# What makes a warning: half the width of the 95 % interval, relative to a time constant, to full
+# thrust.
 UNCERTAIN_TAU, UNCERTAIN_THRUST = 0.2, 0.02
 BOX_ACTIONS, BOX_VOLTAGES = 41, 9
 NEVER_MOVED = 1e-3  # of a stick's travel from -1 to 1
-LEAST_RESPONSE = 0.1  # correlation of a rate with its lagged command; chance gives less in a minute of noise
+# correlation of a rate with its lagged command; chance gives less in a minute of noise
+LEAST_RESPONSE = 0.1
 AT_BOUND = 1.01
 AT_END = 1e-3  # of the range of an effect's parameter
 
@@ -64,10 +72,11 @@ class MapUncertainty(NamedTuple):
 class Fit:
     """An identified model.
 
-    model: float32, as the environment takes it. estimate: the same in float64, with covariance and residuals
-    of each channel. intervals: by name. map_uncertainty: None where the thrust map was not fitted.
-    warnings: sentences on what the data do not determine. every: which part was held out
-    (``flytrack_sysid.split``), 0 for none. source, sha256: of the log, and the hash of its content.
+    model: float32, as the environment takes it. estimate: the same in float64, with covariance and
+    residuals of each channel. intervals: by name. map_uncertainty: None where the thrust map was
+    not fitted. warnings: sentences on what the data do not determine. every: which part was held
+    out (``flytrack_sysid.split``), 0 for none. source, sha256: of the log, and the hash of its
+    content.
     """
 
     model: ModelParameters
@@ -97,9 +106,13 @@ class Fit:
             },
             "correlation": {
                 "of": names,
-                "matrix": np.round(self.estimate.covariance / np.where(scale > 0.0, scale, 1.0), 4).tolist(),
+                "matrix": np.round(
+                    self.estimate.covariance / np.where(scale > 0.0, scale, 1.0), 4
+                ).tolist(),
             },
-            "thrust_map_worst": None if self.map_uncertainty is None else self.map_uncertainty._asdict(),
+            "thrust_map_worst": None
+            if self.map_uncertainty is None
+            else self.map_uncertainty._asdict(),
             "left_rms": {name: left.tolist() for name, left in self.estimate.noise.items()},
             "warnings": list(self.warnings),
         }
@@ -108,7 +121,9 @@ class Fit:
         """Return the result as a table in text."""
         lines = [f"{'parameter':28} {'estimate':>12} {'95 % interval':>27}  unit"]
         for name, (value, low, high) in self.intervals.items():
-            lines.append(f"{name:28} {value:12.6g} {low:12.6g} to {high:11.6g}  {range_of(name).unit}")
+            lines.append(
+                f"{name:28} {value:12.6g} {low:12.6g} to {high:11.6g}  {range_of(name).unit}"
+            )
         if self.map_uncertainty is not None:
             worst = self.map_uncertainty
             lines.append(
@@ -119,7 +134,9 @@ class Fit:
         return "\n".join(lines)
 
 
-def _free_names(model: ModelParameters, log: FlightLog, fixed: Mapping[str, float]) -> tuple[str, ...]:
+def _free_names(
+    model: ModelParameters, log: FlightLog, fixed: Mapping[str, float]
+) -> tuple[str, ...]:
     """Return what is estimated: lags, thrust map, drain and effects, as far as the log has the channels."""
     names = names_of(model)
     unknown = [name for name in fixed if name not in names]
@@ -129,7 +146,9 @@ def _free_names(model: ModelParameters, log: FlightLog, fixed: Mapping[str, floa
         low, high, unit = range_of(name)
         if not (np.isfinite(value) and low <= value <= high):
             raise FitError(f"fixed: {name}: found {value}, expected {low:g} to {high:g} {unit}")
-    of_effects = [name for name in names if "." in name and not BY_NAME[name.split(".")[0]].search.is_setting]
+    of_effects = [
+        name for name in names if "." in name and not BY_NAME[name.split(".")[0]].search.is_setting
+    ]
     wanted = [*base_of(model), *of_effects]
     if "v_bat" not in log:
         wanted = [name for name in wanted if name not in (*THRUST_COEFFS[4:], DRAIN)]
@@ -157,10 +176,14 @@ def _map_uncertainty(result: Estimate, log: FlightLog) -> MapUncertainty | None:
     low, high = flown_voltages(log)
     if is_within((low, high), result.model.battery):
         low, high = float(result.model.battery.empty_v), float(result.model.battery.full_v)
-    action, battery_v = np.meshgrid(np.linspace(-1, 1, BOX_ACTIONS), np.linspace(low, high, BOX_VOLTAGES))
+    action, battery_v = np.meshgrid(
+        np.linspace(-1, 1, BOX_ACTIONS), np.linspace(low, high, BOX_VOLTAGES)
+    )
     units: Any = np.eye(len(THRUST_COEFFS))
     coeffs: Any = np.asarray(result.model.thrust_coeffs)
-    terms = np.stack([np.asarray(collective_thrust(action, battery_v, unit)) for unit in units], axis=-1)
+    terms = np.stack(
+        [np.asarray(collective_thrust(action, battery_v, unit)) for unit in units], axis=-1
+    )
     terms = terms[..., [THRUST_COEFFS.index(result.free[index]) for index in where]]
     covariance = result.covariance[np.ix_(where, where)]
     half = TWO_SIDED_95 * np.sqrt(np.einsum("...i,ij,...j->...", terms, covariance, terms))
@@ -185,7 +208,9 @@ def _warnings(
     if uncertainty is not None and uncertainty.share > UNCERTAIN_THRUST:
         half_width_n, share, action, battery_v = uncertainty
         thrust = log["u"][:, 3]
-        volts = f" at {log['v_bat'].min():.4g} to {log['v_bat'].max():.4g} V" if "v_bat" in log else ""
+        volts = (
+            f" at {log['v_bat'].min():.4g} to {log['v_bat'].max():.4g} V" if "v_bat" in log else ""
+        )
         found.append(
             f"the thrust map is not determined by the data everywhere: +-{half_width_n:.3g} N "
             f"({share:.0%} of full thrust) at action {action:.2g}, {battery_v:.4g} V; the log commands "
@@ -217,7 +242,9 @@ def what_is_fitted(
     except KeyError as error:
         raise FitError(f"effects: {error.args[0]}: no effect of that name") from error
     for name in (name for name in effects if BY_NAME[name].search.is_setting):
-        raise FitError(f"effects: {name}: known from settings and not fitted; start from a model that has it")
+        raise FitError(
+            f"effects: {name}: known from settings and not fitted; start from a model that has it"
+        )
     free = _free_names(model, log, fixed)
     model = with_values(model, fixed)
     model = model._replace(motion=required_motion(log, motion) or model.motion)
@@ -238,11 +265,12 @@ def fit(
 ) -> Fit:
     """Identify lags, thrust map and battery drain from a log; mass, gravity and full-stick rates are given.
 
-    start: initial values, also of what is not estimated; nominal if None. fixed: values of parameters that
-    are not estimated, by name (``tau_yaw``, ``c4``, ``linear_drag.d_x``, ...). effects: names of effects
-    whose parameters are estimated too. every: which rows are held out (``flytrack_sysid.split``), 0 for none.
-    report: called with the rounds done and in all. motion: how the log moves within a step; if None,
-    continuously where the log is measured, else as ``start`` does.
+    start: initial values, also of what is not estimated; nominal if None. fixed: values of
+    parameters that are not estimated, by name (``tau_yaw``, ``c4``, ``linear_drag.d_x``, ...).
+    effects: names of effects whose parameters are estimated too. every: which rows are held out
+    (``flytrack_sysid.split``), 0 for none. report: called with the rounds done and in all. motion:
+    how the log moves within a step; if None, continuously where the log is measured, else as
+    ``start`` does.
 
     Raises:
         LogError, FitError: an implausible log; missing channels or motion, or a fit that diverged.
@@ -282,7 +310,9 @@ def _check_data(log: FlightLog, judged: np.ndarray, free: tuple[str, ...]) -> No
         raise FitError("fixed: found every parameter, expected one to estimate at least")
     has_turns = "w" in log or "q" in log
     if not has_turns and any(name in free for name in TAUS[:3]):
-        raise FitError(f"{log.source}: w and q are absent; the lags of the body rates need one of them")
+        raise FitError(
+            f"{log.source}: w and q are absent; the lags of the body rates need one of them"
+        )
     has_forces = "f" in log or ("q" in log and any(name in log for name in ("a", "v", "p")))
     if not has_forces and any(name in free for name in (TAUS[3], *THRUST_COEFFS)):
         raise FitError(
@@ -327,7 +357,10 @@ def _check_result(result: Estimate, log: FlightLog, judged: np.ndarray) -> None:
     """Raise FitError where the best model is no model of a drone."""
     values = dict(zip(names_of(result.model), to_vector(result.model), strict=True))
     for name in TAUS:
-        if name in result.free and not TAU_RANGE.low * AT_BOUND < values[name] < TAU_RANGE.high / AT_BOUND:
+        if (
+            name in result.free
+            and not TAU_RANGE.low * AT_BOUND < values[name] < TAU_RANGE.high / AT_BOUND
+        ):
             raise FitError(
                 f"{log.source}: {name}: the fit ended at {values[name]:.3g} s, expected {TAU_RANGE.low} to "
                 f"{TAU_RANGE.high} s; {_likely_cause(log, name)}; --fix {name}=VALUE holds it"
@@ -342,7 +375,10 @@ def _check_result(result: Estimate, log: FlightLog, judged: np.ndarray) -> None:
             )
     if "w" in result.noise:
         for axis, column in enumerate(CHANNELS["w"]):
-            left, measured = result.noise["w"][axis], np.sqrt(np.mean(np.square(log["w"][judged, axis])))
+            left, measured = (
+                result.noise["w"][axis],
+                np.sqrt(np.mean(np.square(log["w"][judged, axis]))),
+            )
             if TAUS[axis] in result.free and left > AT_BOUND * measured:
                 raise FitError(
                     f"{log.source}: {column}: the model leaves more ({left:.3g} rad/s rms) than was measured "

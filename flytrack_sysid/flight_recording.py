@@ -9,19 +9,25 @@ from flytrack_sysid.log import FlightLog
 
 
 def write_flight_recording(
-    path: Path, log: FlightLog, models: Mapping[str, ModelParameters], residuals: Traces | None = None
+    path: Path,
+    log: FlightLog,
+    models: Mapping[str, ModelParameters],
+    residuals: Traces | None = None,
 ) -> str:
     """Write a log and what models make of it as a Rerun recording; return why not, "" if it was written.
 
-    models, residuals: as for ``trajectories.trajectories_of``. Where nothing is written, a file of that name
-    is removed: it would pass for this log's.
+    models, residuals: as for ``trajectories.trajectories_of``. Where nothing is written, a file of
+    that name is removed: it would pass for this log's.
     """
     try:
         from flytrack_env.viz_rerun import write_recording
         from flytrack_sysid.trajectories import trajectories_of
 
         write_recording(path, trajectories_of(log, models, residuals), None)
-    except (ImportError, ValueError) as error:  # Rerun is not installed; what cannot be shown or written
+    except (
+        ImportError,
+        ValueError,
+    ) as error:  # Rerun is not installed; what cannot be shown or written
         path.unlink(missing_ok=True)
         return str(error)
     return ""

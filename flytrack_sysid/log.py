@@ -1,15 +1,18 @@
 """Flight logs: named columns in SI units, the one form of simulated and measured flight.
 
-docs/identification.md lists columns, units and frames: position ``p``, velocity ``v``, acceleration ``a``
-(0 in hover), world; specific force ``f``, angular velocity ``w``, body; orientation ``q``, (w, x, y, z), body
-to world; command ``u`` and applied action ``uprev`` in [-1, 1]; battery ``v_bat``, V.
+docs/identification.md lists columns, units and frames: position ``p``, velocity ``v``, acceleration
+``a`` (0 in hover), world; specific force ``f``, angular velocity ``w``, body; orientation ``q``,
+(w, x, y, z), body to world; command ``u`` and applied action ``uprev`` in [-1, 1]; battery
+``v_bat``, V.
 
-Row k holds what was measured at t_k and the command held from t_k to t_k+1. As in the handout's state,
-``a`` and ``f`` of row k are those of the step that led to t_k, with the attitude before it. ``t`` and the
-commands are always there; other channels may be absent (never zero instead), but only whole ones.
+Row k holds what was measured at t_k and the command held from t_k to t_k+1. As in the handout's
+state, ``a`` and ``f`` of row k are those of the step that led to t_k, with the attitude before it.
+``t`` and the commands are always there; other channels may be absent (never zero instead), but only
+whole ones.
 
-Columns of ``STATED`` hold the same number in every row: ``measured``, 1 where a real drone flew and 0 where a
-simulator did; ``v_bat_low`` and ``v_bat_high``, V, the range that is stated for a pack that was not logged.
+Columns of ``STATED`` hold the same number in every row: ``measured``, 1 where a real drone flew and
+0 where a simulator did; ``v_bat_low`` and ``v_bat_high``, V, the range that is stated for a pack
+that was not logged.
 """
 
 import hashlib
@@ -20,7 +23,15 @@ from typing import Literal
 
 import numpy as np
 
-from flytrack_env.state import ACCELERATION, APPLIED_ACTION, BATTERY, POSITION, QUATERNION, RATES, VELOCITY
+from flytrack_env.state import (
+    ACCELERATION,
+    APPLIED_ACTION,
+    BATTERY,
+    POSITION,
+    QUATERNION,
+    RATES,
+    VELOCITY,
+)
 
 _XYZ, _STICKS = ("x", "y", "z"), ("roll", "pitch", "yaw", "thrust")
 CHANNELS: dict[str, tuple[str, ...]] = {
@@ -34,7 +45,12 @@ CHANNELS: dict[str, tuple[str, ...]] = {
 REQUIRED = ("t", *CHANNELS["u"])
 MEASURED, STATED_VOLTAGES = "measured", ("v_bat_low", "v_bat_high")
 STATED = (MEASURED, *STATED_VOLTAGES)
-COLUMNS = ("t", "segment", *(column for columns in CHANNELS.values() for column in columns), *STATED)
+COLUMNS = (
+    "t",
+    "segment",
+    *(column for columns in CHANNELS.values() for column in columns),
+    *STATED,
+)
 # What flew a log, and what its files say of it in the column ``measured``.
 Origin = Literal["measured", "simulated"]
 ORIGINS: dict[float, Origin] = {1.0: "measured", 0.0: "simulated"}
@@ -60,10 +76,11 @@ class LogError(ValueError):
 class FlightLog:
     """A flight log in memory; what files hold is checked by ``load_log``, this is not.
 
-    time: (num_rows,) s. channels: of ``CHANNELS``, name -> (num_rows, number of its columns) float64;
-    "u" is always there. segment: (num_rows,) int, equal numbers side by side. source: where it is from,
-    for messages. origin: whether a real drone flew or a simulator; None if nobody says. stated_voltage_v:
-    lowest and highest voltage of the pack in flight, V, where they are stated but ``v_bat`` was not logged.
+    time: (num_rows,) s. channels: of ``CHANNELS``, name -> (num_rows, number of its columns)
+    float64; "u" is always there. segment: (num_rows,) int, equal numbers side by side. source:
+    where it is from, for messages. origin: whether a real drone flew or a simulator; None if nobody
+    says. stated_voltage_v: lowest and highest voltage of the pack in flight, V, where they are
+    stated but ``v_bat`` was not logged.
     """
 
     time: np.ndarray
@@ -87,7 +104,11 @@ class FlightLog:
         """The hash of the rows: the same in memory and in any file, and whatever is stated of them."""
         digest = hashlib.sha256()
         segment = np.cumsum(self.is_start())
-        for name, values in (("t", self.time), ("segment", segment), *sorted(self.channels.items())):
+        for name, values in (
+            ("t", self.time),
+            ("segment", segment),
+            *sorted(self.channels.items()),
+        ):
             digest.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
         return digest.hexdigest()
 
@@ -135,7 +156,9 @@ def log_of_states(
 
     The first acceleration of a flight is that of the step before it. dt: s.
     """
-    flights = [(np.asarray(states, float), np.asarray(actions, float)) for states, actions in flights]
+    flights = [
+        (np.asarray(states, float), np.asarray(actions, float)) for states, actions in flights
+    ]
     states = np.concatenate([states for states, _ in flights])
     channels = {name: states[:, where] for name, where in IN_STATE.items()}
     return FlightLog(

@@ -1,10 +1,11 @@
 """Files of flight logs: ``.npz`` and ``.csv``, checked when read; the same log gives the same bytes.
 
-Columns of numbers are read from CSV files of any source, gzip-compressed ones too; every refusal names the
-place.
+Columns of numbers are read from CSV files of any source, gzip-compressed ones too; every refusal
+names the place.
 
-Columns are those of ``flytrack_sysid.log``. An ``.npz`` holds one array of numbers per column; a ``.csv`` has
-a header of column names, then one row of numbers, separated by commas, per sample; blank lines are skipped.
+Columns are those of ``flytrack_sysid.log``. An ``.npz`` holds one array of numbers per column; a
+``.csv`` has a header of column names, then one row of numbers, separated by commas, per sample;
+blank lines are skipped.
 """
 
 import contextlib
@@ -28,16 +29,22 @@ from flytrack_sysid.log_table import Table, check_names, columns_of, log_of_tabl
 
 SUFFIXES = (".npz", ".csv")
 LARGEST_BYTES = 512 * 2**20
-PACKED_BYTES, LARGEST_RATIO = 2**24, 32  # characters in a compressed file: that, or as many times its bytes
-LARGEST_VALUES = 56 * 2**20  # all columns at 1 kHz for half an hour; twice as many float64 are below 1 GiB
+PACKED_BYTES, LARGEST_RATIO = (
+    2**24,
+    32,
+)  # characters in a compressed file: that, or as many times its bytes
+LARGEST_VALUES = (
+    56 * 2**20
+)  # all columns at 1 kHz for half an hour; twice as many float64 are below 1 GiB
 LONGEST_ROW = 2**16  # characters: thousands of columns
 
 
 def load_log(path: str | Path) -> FlightLog:
     """Return the log in an ``.npz`` or ``.csv`` file; the suffix says which. Nothing is ever unpickled.
 
-    Without a column ``segment``, all rows are one. Quaternions come back with norm 1. Raises LogError, whose
-    message names file, row and column; rows count from 0, lines of a CSV file from 1.
+    Without a column ``segment``, all rows are one. Quaternions come back with norm 1. Raises
+    LogError, whose message names file, row and column; rows count from 0, lines of a CSV file from
+    1.
     """
     path = Path(path)
     check_name(path)
@@ -50,8 +57,8 @@ def load_log(path: str | Path) -> FlightLog:
 def save_log(path: str | Path, log: FlightLog) -> None:
     """Write a log to an ``.npz`` or ``.csv`` file, atomically; the suffix says which.
 
-    Every float64 comes back the same, and the same log gives the same bytes. Raises LogError for a log that
-    ``load_log`` would refuse, OSError for a file that cannot be written.
+    Every float64 comes back the same, and the same log gives the same bytes. Raises LogError for a
+    log that ``load_log`` would refuse, OSError for a file that cannot be written.
     """
     path = Path(path)
     check_name(path)
@@ -68,7 +75,9 @@ def save_log(path: str | Path, log: FlightLog) -> None:
 def check_name(path: str | Path) -> None:
     """Raise LogError for a file that ``save_log`` would refuse by its name, before there is a log."""
     if Path(path).suffix.lower() not in SUFFIXES:
-        raise LogError(f"{path}: found suffix {Path(path).suffix!r}, expected {' or '.join(SUFFIXES)}")
+        raise LogError(
+            f"{path}: found suffix {Path(path).suffix!r}, expected {' or '.join(SUFFIXES)}"
+        )
 
 
 def gaps_of(log: FlightLog) -> np.ndarray:
@@ -92,7 +101,10 @@ def describe(log: FlightLog) -> str:
     ]
     if inside.any():
         median, gaps = np.median(steps[inside]), gaps_of(log)
-        lines[1:1] = [f"sample interval: {median:.4g} s (median), {1.0 / median:.4g} Hz", "gaps: none"]
+        lines[1:1] = [
+            f"sample interval: {median:.4g} s (median), {1.0 / median:.4g} Hz",
+            "gaps: none",
+        ]
         if len(gaps):
             longest = gaps[np.argmax(steps[gaps])]
             lines[2] = f"gaps: {len(gaps)}, longest {steps[longest]:.4g} s, after row {longest}"
@@ -110,7 +122,9 @@ def _ranges(log: FlightLog) -> list[str]:
         ranges.append(f"speed up to {np.linalg.norm(log['v'], axis=1).max():.3g} m/s")
     if "q" in log:
         upright = 1.0 - 2.0 * (log["q"][:, 1] ** 2 + log["q"][:, 2] ** 2)  # cosine of the tilt
-        ranges.append(f"tilt up to {np.rad2deg(np.arccos(np.clip(upright.min(), -1.0, 1.0))):.0f} deg")
+        ranges.append(
+            f"tilt up to {np.rad2deg(np.arccos(np.clip(upright.min(), -1.0, 1.0))):.0f} deg"
+        )
     for name, label, unit in (("p", "height", "m"), ("v_bat", "voltage", "V")):
         if name in log:
             values = log[name][:, -1]  # p_z, or the only column
@@ -156,7 +170,9 @@ def open_csv(path: Path, delimiter: str = ",") -> Iterator[Any]:
             stream: Any = file
             most_characters = LARGEST_BYTES
             if path.suffix == ".gz":
-                most_characters = min(LARGEST_BYTES, max(PACKED_BYTES, LARGEST_RATIO * path.stat().st_size))
+                most_characters = min(
+                    LARGEST_BYTES, max(PACKED_BYTES, LARGEST_RATIO * path.stat().st_size)
+                )
                 stream = gzip.GzipFile(fileobj=file)
             with io.TextIOWrapper(stream, encoding="utf-8-sig", newline="") as text:
                 rows = csv.reader(_lines(text, most_characters), delimiter=delimiter, strict=True)
@@ -185,19 +201,23 @@ def _lines(text: io.TextIOWrapper, most_characters: int) -> Iterator[str]:
 def read_columns(path: Path, rows: Any, header: list[str], wanted: Iterable[str]) -> Table:
     """Return the wanted columns of the rows after the header, which has each of them, less blank ones.
 
-    Raises:
-        LogError: a row of another length, a cell that is no finite number, more than LARGEST_VALUES numbers.
+    Raises: LogError: a row of another length, a cell that is no finite number, more than
+        LARGEST_VALUES numbers.
     """
     places = {name: header.index(name) for name in wanted}
     values, lines = array("d"), array("q")
     for cells in filter(None, rows):
         where = f"{path}: row {len(lines)} (line {rows.line_num})"
         if len(cells) != len(header):
-            raise LogError(f"{where}: found {len(cells)} cells, expected {len(header)} as in the header")
+            raise LogError(
+                f"{where}: found {len(cells)} cells, expected {len(header)} as in the header"
+            )
         values.extend(_number(where, name, cells[place]) for name, place in places.items())
         lines.append(rows.line_num)
         if len(values) > LARGEST_VALUES:
-            raise LogError(f"{path}: found more than {LARGEST_VALUES} numbers, expected at most that")
+            raise LogError(
+                f"{path}: found more than {LARGEST_VALUES} numbers, expected at most that"
+            )
     columns = np.asarray(values).reshape(-1, len(places)).T
     return Table(str(path), dict(zip(places, columns, strict=True)), np.asarray(lines))
 
@@ -207,7 +227,11 @@ def _number(where: str, column: str, cell: str) -> float:
         value = float(cell)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value) or "_" in cell:  # Python reads 1_000 as a number, other programs do not
+    if (
+        not math.isfinite(value) or "_" in cell
+    ):  # Python reads 1_000 as a number, other programs do not
         found = quote_value(cell) if cell.strip() else "an empty cell"
-        raise LogError(f"{where}, column {quote_name(column)}: found {found}, expected a finite number")
+        raise LogError(
+            f"{where}, column {quote_name(column)}: found {found}, expected a finite number"
+        )
     return value

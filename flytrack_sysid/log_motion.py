@@ -1,8 +1,9 @@
 """How a log is replayed within a step, by what flew it: a measured log continuously.
 
-The likelihoods of the two discrete integrators and of continuous motion differ by less than what a model
-that lacks something leaves, so on measured logs they choose a simulator's step (docs/diagnosis.md). Drones
-move continuously, so only logs that are not measured leave anything to choose.
+The likelihoods of the two discrete integrators and of continuous motion differ by less than what a
+model that lacks something leaves, so on measured logs they choose a simulator's step
+(docs/diagnosis.md). Drones move continuously, so only logs that are not measured leave anything to
+choose.
 """
 
 from flytrack_env.dynamics import ModelParameters
@@ -24,12 +25,9 @@ def motion_notes(
 ) -> list[str]:
     """Return where log, model and request contradict each other on the motion, a sentence each.
 
-    Args:
-        log: what is replayed.
-        model: the model as it was given; None if none was.
-        requested: the motion that was asked for; None if none was.
-        otherwise: how the motion of a log that is not measured comes about, for the note on one that is not
-            marked.
+    Args: log: what is replayed. model: the model as it was given; None if none was. requested: the
+            motion that was asked for; None if none was. otherwise: how the motion of a log that is
+            not measured comes about, for the note on one that is not marked.
     """
     required, notes = required_motion(log, requested), []
     if log.origin == "measured" and required not in (None, Motion.CONTINUOUS):
@@ -38,7 +36,9 @@ def motion_notes(
         )
     if model is not None and required is not None and model.motion is not required:
         why = "as requested" if requested is not None else f"since {log.source} is measured"
-        notes.append(f"motion: replayed as {required.value}, {why}; the model says {model.motion.value}")
+        notes.append(
+            f"motion: replayed as {required.value}, {why}; the model says {model.motion.value}"
+        )
     if log.origin is None and requested is None:
         notes.append(
             f"motion: {otherwise}, since {log.source} does not say whether a drone or a simulator flew; "

@@ -30,7 +30,8 @@ LARGEST_SEGMENT = 2**53  # float64 is exact for whole numbers below it
 class Table(NamedTuple):
     """The columns of a file, (num_rows,) float64 each, by name.
 
-    source: the file, for messages. lines: (num_rows,) int, the line of each row in a text file, else None.
+    source: the file, for messages. lines: (num_rows,) int, the line of each row in a text file,
+    else None.
     """
 
     source: str
@@ -54,7 +55,9 @@ class Table(NamedTuple):
     def select(self, rows: np.ndarray) -> "Table":
         """Return some of the rows, by mask."""
         lines = None if self.lines is None else self.lines[rows]
-        return Table(self.source, {name: values[rows] for name, values in self.columns.items()}, lines)
+        return Table(
+            self.source, {name: values[rows] for name, values in self.columns.items()}, lines
+        )
 
     def matrix(self, columns: Sequence[str]) -> np.ndarray:
         """Return some of the columns side by side, (num_rows, len(columns))."""
@@ -71,15 +74,21 @@ def check_names(source: str, names: Sequence[str]) -> None:
                 f"{source}: column {quote_value(name)}: unknown{hint} (known: {', '.join(COLUMNS)})"
             )
         if names.count(name) > 1:
-            raise LogError(f"{source}: column {name}: found {names.count(name)} times, expected once")
+            raise LogError(
+                f"{source}: column {name}: found {names.count(name)} times, expected once"
+            )
     for name in REQUIRED:
         if name not in names:
-            raise LogError(f"{source}: column {name}: missing; found {', '.join(names) or 'no column'}")
+            raise LogError(
+                f"{source}: column {name}: missing; found {', '.join(names) or 'no column'}"
+            )
     for columns in (*CHANNELS.values(), STATED_VOLTAGES):
         present = [column for column in columns if column in names]
         for column in columns:
             if present and column not in present:
-                raise LogError(f"{source}: column {column}: missing; found only {', '.join(present)} of it")
+                raise LogError(
+                    f"{source}: column {column}: missing; found only {', '.join(present)} of it"
+                )
 
 
 def columns_of(time: np.ndarray, channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -95,15 +104,18 @@ def stated_columns(log: FlightLog) -> dict[str, np.ndarray]:
     """Return the columns of what is stated of a log, the same number in every row."""
     stated = dict(zip(STATED_VOLTAGES, log.stated_voltage_v or (), strict=False))
     if log.origin is not None:
-        stated[MEASURED] = next(number for number, origin in ORIGINS.items() if origin == log.origin)
+        stated[MEASURED] = next(
+            number for number, origin in ORIGINS.items() if origin == log.origin
+        )
     return {name: np.full(len(log), stated[name]) for name in STATED if name in stated}
 
 
 def log_of_table(table: Table) -> FlightLog:
     """Return the log that a table holds, with unit quaternions; a table without segments is one.
 
-    The names must have passed ``check_names``. Columns are removed from the table as they are copied, so that
-    a large log is not in memory twice. Raises LogError for a value that no log can have, with its place.
+    The names must have passed ``check_names``. Columns are removed from the table as they are
+    copied, so that a large log is not in memory twice. Raises LogError for a value that no log can
+    have, with its place.
     """
     num_rows = len(table.columns["t"])
     for column, values in table.columns.items():
@@ -143,7 +155,9 @@ def _stated(table: Table, name: str) -> float | None:
     values = table.columns.pop(name, None)
     if values is None:
         return None
-    table.check(values == values[0], name, f"{values[0]:g} as in row 0: all rows are of one craft", values)
+    table.check(
+        values == values[0], name, f"{values[0]:g} as in row 0: all rows are of one craft", values
+    )
     return float(values[0])
 
 
@@ -151,7 +165,9 @@ def _origin(table: Table) -> Origin | None:
     """Return what flew, by the column ``measured``."""
     value = _stated(table, MEASURED)
     if value is not None and value not in ORIGINS:
-        raise table.error(0, MEASURED, f"found {value}, expected 1 (a real drone) or 0 (a simulator)")
+        raise table.error(
+            0, MEASURED, f"found {value}, expected 1 (a real drone) or 0 (a simulator)"
+        )
     return None if value is None else ORIGINS[value]
 
 
@@ -174,6 +190,8 @@ def _segments(table: Table) -> np.ndarray:
     segment = values.astype(np.int64)
     starts = np.flatnonzero(np.concatenate([[True], segment[1:] != segment[:-1]]))
     is_first = np.ones(len(values), bool)
-    is_first[starts] = np.isin(np.arange(len(starts)), np.unique(segment[starts], return_index=True)[1])
+    is_first[starts] = np.isin(
+        np.arange(len(starts)), np.unique(segment[starts], return_index=True)[1]
+    )
     table.check(is_first, "segment", "each number in one piece")
     return segment

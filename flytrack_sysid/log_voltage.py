@@ -1,7 +1,7 @@
 """At which voltages a log was flown, and what that says of a model's battery.
 
-Where ``v_bat`` was not logged, thrust is that of the middle of the pack's stated range, else of the model's
-battery.
+Where ``v_bat`` was not logged, thrust is that of the middle of the pack's stated range, else of the
+model's battery.
 """
 
 from dataclasses import replace
@@ -13,8 +13,8 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_sysid.log import FlightLog
 
-# Percentiles of a logged voltage, so that a lone wrong sample is no range: a pack that falls evenly from 16.7
-# to 14.4 V keeps all but 12 mV at each end.
+# Percentiles of a logged voltage, so that a lone wrong sample is no range: a pack that falls evenly
+# from 16.7 to 14.4 V keeps all but 12 mV at each end.
 LOWEST_PERCENTILE, HIGHEST_PERCENTILE = 0.5, 99.5
 DECIMALS = 3  # of a battery's voltages, V: sensors have two
 
@@ -23,7 +23,9 @@ def with_voltage(log: FlightLog, model: ModelParameters) -> FlightLog:
     """Return a log that has a voltage: where neither logged nor stated, that of the model's battery."""
     if "v_bat" in log or log.stated_voltage_v is not None:
         return log
-    return replace(log, stated_voltage_v=(float(model.battery.empty_v), float(model.battery.full_v)))
+    return replace(
+        log, stated_voltage_v=(float(model.battery.empty_v), float(model.battery.full_v))
+    )
 
 
 def assumed_voltage(log: FlightLog) -> float:
@@ -43,14 +45,17 @@ def flown_voltages(log: FlightLog) -> tuple[float, float]:
 def is_within(voltages: tuple[float, float], battery: Battery) -> bool:
     """Return whether voltages are a battery's, but for what a thrust map may be extrapolated by."""
     margin = MAX_EXTRAPOLATION * float(battery.full_v)
-    return voltages[0] >= float(battery.empty_v) - margin and voltages[1] <= float(battery.full_v) + margin
+    return (
+        voltages[0] >= float(battery.empty_v) - margin
+        and voltages[1] <= float(battery.full_v) + margin
+    )
 
 
 def battery_of_craft(log: FlightLog, battery: Battery) -> Battery:
     """Return the battery of the craft that flew a log: the model's, unless the log was flown at others.
 
-    Then it goes from the highest voltage of the log down to the lowest, or, of a log that hardly drains it,
-    by as large a share as the model's battery does.
+    Then it goes from the highest voltage of the log down to the lowest, or, of a log that hardly
+    drains it, by as large a share as the model's battery does.
     """
     low, high = flown_voltages(log)
     if is_within((low, high), battery):
@@ -75,7 +80,9 @@ def voltage_notes(log: FlightLog, battery: Battery) -> list[str]:
     notes = []
     if "v_bat" not in log:
         lender = (
-            "the model's battery" if log.stated_voltage_v is None else "the voltages stated for the craft"
+            "the model's battery"
+            if log.stated_voltage_v is None
+            else "the voltages stated for the craft"
         )
         low, high = log.stated_voltage_v or (float(battery.empty_v), float(battery.full_v))
         notes.append(
@@ -87,7 +94,9 @@ def voltage_notes(log: FlightLog, battery: Battery) -> list[str]:
     low, high = flown_voltages(log)
     if not is_within((low, high), battery):
         overlap = (
-            "exceeds" if low <= float(battery.full_v) and high >= float(battery.empty_v) else "is outside"
+            "exceeds"
+            if low <= float(battery.full_v) and high >= float(battery.empty_v)
+            else "is outside"
         )
         notes.append(
             f"voltage: {log.source} was flown at {low:.4g} to {high:.4g} V, which {overlap} the model's "

@@ -1,7 +1,7 @@
 """Manoeuvres: flights that answer one question each, from chosen states.
 
-The excitation (``flytrack_sysid.excitation``) excites everything a little; a manoeuvre repeats one thing:
-eight flights of 2.5 s. ``MANOEUVRES`` says how to fly each on a real drone.
+The excitation (``flytrack_sysid.excitation``) excites everything a little; a manoeuvre repeats one
+thing: eight flights of 2.5 s. ``MANOEUVRES`` says how to fly each on a real drone.
 """
 
 from collections.abc import Callable, Iterable
@@ -15,10 +15,13 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.state import BATTERY, BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_sysid import excitation
 
-# All manoeuvres have the same length to be comparable. Even: two flights fill a lane of a diagnosis.
+# All manoeuvres have the same length to be comparable. Even: two flights fill a lane of a
+# diagnosis.
 FLIGHTS_PER_MANOEUVRE = 8
 SECONDS_PER_MANOEUVRE = FLIGHTS_PER_MANOEUVRE * excitation.FLIGHT_STEPS * excitation.DT_S
-STARTS_V = np.linspace(BATTERY_EMPTY_V + excitation.RESERVE_V, BATTERY_FULL_V, FLIGHTS_PER_MANOEUVRE)
+STARTS_V = np.linspace(
+    BATTERY_EMPTY_V + excitation.RESERVE_V, BATTERY_FULL_V, FLIGHTS_PER_MANOEUVRE
+)
 SWING_HZ = 1.0  # of a thrust that oscillates about hovering
 HOVER_SWING = 0.05  # of the stick: no pilot holds it still
 VOLTAGE_SWING = 0.5
@@ -27,7 +30,8 @@ LOW_HEIGHTS = (0.2, 0.35, 0.6, 1.0)  # m: a rotor's radius or two, where the gro
 LOW_SPEED = 2.0  # m/s, of every other low pass
 TILTS_DEG = (20.0, 40.0, 60.0, 80.0)
 QUICK_STEPS = (1, 6)  # how long fast switching is held
-# m/s upwards at the start of flips, whose thrust lifts nothing on average: half of what a flight loses.
+# m/s upwards at the start of flips, whose thrust lifts nothing on average: half of what a flight
+# loses.
 FLIP_CLIMB = 0.5 * 9.8 * excitation.FLIGHT_STEPS * excitation.DT_S
 SPIN_STICKS = (
     *((sign, 0.0, 0.0) for sign in (1.0, -1.0)),
@@ -87,38 +91,58 @@ def _headings(number: int, hover: float, rng: np.random.Generator) -> tuple[np.n
     return _start(hover, yaw_deg=90.0 * number), _swing(hover, HOVER_SWING, rng)
 
 
-@_manoeuvre("Fly straight legs at 3, 7, 11 and 15 m/s, nose first and sideways, climbing and sinking.")
+@_manoeuvre(
+    "Fly straight legs at 3, 7, 11 and 15 m/s, nose first and sideways, climbing and sinking."
+)
 def _speeds(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return a leg along x or, every other, along y of the body; climbing and sinking by pairs."""
     speed, yaw_deg = excitation.LEG_SPEEDS[number // 2], 90.0 * rng.integers(4)
     course = np.deg2rad(yaw_deg + 90.0 * (number % 2))
     climb = STEEPNESS * (-1.0) ** (number // 2)
     vel_w = speed * np.array([np.cos(course), np.sin(course), climb]) / np.hypot(1.0, climb)
-    return _start(hover, STARTS_V[number], yaw_deg, vel_w=vel_w), _swing(hover, excitation.LEG_SWING, rng)
+    return _start(hover, STARTS_V[number], yaw_deg, vel_w=vel_w), _swing(
+        hover, excitation.LEG_SWING, rng
+    )
 
 
 @_manoeuvre("Hover and pass slowly between 0.2 and 1 m above flat ground.")
-def _low_passes(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _low_passes(
+    number: int, hover: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     vel_w = (LOW_SPEED * (number % 2), 0.0, 0.0)
-    return _start(hover, vel_w=vel_w, height=LOW_HEIGHTS[number // 2]), _swing(hover, HOVER_SWING, rng)
+    return _start(hover, vel_w=vel_w, height=LOW_HEIGHTS[number // 2]), _swing(
+        hover, HOVER_SWING, rng
+    )
 
 
-@_manoeuvre("Level, throw the thrust stick between both ends, in short jabs and held for half a second.")
-def _thrust_steps(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+@_manoeuvre(
+    "Level, throw the thrust stick between both ends, in short jabs and held for half a second."
+)
+def _thrust_steps(
+    number: int, hover: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     command = np.zeros((excitation.FLIGHT_STEPS, 4))
     command[:, 3] = excitation.switching(rng, *((0.5, excitation.SLOW_STEPS) if number % 2 else ()))
     return _start(hover, STARTS_V[number]), command
 
 
-@_manoeuvre("Hold the drone at 20 to 80 degrees to one side and to the other, moving thrust up and down.")
-def _thrust_tilted(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+@_manoeuvre(
+    "Hold the drone at 20 to 80 degrees to one side and to the other, moving thrust up and down."
+)
+def _thrust_tilted(
+    number: int, hover: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     tilt_deg = TILTS_DEG[number // 2] * (-1.0) ** number
     start = _start(hover, STARTS_V[number], 90.0 * rng.integers(4), tilt_deg)
     return start, _swing(hover, excitation.LEG_SWING, rng)
 
 
-@_manoeuvre("Give roll, pitch and yaw to both sides, at a tenth, a third, two thirds and all of the stick.")
-def _stick_amplitudes(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+@_manoeuvre(
+    "Give roll, pitch and yaw to both sides, at a tenth, a third, two thirds and all of the stick."
+)
+def _stick_amplitudes(
+    number: int, hover: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Return roll, then pitch at one amplitude, or yaw, then all axes."""
     command = _swing(hover, HOVER_SWING, rng)
     slots = slice(excitation.SLOT_STEPS), slice(excitation.SLOT_STEPS, excitation.FLIGHT_STEPS)
@@ -130,7 +154,9 @@ def _stick_amplitudes(number: int, hover: float, rng: np.random.Generator) -> tu
 
 
 @_manoeuvre("Throw all four sticks from side to side as fast as you can, small and large.")
-def _fast_switching(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _fast_switching(
+    number: int, hover: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     command = [excitation.switching(rng, hold_steps=QUICK_STEPS) for _ in range(4)]
     size = excitation.FREE_AMPLITUDES[number // 2]
     return _start(hover, STARTS_V[number]), size * np.stack(command, axis=1)
@@ -149,23 +175,28 @@ def _voltages(number: int, hover: float, rng: np.random.Generator) -> tuple[np.n
     return _start(hover, STARTS_V[number]), _swing(hover, VOLTAGE_SWING, rng)
 
 
-def hover_action(model: ModelParameters, voltages: tuple[float, float] = excitation.VOLTAGES) -> float:
+def hover_action(
+    model: ModelParameters, voltages: tuple[float, float] = excitation.VOLTAGES
+) -> float:
     """Return the thrust action at which a model's thrust curve holds its weight, half-way between voltages.
 
-    The nearest end of the stick if none does. Effects are ignored: they matter little to where a flight
-    starts.
+    The nearest end of the stick if none does. Effects are ignored: they matter little to where a
+    flight starts.
     """
     weight_n = float(model.m) * float(model.g)
     return thrust.hover_action(model.thrust_coeffs, weight_n, 0.5 * sum(voltages))
 
 
 def flights_of(
-    names: Iterable[str], hover: float, seed: int = 0, voltages: tuple[float, float] = excitation.VOLTAGES
+    names: Iterable[str],
+    hover: float,
+    seed: int = 0,
+    voltages: tuple[float, float] = excitation.VOLTAGES,
 ) -> list[excitation.ScriptedFlight]:
     """Return the flights of manoeuvres, eight of each, in the order of the names.
 
-    hover: the thrust action that holds the weight. A manoeuvre's flights do not depend on the other names.
-    voltages: of an empty and a full battery, V.
+    hover: the thrust action that holds the weight. A manoeuvre's flights do not depend on the other
+    names. voltages: of an empty and a full battery, V.
 
     Raises:
         KeyError: no manoeuvre of that name.

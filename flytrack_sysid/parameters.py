@@ -17,8 +17,8 @@ MAX_RATES = tuple(f"max_rate_{stick}" for stick in STICKS[:3])
 NO_BATTERY: Any = ()  # in the place of a battery: no number of it is fitted
 DRAIN = "battery_drain_v_per_min"
 BASE = (*TAUS, *THRUST_COEFFS, *MAX_RATES, "m", "g", DRAIN)
-# Where a fit looks for each, and its unit: wide enough for anything that flies at 100 Hz; an answer at an end
-# is refused.
+# Where a fit looks for each, and its unit: wide enough for anything that flies at 100 Hz; an answer
+# at an end is refused.
 TAU_RANGE = Range(1e-3, 0.5, "s")
 RANGES = {
     **dict.fromkeys(TAUS, TAU_RANGE),
@@ -116,4 +116,6 @@ def with_neutral_effects(model: ModelParameters, effects: Iterable[str]) -> Mode
     """
     added = [BY_NAME[name].parameters() for name in effects]
     present = {type(parameters) for parameters in model.effects}
-    return model.with_effects(*(parameters for parameters in added if type(parameters) not in present))
+    return model.with_effects(
+        *(parameters for parameters in added if type(parameters) not in present)
+    )

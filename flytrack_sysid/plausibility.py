@@ -1,7 +1,7 @@
 """Plausibility of a log as a flight: units, gravity and signs, stuck columns, too little data.
 
-The motion by one channel is compared with that by another over windows of 0.1 to 1 s, so that noise averages
-out. Where the motion is too small to tell, no problem is reported.
+The motion by one channel is compared with that by another over windows of 0.1 to 1 s, so that noise
+averages out. Where the motion is too small to tell, no problem is reported.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,8 +18,9 @@ from flytrack_sysid.log import CHANNELS, FlightLog, LogError
 WINDOWS_S = (0.1, 0.3, 1.0)  # long against the noise of a sample; short ones for fast manoeuvres
 FEWEST_WINDOWS = 10
 LEAST_CORRELATION = 0.9  # with less in common, the slope may be that of noise
-# Channels of one motion correlate by more unless they contradict each other; and then they must correlate by
-# LEAST_CORRELATION if read otherwise. Right logs: 0.97 or more where they move, anything where they do not.
+# Channels of one motion correlate by more unless they contradict each other; and then they must
+# correlate by LEAST_CORRELATION if read otherwise. Right logs: 0.97 or more where they move,
+# anything where they do not.
 CONTRADICTION = 0.5
 STILL = 1e-6  # in any unit: what changes by less does not change
 GRAVITY = float(nominal_parameters().g)  # m/s^2
@@ -87,10 +88,9 @@ def agreement(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> tuple[flo
         change: a quantity, (num_rows, 3).
         rate: what should be its derivative, (num_rows, 3).
 
-    Returns:
-        Their correlation over windows of that length at which they move most alike, nan where they move too
-        little, and the size of the integral over that of the change: noise in either biases it little where
-        they are highly correlated.
+    Returns: Their correlation over windows of that length at which they move most alike, nan where
+        they move too little, and the size of the integral over that of the change: noise in either
+        biases it little where they are highly correlated.
     """
     best, slope = np.nan, np.nan
     for length_s in WINDOWS_S:
@@ -181,13 +181,18 @@ def _pairs(log: FlightLog) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         if "w" in log:
             pairs["q and w"] = summed_turns(attitude), log["w"]
         if "f" in log and "v" in log:
-            pairs["v and f by q"] = log["v"], attitude.apply(log["f"]) - np.array([0.0, 0.0, GRAVITY])
+            pairs["v and f by q"] = (
+                log["v"],
+                attitude.apply(log["f"]) - np.array([0.0, 0.0, GRAVITY]),
+            )
     if "p" in log and "v" in log:
         pairs["p and v"] = log["p"], log["v"]
     return pairs
 
 
-def _changed(channel: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[FlightLog], FlightLog]:
+def _changed(
+    channel: str, change: Callable[[np.ndarray], np.ndarray]
+) -> Callable[[FlightLog], FlightLog]:
     return lambda log: replace(log, channels={**log.channels, channel: change(log[channel])})
 
 
@@ -197,13 +202,16 @@ def _rolled(quat: np.ndarray, signs: np.ndarray, step: int) -> np.ndarray:
 
 
 def _as_quaternions(change: Callable[[Rotation], Rotation]) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda quat: change(Rotation.from_quat(quat, scalar_first=True)).as_quat(scalar_first=True)
+    return lambda quat: change(Rotation.from_quat(quat, scalar_first=True)).as_quat(
+        scalar_first=True
+    )
 
 
 HALF_TURN = Rotation.from_rotvec([np.pi, 0.0, 0.0])  # about x: between FLU and FRD, z up and NED
 TURN_SIGNS = np.array([1.0, -1.0, -1.0])
-# One mistake each in what a mapping says: the channel, what it looks like, and how to read it right. An order
-# is mistaken before the frames are converted, which may have turned both body and world.
+# One mistake each in what a mapping says: the channel, what it looks like, and how to read it
+# right. An order is mistaken before the frames are converted, which may have turned both body and
+# world.
 CONVENTIONS: tuple[tuple[str, str, Callable[[FlightLog], FlightLog]], ...] = (
     (
         "q",
@@ -262,9 +270,15 @@ def _conventions(log: FlightLog) -> Iterator[str]:
         if channel not in log:
             continue
         after = {name: agreement(log, *pair)[0] for name, pair in _pairs(read_right(log)).items()}
-        cured = [name for name in before if before[name] < CONTRADICTION and after[name] >= LEAST_CORRELATION]
+        cured = [
+            name
+            for name in before
+            if before[name] < CONTRADICTION and after[name] >= LEAST_CORRELATION
+        ]
         is_harmed = any(
-            after[name] < min(before[name], LEAST_CORRELATION) for name in before if name not in cured
+            after[name] < min(before[name], LEAST_CORRELATION)
+            for name in before
+            if name not in cured
         )
         if cured and not is_harmed:
             resolved.setdefault(", ".join(cured), []).append(f"{channel} {text}")
@@ -273,7 +287,9 @@ def _conventions(log: FlightLog) -> Iterator[str]:
     for names, readings in resolved.items():
         if len(names.split(", ")) == most:
             channel = readings[0].partition(" ")[0]
-            shown = ", ".join(f"{name} correlate by {before[name]:.2f}" for name in names.split(", "))
+            shown = ", ".join(
+                f"{name} correlate by {before[name]:.2f}" for name in names.split(", ")
+            )
             agree = "; or if ".join(dict.fromkeys(readings))
             yield f"{_columns(channel)}: found motion that contradicts itself ({shown}); it agrees if {agree}"
             return
@@ -283,7 +299,9 @@ def _rates(log: FlightLog) -> Iterator[str]:
     if "w" not in log:
         return
     if "q" in log:
-        slope = slope_of(log, summed_turns(Rotation.from_quat(log["q"], scalar_first=True)), log["w"])
+        slope = slope_of(
+            log, summed_turns(Rotation.from_quat(log["q"], scalar_first=True)), log["w"]
+        )
         if _is_about(slope, np.rad2deg(1.0)):
             found = f"found {slope:.3g} for the rates over those by {_columns('q')}, expected 1"
             yield f"{_columns('w')}: {found}: this looks like deg/s, not rad/s"
@@ -325,7 +343,9 @@ def _force_unit(log: FlightLog) -> Iterator[str]:
         return
     problem = f"{_columns('f')}: found a median size of {found:.3g}"
     if "v" in log:
-        force_w = windows.change_of(log["v"]) / windows.durations[:, None] + np.array([0.0, 0.0, GRAVITY])
+        force_w = windows.change_of(log["v"]) / windows.durations[:, None] + np.array(
+            [0.0, 0.0, GRAVITY]
+        )
         expected = float(np.median(np.linalg.norm(force_w, axis=1)))
         if _is_about(found * GRAVITY, expected):
             yield f"{problem}, expected {expected:.3g} m/s^2 by {_columns('v')}: this looks like g"
@@ -356,14 +376,24 @@ def _battery(log: FlightLog) -> Iterator[str]:
 
 
 CHECKS: tuple[Callable[[FlightLog], Iterator[str]], ...]
-CHECKS = (_length, _commands, _motion, _attitude, _conventions, _rates, _acceleration, _force, _battery)
+CHECKS = (
+    _length,
+    _commands,
+    _motion,
+    _attitude,
+    _conventions,
+    _rates,
+    _acceleration,
+    _force,
+    _battery,
+)
 
 
 def find_problems(log: FlightLog) -> list[str]:
     """Return what in a log cannot be true of a flight, a sentence each; empty if nothing.
 
-    Each names the source, the columns, what was found, and why it looks wrong. Where time is not in s, the
-    other checks see it corrected.
+    Each names the source, the columns, what was found, and why it looks wrong. Where time is not in
+    s, the other checks see it corrected.
     """
     log, problems = _with_time_in_s(log)
     problems = [*problems, *(problem for check in CHECKS for problem in check(log))]

@@ -37,7 +37,9 @@ def _empty(title: str, why: str) -> Figure:
 def say(axes: Axes, why: str) -> None:
     """Say in a panel why it shows nothing."""
     axes.set_axis_off()
-    axes.text(0.5, 0.5, why, ha="center", va="center", color=GREY, transform=axes.transAxes, wrap=True)
+    axes.text(
+        0.5, 0.5, why, ha="center", va="center", color=GREY, transform=axes.transAxes, wrap=True
+    )
 
 
 def _label(panel: Axes, x: str, y: str) -> None:

@@ -1,5 +1,6 @@
 """What a model predicts of a flight log, in float64: one step from every row, and free flight from some."""
 
+import operator
 from typing import Any, NamedTuple
 
 import jax
@@ -25,11 +26,11 @@ FLOWN = ("p", "v", "q", "w")  # channels of a free flight
 class Prediction(NamedTuple):
     """A model's step from every row of a log; leaves of the drones are (num_rows,) float64.
 
-    log: without gaps.
-    before: the measured state; zeros (upright, ``assumed_voltage``) where the log has no such channel.
-    memories: what the model's effects remember before the step. after: the state at the next row. force_b:
-    (num_rows, 3) m/s^2, specific force of the step. record: of the rows. step_s: the usual one.
-    is_settled: (num_rows,) bool, applied action and memories no longer depend on how they began.
+    log: without gaps. before: the measured state; zeros (upright, ``assumed_voltage``) where the
+    log has no such channel. memories: what the model's effects remember before the step. after: the
+    state at the next row. force_b: (num_rows, 3) m/s^2, specific force of the step. record: of the
+    rows. step_s: the usual one. is_settled: (num_rows,) bool, applied action and memories no longer
+    depend on how they began.
     """
 
     model: ModelParameters
@@ -113,7 +114,8 @@ def _step_from_every_row(
 def predict(model: ModelParameters, filled: Filled) -> Prediction:
     """Return the model's step from every row of a log, from the measured state under the logged command.
 
-    The applied action is the log's; without it, it follows the commands from the segment's start on.
+    The applied action is the log's; without it, it follows the commands from the segment's start
+    on.
     """
     filled = filled._replace(log=with_voltage(filled.log, model))
     log = filled.log
@@ -127,12 +129,17 @@ def predict(model: ModelParameters, filled: Filled) -> Prediction:
         since_start = log.time - log.time[record.begins][np.cumsum(record.begins) - 1]
         is_settled = is_settled & (since_start >= SETTLING_S)
     step_s = float(np.median(usual_step(log)))
-    return Prediction(model, log, before, memories, after, columns(force_b), record, step_s, is_settled)
+    return Prediction(
+        model, log, before, memories, after, columns(force_b), record, step_s, is_settled
+    )
 
 
 @jax.jit
 def _fly(
-    starts: tuple[Drone, tuple[Any, ...]], commands: Action, durations: jax.Array, model: ModelParameters
+    starts: tuple[Drone, tuple[Any, ...]],
+    commands: Action,
+    durations: jax.Array,
+    model: ModelParameters,
 ) -> dict[str, Any]:
     """Return free flights: p, v, q, w after every step; leaves (num_steps, BATCH)."""
 
@@ -146,7 +153,9 @@ def _fly(
     return jax.lax.scan(one, starts, (commands, durations))[1]
 
 
-def free_flights(prediction: Prediction, starts: np.ndarray, seen: np.ndarray) -> dict[str, np.ndarray]:
+def free_flights(
+    prediction: Prediction, starts: np.ndarray, seen: np.ndarray
+) -> dict[str, np.ndarray]:
     """Return flights of the model by itself from measured rows under the logged commands: p, v, q, w.
 
     starts: (num_starts,) rows. seen: (num_starts, num_seen) later rows, at which it returns them,
@@ -159,9 +168,12 @@ def free_flights(prediction: Prediction, starts: np.ndarray, seen: np.ndarray) -
         filled = np.resize(starts[begin : begin + BATCH], BATCH)
         rows = np.minimum(filled + np.arange(num_steps)[:, None], len(prediction.log) - 1)
         with jax.enable_x64(True):
-            first = jax.tree.map(lambda leaf: leaf[filled], (prediction.before, prediction.memories))  # noqa: B023
+            memories = (prediction.before, prediction.memories)
+            first = jax.tree.map(operator.itemgetter(filled), memories)
             commands = Action(*(column[rows] for column in prediction.log["u"].T))
-            flown = _fly(first, commands, prediction.record.step_s[rows], in_float64(prediction.model))
+            flown = _fly(
+                first, commands, prediction.record.step_s[rows], in_float64(prediction.model)
+            )
         at = after[begin : begin + BATCH]
         for name, leaves in flown.items():
             found[name][begin : begin + BATCH] = columns(leaves)[at, np.arange(len(at))[:, None]]

@@ -8,7 +8,14 @@ from scipy.stats import binned_statistic_2d
 
 from flytrack_env.battery import Battery
 from flytrack_sysid.log import CHANNELS
-from flytrack_sysid.prediction import LONGEST_S, Prediction, columns, free_flights, judged_steps, runs_of
+from flytrack_sysid.prediction import (
+    LONGEST_S,
+    Prediction,
+    columns,
+    free_flights,
+    judged_steps,
+    runs_of,
+)
 from flytrack_sysid.sensors import specific_force_b
 
 UNITS = {"p": "m", "v": "m/s", "q": "1", "w": "rad/s", "a": "m/s^2", "f": "m/s^2"}
@@ -89,7 +96,9 @@ def turn_between(quats: np.ndarray, others: np.ndarray) -> np.ndarray:
     return (first.inv() * second).as_rotvec()
 
 
-def error_of(name: str, before: np.ndarray, measured: np.ndarray, predicted: np.ndarray) -> ChannelError:
+def error_of(
+    name: str, before: np.ndarray, measured: np.ndarray, predicted: np.ndarray
+) -> ChannelError:
     """Return a channel's errors; all (num_steps, size)."""
     angle_rms_deg = None
     if name == "q":
@@ -121,7 +130,9 @@ def one_step_errors(prediction: Prediction, rows: np.ndarray) -> OneStep:
     if not len(here):
         return OneStep(0, {})
     channels = {
-        name: error_of(name, log[name][here], log[name][here + 1], predicted_channel(name, prediction)[here])
+        name: error_of(
+            name, log[name][here], log[name][here + 1], predicted_channel(name, prediction)[here]
+        )
         for name in names
     }
     return OneStep(len(here), channels)
@@ -182,10 +193,13 @@ def _spread(distances: np.ndarray) -> Spread:
 def rollout_errors(prediction: Prediction, rows: np.ndarray) -> tuple[Rollout, ...]:
     """Return the errors of free flights from measured states, a start every 0.25 s of judged runs.
 
-    rows: (num_rows,) bool, those judged; a flight stays in them, and begins and ends where it was measured.
+    rows: (num_rows,) bool, those judged; a flight stays in them, and begins and ends where it was
+    measured.
     """
     log, lacking = prediction.log, prediction.lacking
-    judged = [name for name, (channel, _) in QUANTITIES.items() if channel in log and not lacking[channel]]
+    judged = [
+        name for name, (channel, _) in QUANTITIES.items() if channel in log and not lacking[channel]
+    ]
     starts, ends = _starts_and_ends(prediction, rows)
     starts, ends = starts[(ends >= 0).any(axis=1)], ends[(ends >= 0).any(axis=1)]
     is_reached = ends >= 0
@@ -197,7 +211,10 @@ def rollout_errors(prediction: Prediction, rows: np.ndarray) -> tuple[Rollout, .
         for name in judged if reaches.any() else ():
             channel = QUANTITIES[name][0]
             with np.errstate(over="ignore", invalid="ignore"):  # a model may run away
-                measured, at_end = log[channel][ends[reaches, index]], flown[channel][reaches, index]
+                measured, at_end = (
+                    log[channel][ends[reaches, index]],
+                    flown[channel][reaches, index],
+                )
                 apart = turn_between(measured, at_end) if channel == "q" else measured - at_end
                 distances = np.linalg.norm(apart, axis=1)
                 errors[name] = _spread(np.rad2deg(distances) if channel == "q" else distances)
@@ -233,18 +250,25 @@ def thrust_error(prediction: Prediction, rows: np.ndarray) -> ThrustError | None
     rows: (num_rows,) bool, those judged. Samples beyond an end are in its bin.
     """
     log, model, here = prediction.log, prediction.model, judged_steps(rows, prediction)
-    source = next((name for name in ("f", "a") if name in log and not prediction.lacking[name]), None)
+    source = next(
+        (name for name in ("f", "a") if name in log and not prediction.lacking[name]), None
+    )
     if source is None or not len(here):
         return None
     measured_b = log["f"] if source == "f" else specific_force_b(log, float(model.g))
     error_n = float(model.m) * (measured_b[here + 1, 2] - prediction.force_b[here, 2])
     battery_v = np.asarray(prediction.before.battery_v)[here]
     low, high = _voltage_range(battery_v, model.battery)
-    edges = np.linspace(low, high, NUM_VOLTAGE_BINS + 1), np.linspace(-1.0, 1.0, NUM_ACTION_BINS + 1)
+    edges = (
+        np.linspace(low, high, NUM_VOLTAGE_BINS + 1),
+        np.linspace(-1.0, 1.0, NUM_ACTION_BINS + 1),
+    )
     action = np.asarray(prediction.after.applied.thrust)[here]
     place = np.clip(battery_v, low, high), np.clip(action, -1.0, 1.0)
     count = binned_statistic_2d(*place, None, "count", edges).statistic
-    mean_n, mean_square = binned_statistic_2d(*place, [error_n, error_n**2], "mean", edges).statistic
+    mean_n, mean_square = binned_statistic_2d(
+        *place, [error_n, error_n**2], "mean", edges
+    ).statistic
     return ThrustError(
         source=source,
         action_edges=edges[1],

@@ -1,8 +1,8 @@
 """Multi-step prediction: free flight from measured states, many windows at once, differentiable.
 
-A window begins with a lead-in, in which the measured states are fed in, body rates too where there is a gyro
-(as it read them, by the model's latency, later), and the commands settle the applied action and the memories
-of effects. Then the model flies by itself under the logged commands.
+A window begins with a lead-in, in which the measured states are fed in, body rates too where there
+is a gyro (as it read them, by the model's latency, later), and the commands settle the applied
+action and the memories of effects. Then the model flies by itself under the logged commands.
 """
 
 from typing import Any, NamedTuple
@@ -34,11 +34,11 @@ BLOCK_S = 2.0
 class Windows(NamedTuple):
     """Windows of a log.
 
-    record: (rows, windows, ...), as in ``flytrack_sysid.record``; the lead-in first. is_free: (rows,) bool,
-    the state of this row is the model's. ends: (horizons,) int, rows at the horizons. gyro_b: (rows,
-    windows, 3) rad/s, zeros without a gyro. has_gyro: bool. counts: (horizons, windows, quantities) bool,
-    what is judged. block: (windows,) int, number of the stretch of 2 s that the window starts in. start:
-    (windows,) int, row of the log.
+    record: (rows, windows, ...), as in ``flytrack_sysid.record``; the lead-in first. is_free:
+    (rows,) bool, the state of this row is the model's. ends: (horizons,) int, rows at the horizons.
+    gyro_b: (rows, windows, 3) rad/s, zeros without a gyro. has_gyro: bool. counts: (horizons,
+    windows, quantities) bool, what is judged. block: (windows,) int, number of the stretch of 2 s
+    that the window starts in. start: (windows,) int, row of the log.
     """
 
     record: Record
@@ -131,7 +131,8 @@ def _gyro_in_time(
 ) -> tuple[jax.Array, ModelParameters]:
     """Return what the gyro read of each row's own time, and the model of a gyro that is not late.
 
-    Rates that were corrected by late readings would be corrected again until those arrive, and diverge.
+    Rates that were corrected by late readings would be corrected again until those arrive, and
+    diverge.
     """
     late = [one for one in model.effects if isinstance(one, ImuLatency)]
     if not late:
@@ -177,8 +178,10 @@ def _fly(model: ModelParameters, record: Record, gyro_b: jax.Array, windows: Win
 def prediction_errors(model: ModelParameters, windows: Windows) -> jax.Array:
     """Return measured minus predicted at the horizons: (horizons, windows, 12).
 
-    Turn (rad, body frame), rates (rad/s), velocity (m/s) and position (m), three components each; 0 where
-    nothing is judged.
+    Turn (rad, body frame), rates (rad/s), velocity (m/s) and position (m), three components each; 0
+    where nothing is judged.
     """
     fly = jax.vmap(lambda record, gyro: _fly(model, record, gyro, windows), in_axes=1, out_axes=1)
-    return jnp.where(jnp.repeat(windows.counts, 3, axis=-1), fly(windows.record, windows.gyro_b), 0.0)
+    return jnp.where(
+        jnp.repeat(windows.counts, 3, axis=-1), fly(windows.record, windows.gyro_b), 0.0
+    )

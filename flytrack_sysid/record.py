@@ -1,8 +1,9 @@
 """A log made ready for replay: on even steps, gaps filled with rows that count for nothing.
 
-Commands are what a replay is driven by, so a lost row matters twice: its measurements are missing, and
-so is the command that was given in it. Filled rows get commands in between their neighbours, and how far
-off those may be is carried along (``command_doubt``), so that rows where it matters can be left out.
+Commands are what a replay is driven by, so a lost row matters twice: its measurements are missing,
+and so is the command that was given in it. Filled rows get commands in between their neighbours,
+and how far off those may be is carried along (``command_doubt``), so that rows where it matters can
+be left out.
 """
 
 from dataclasses import replace
@@ -31,14 +32,13 @@ APPLIED_UNKNOWN = 1.0  # standard deviation of an applied action that nothing is
 class Record(NamedTuple):
     """Rows of a replay, padded; row k is followed by row k + 1 after ``step_s``.
 
-    source_row: (num_rows,) int, the log's row, -1 for filled ones and padding.
-    step_s: (num_rows,) s. command: (num_rows, 4). command_doubt: (num_rows, 4), how far off the command
-    may be (standard deviation). begins: (num_rows,) bool, a flight starts here.
-    is_applied_known: (num_rows,) bool, ``applied`` was measured here. applied: (num_rows, 4).
-    pos_w, vel_w: (num_rows, 3). quat: (num_rows, 4). battery_v: (num_rows,). Where a channel is absent:
-    0, upright, ``assumed_voltage``.
-    piece: (num_rows,) int, numbers of stretches of at most 2.5 s, none across blocks. time_s: (num_rows,) s,
-    since the log began, of several each.
+    source_row: (num_rows,) int, the log's row, -1 for filled ones and padding. step_s: (num_rows,)
+    s. command: (num_rows, 4). command_doubt: (num_rows, 4), how far off the command may be
+    (standard deviation). begins: (num_rows,) bool, a flight starts here. is_applied_known:
+    (num_rows,) bool, ``applied`` was measured here. applied: (num_rows, 4). pos_w, vel_w:
+    (num_rows, 3). quat: (num_rows, 4). battery_v: (num_rows,). Where a channel is absent: 0,
+    upright, ``assumed_voltage``. piece: (num_rows,) int, numbers of stretches of at most 2.5 s,
+    none across blocks. time_s: (num_rows,) s, since the log began, of several each.
     """
 
     source_row: np.ndarray
@@ -74,7 +74,8 @@ def _new_times(log: FlightLog, usual: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _doubts(log: FlightLog, pieces: np.ndarray) -> np.ndarray:
     """Return how far a command in the gap after each row may be off, (num_rows, 4).
 
-    A command that changes evenly is off by nothing, one that jumps somewhere in the gap by half the jump.
+    A command that changes evenly is off by nothing, one that jumps somewhere in the gap by half the
+    jump.
     """
     change = np.diff(log["u"], axis=0, append=log["u"][-1:])
     # To the next row of the same flight, per step; the last row of a flight has none.
@@ -101,9 +102,9 @@ def _velocity(log: FlightLog) -> np.ndarray:
 class Filled(NamedTuple):
     """A log with rows added in its gaps, in between their neighbours.
 
-    log: segments end where a gap is too long to be filled. source_row: (num_rows,) int, the row of the
-    log as it was; -1 for added ones. behind: (num_rows,) int, that row or the one before the gap.
-    command_doubt: (num_rows, 4), standard deviation of how far a command may be off.
+    log: segments end where a gap is too long to be filled. source_row: (num_rows,) int, the row of
+    the log as it was; -1 for added ones. behind: (num_rows,) int, that row or the one before the
+    gap. command_doubt: (num_rows, 4), standard deviation of how far a command may be off.
     """
 
     log: FlightLog
@@ -126,7 +127,10 @@ def fill_gaps(log: FlightLog) -> Filled:
         channels[name], _ = between(in_line.time, values, times)
         channels[name][measured] = values[rows[measured]]
     filled = replace(
-        log, time=times - (in_line.time - log.time)[behind], channels=channels, segment=np.cumsum(begins) - 1
+        log,
+        time=times - (in_line.time - log.time)[behind],
+        channels=channels,
+        segment=np.cumsum(begins) - 1,
     )
     doubt = np.where(measured[:, None], 0.0, _doubts(log, pieces)[behind])
     return Filled(filled, np.where(measured, rows, -1), behind, doubt)
@@ -141,7 +145,9 @@ def record_of(filled: Filled) -> Record:
     return Record(
         source_row=filled.source_row,
         # To the next row of the flight; the usual step at its end.
-        step_s=np.where(np.append(begins[1:], True), usual_step(log), np.diff(log.time, append=log.time[-1])),
+        step_s=np.where(
+            np.append(begins[1:], True), usual_step(log), np.diff(log.time, append=log.time[-1])
+        ),
         command=log["u"],
         command_doubt=filled.command_doubt,
         begins=begins,
@@ -182,8 +188,8 @@ def _padded(record: Record) -> Record:
 def is_applied_certain(record: Record, tau: np.ndarray) -> np.ndarray:
     """Return where the applied action of a replay is known well enough to judge a model by, (num_rows, 4).
 
-    Doubt is from commands that were lost and from what was applied when a flight began; both are forgotten
-    with the lags ``tau``, (4,) s.
+    Doubt is from commands that were lost and from what was applied when a flight began; both are
+    forgotten with the lags ``tau``, (4,) s.
     """
     keep = np.exp(-record.step_s[:, None] / tau)
     enters = (1.0 - keep) ** 2 * record.command_doubt**2
@@ -201,8 +207,8 @@ def is_applied_certain(record: Record, tau: np.ndarray) -> np.ndarray:
 def measured_channels(log: FlightLog, record: Record, gravity: float) -> dict[str, np.ndarray]:
     """Return what a log measured on the record's rows, by channel; anything in filled rows.
 
-    ``f`` comes from ``a`` where there is no accelerometer, ``p`` only without ``v``. Without ``q`` nothing
-    in the world frame can be compared.
+    ``f`` comes from ``a`` where there is no accelerometer, ``p`` only without ``v``. Without ``q``
+    nothing in the world frame can be compared.
     """
     row = record.source_row
     own = {name: log[name][row] for name in ("w", "q", "v", "v_bat", "f") if name in log}

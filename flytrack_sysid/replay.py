@@ -1,8 +1,9 @@
 """Replaying a flight log through the simulator's own step, row after row.
 
-The measured attitude, velocity, position and voltage are fed in at every row, so that one error in the model
-does not spoil all channels. The applied action, the body rates and the effects' memories follow from the
-commands, which are known exactly. The fit, the validation and the diagnosis all replay logs with ``replay``.
+The measured attitude, velocity, position and voltage are fed in at every row, so that one error in
+the model does not spoil all channels. The applied action, the body rates and the effects' memories
+follow from the commands, which are known exactly. The fit, the validation and the diagnosis all
+replay logs with ``replay``.
 """
 
 from collections.abc import Callable
@@ -65,9 +66,10 @@ def replay(
 ) -> Any:
     """Return what ``observe`` makes of the model's step from every row; differentiable in the model.
 
-    gyro_b: (num_rows, 3) rad/s, with which a flight starts, or every step if ``is_gyro_fed``; without a gyro
-    a flight starts with the rates of the sticks. observe: called with a step and the row's part of
-    ``extras``, a tree of leaves (num_rows, ...). In float64 inside ``jax.enable_x64(True)``.
+    gyro_b: (num_rows, 3) rad/s, with which a flight starts, or every step if ``is_gyro_fed``;
+    without a gyro a flight starts with the rates of the sticks. observe: called with a step and the
+    row's part of ``extras``, a tree of leaves (num_rows, ...). In float64 inside
+    ``jax.enable_x64(True)``.
     """
 
     def next_row(carry: tuple[Any, ...], inputs: tuple[Any, ...]) -> tuple[Any, Any]:
@@ -77,9 +79,12 @@ def replay(
         first_b = body_rates(applied, model.max_rate) if gyro is None else Vec3(*gyro)
         rates_b = first_b if is_gyro_fed else where_true(row.begins, first_b, rates_b)
         before = measured_drone(row, applied, rates_b)
-        # As logged, which it is where a flight begins: past commands then depend on no model of a batch.
+        # As logged, which it is where a flight begins: past commands then depend on no model of a
+        # batch.
         begun = before._replace(applied=Action(*row.applied))
-        memories = where_true(row.begins, start_memories(model.effects, begun, MOST_STEPS), memories)
+        memories = where_true(
+            row.begins, start_memories(model.effects, begun, MOST_STEPS), memories
+        )
         memories = at_row(memories, row.time_s)
         moved = move(before, memories, Action(*row.command), row.step_s, model)
         later = moved.after.applied, moved.after.rates_b, moved.memories

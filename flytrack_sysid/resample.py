@@ -33,7 +33,9 @@ def _brackets(times: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return after - 1, after, is_inside & (is_exact | (times[after] - times[after - 1] <= longest))
 
 
-def interpolate(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def interpolate(
+    times: np.ndarray, values: np.ndarray, at: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return linearly interpolated values (num_at, n) and where they are known, (num_at,) bool.
 
     values: (num_rows, n). Exact at a sample's own time.
@@ -79,11 +81,13 @@ def slow_channels(samples: Mapping[str, Samples]) -> list[str]:
     return found
 
 
-def on_one_base(samples: Mapping[str, Samples], base: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def on_one_base(
+    samples: Mapping[str, Samples], base: np.ndarray
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return channels (num_base, n) at the times of the base, and where all are known, (num_base,) bool.
 
-    Commands are held, attitudes interpolated on the arc, others linearly. The battery changes slowly: its
-    ends are held, and gaps do not matter.
+    Commands are held, attitudes interpolated on the arc, others linearly. The battery changes
+    slowly: its ends are held, and gaps do not matter.
     """
     channels, is_known = {}, np.ones(len(base), bool)
     for name, (times, values) in samples.items():

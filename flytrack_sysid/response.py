@@ -25,9 +25,9 @@ BATCH = 8  # models at once
 def half_response_s(model: ModelParameters, stick_step: float = SMALL_STEP) -> np.ndarray:
     """Return the times from a step of roll, pitch, yaw and thrust to half of the steady change, (4,) s.
 
-    Of the body rates and the thrust, as a drone that moves continuously; its sensors' delays are not in them.
-    NaN where the response takes longer than 1.5 s, or there is none. stick_step: from the centre, which for
-    thrust is half a stick.
+    Of the body rates and the thrust, as a drone that moves continuously; its sensors' delays are
+    not in them. NaN where the response takes longer than 1.5 s, or there is none. stick_step: from
+    the centre, which for thrust is half a stick.
     """
     with jax.enable_x64(True):
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
@@ -52,7 +52,9 @@ def _of_model(model: ModelParameters, stick_step: jax.Array) -> jax.Array:
     dead_s = jnp.stack(jnp.broadcast_arrays(*dead_times(model.effect("command_delay"))))
     others = tuple(one for one in model.effects if not isinstance(one, CommandDelay))
     prompt = model._replace(effects=others, motion=Motion.CONTINUOUS, battery_drain_v_per_min=0.0)
-    return dead_s + jax.vmap(lambda stick: _of_stick(prompt, stick, stick_step))(jnp.eye(ACTION_SIZE))
+    return dead_s + jax.vmap(lambda stick: _of_stick(prompt, stick, stick_step))(
+        jnp.eye(ACTION_SIZE)
+    )
 
 
 def _of_stick(model: ModelParameters, stick: jax.Array, stick_step: jax.Array) -> jax.Array:

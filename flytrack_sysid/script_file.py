@@ -41,9 +41,19 @@ def check_script(script: Script, source: str = "script") -> None:
     """Raise ScriptError unless a script can be flown; the message names source, flight and array."""
     kinds, starts, commands = script
     number, (low, high) = len(kinds), excitation.SCRIPT_HEIGHTS
-    is_shaped = starts.shape == (number, STATE_SIZE) and commands.shape[::2] == (number, ACTION_SIZE)
-    if number == 0 or not is_shaped or commands.ndim != 3 or commands.shape[1] < excitation.FEWEST_STEPS:
-        found = f"{number} kinds, starts of shape {starts.shape}, commands of shape {commands.shape}"
+    is_shaped = starts.shape == (number, STATE_SIZE) and commands.shape[::2] == (
+        number,
+        ACTION_SIZE,
+    )
+    if (
+        number == 0
+        or not is_shaped
+        or commands.ndim != 3
+        or commands.shape[1] < excitation.FEWEST_STEPS
+    ):
+        found = (
+            f"{number} kinds, starts of shape {starts.shape}, commands of shape {commands.shape}"
+        )
         fewest = f"{excitation.FEWEST_STEPS} or more"
         expected = f"(N,), (N, {STATE_SIZE}) and (N, {fewest}, {ACTION_SIZE}), N >= 1"
         raise ScriptError(f"{source}: found {found}, expected {expected}")
@@ -71,7 +81,8 @@ def _are_sticks(values: np.ndarray) -> np.ndarray:
 def save_script(path: str | Path, script: Script) -> None:
     """Write a script to an ``.npz`` file, atomically; the same script gives the same bytes.
 
-    Raises ScriptError for one that ``load_script`` would refuse, OSError for a file that cannot be written.
+    Raises ScriptError for one that ``load_script`` would refuse, OSError for a file that cannot be
+    written.
     """
     check_name(path)
     check_script(script, str(path))
@@ -94,7 +105,9 @@ def load_script(path: str | Path) -> Script:
     for name in Script._fields:
         if name not in arrays or arrays[name].dtype.kind not in ("U" if name == "kinds" else "iuf"):
             found = f"an array of {arrays[name].dtype}" if name in arrays else "none"
-            raise ScriptError(f"{path}: {name}: found {found}, expected texts of kinds, else numbers")
+            raise ScriptError(
+                f"{path}: {name}: found {found}, expected texts of kinds, else numbers"
+            )
     kinds, starts, commands = (arrays[name] for name in Script._fields)
     script = Script(tuple(kinds.ravel().tolist()), starts.astype(float), commands.astype(float))
     check_script(script, str(path))

@@ -33,8 +33,8 @@ def specific_force_b(log: FlightLog, gravity: float) -> np.ndarray:
 def measure(log: FlightLog, level: float, gravity: float, rng: np.random.Generator) -> FlightLog:
     """Return a log as sensors would have written it: noisy, quantised, with rows lost.
 
-    level: 1 for the noise of this module, 0 for none. Accelerations become an accelerometer's specific
-    force, and the applied action, which is not measured, is absent.
+    level: 1 for the noise of this module, 0 for none. Accelerations become an accelerometer's
+    specific force, and the applied action, which is not measured, is absent.
     """
 
     def noisy(values: np.ndarray, noise: float, step: float) -> np.ndarray:

@@ -12,8 +12,8 @@ FEWEST_BLOCKS = 8
 def blocks_of(log: FlightLog) -> np.ndarray:
     """Return the number of the block that each row belongs to, (num_rows,) int, from 0 on.
 
-    A block is a segment, or a piece of a long one: segments are cut evenly into pieces of at most 5 s, and
-    of at most an eighth of the log.
+    A block is a segment, or a piece of a long one: segments are cut evenly into pieces of at most 5
+    s, and of at most an eighth of the log.
     """
     starts = np.flatnonzero(log.is_start())
     durations = log.time[np.append(starts[1:], len(log)) - 1] - log.time[starts]

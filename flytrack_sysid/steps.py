@@ -20,8 +20,9 @@ TIME_ROUNDING_S = 1e-6
 class StepResponse(NamedTuple):
     """One commanded step: the measured body rate, and that of the model flying freely from before it.
 
-    time_s, segment: where in the log. command_before, command_after: in [-1, 1]. since_step: (num_rows,) s.
-    command: (num_rows,). measured, modelled: (num_rows,) rad/s. rms: of their difference, rad/s.
+    time_s, segment: where in the log. command_before, command_after: in [-1, 1]. since_step:
+    (num_rows,) s. command: (num_rows,). measured, modelled: (num_rows,) rad/s. rms: of their
+    difference, rad/s.
     """
 
     axis: str
@@ -48,7 +49,9 @@ def _steps_in(time: np.ndarray, command: np.ndarray) -> np.ndarray:
     return changes[is_step]
 
 
-def _largest_steps(prediction: Prediction, rows: np.ndarray, axis: int) -> list[tuple[int, int, int]]:
+def _largest_steps(
+    prediction: Prediction, rows: np.ndarray, axis: int
+) -> list[tuple[int, int, int]]:
     """Return the largest steps of an axis: first row shown, row of the step, end of the rows shown."""
     found, log = [], prediction.log
     command = log["u"][:, axis]
@@ -68,13 +71,17 @@ def _largest_steps(prediction: Prediction, rows: np.ndarray, axis: int) -> list[
 def step_responses(prediction: Prediction, rows: np.ndarray) -> tuple[StepResponse, ...]:
     """Return the responses to the largest commanded steps of each rate axis.
 
-    rows: (num_rows,) bool, the judged ones. A step is a jump by at least 0.2 between commands that are
-    constant for 0.08 s before and 0.15 s after it.
+    rows: (num_rows,) bool, the judged ones. A step is a jump by at least 0.2 between commands that
+    are constant for 0.08 s before and 0.15 s after it.
     """
     log = prediction.log
     if "w" not in log:
         return ()
-    shown = [(axis, *place) for axis in range(len(AXES)) for place in _largest_steps(prediction, rows, axis)]
+    shown = [
+        (axis, *place)
+        for axis in range(len(AXES))
+        for place in _largest_steps(prediction, rows, axis)
+    ]
     firsts, ends = np.array([(first, end) for _, first, _, end in shown], int).reshape(-1, 2).T
     since_first = np.arange(1, np.max(ends - firsts, initial=1))
     flown = free_flights(prediction, firsts, firsts[:, None] + since_first)

@@ -1,8 +1,8 @@
 """Time stamps as loggers write them, read to one increasing time line.
 
-A stamp is judged by its neighbours on both sides, not by the latest one before it: what does not fit is left
-out, and where the stamps themselves jump, a new segment begins. A stream is a series of rows in the order in
-which they were written, with the stamps of one clock.
+A stamp is judged by its neighbours on both sides, not by the latest one before it: what does not
+fit is left out, and where the stamps themselves jump, a new segment begins. A stream is a series of
+rows in the order in which they were written, with the stamps of one clock.
 """
 
 from collections.abc import Mapping
@@ -13,26 +13,33 @@ import numpy as np
 
 from flytrack_sysid.log import LogError
 
-# Longer steps begin a new segment. 1 s: no window of replay or prediction is longer; 10 steps: batteries and
-# other topics at 1 Hz lose single samples without a pause.
+# Longer steps begin a new segment. 1 s: no window of replay or prediction is longer; 10 steps:
+# batteries and other topics at 1 Hz lose single samples without a pause.
 MAX_GAP_S, MAX_GAP_STEPS = 1.0, 10.0
-# Stamps in a row that are left out between neighbours which fit each other: a tenth of a second at 250 Hz.
+# Stamps in a row that are left out between neighbours which fit each other: a tenth of a second at
+# 250 Hz.
 MAX_STRAY_ROWS = 25
 # Fewer rows between two jumps are strays, not a segment: no estimate can use 10 rows.
 MIN_SEGMENT_ROWS = 10
 MIN_SEGMENT_FRACTION = 0.5  # of the longest one, for streams that have less than 20 rows
-# Rows that stay on both sides of strays have to be as far apart as the rows between them usually are; else
-# the clock was set back, and the rows are further apart than their stamps. 0.9: to pass for strays, a clock
-# that is set back by n rows would need 10 n rows, so more than 2 rows do not pass within MAX_STRAY_ROWS.
+# Rows that stay on both sides of strays have to be as far apart as the rows between them usually
+# are; else the clock was set back, and the rows are further apart than their stamps. 0.9: to pass
+# for strays, a clock that is set back by n rows would need 10 n rows, so more than 2 rows do not
+# pass within MAX_STRAY_ROWS.
 MIN_SPAN_FRACTION = 0.9
 MAX_REORDERED_ROWS = 2  # swapped or repeated rows span less, and move the time by two steps at most
-ROLL_OVERS_S = (2**32 * 1e-6, 2**32 * 1e-3)  # of 32-bit counters of us (71.6 min) and of ms (49.7 days)
+ROLL_OVERS_S = (
+    2**32 * 1e-6,
+    2**32 * 1e-3,
+)  # of 32-bit counters of us (71.6 min) and of ms (49.7 days)
 MAX_UNSET_STEPS = 3.0  # from a first stamp of 0: after a longer step, it meant "not set"
-# Between a sample and its recording: transport takes ms, clocks that count from elsewhere differ by minutes.
+# Between a sample and its recording: transport takes ms, clocks that count from elsewhere differ by
+# minutes.
 MAX_LATENCY_S = 1.0
 # Of a clock that is read: sorted out of more jumps, what remains would be chance.
 MAX_BREAK_FRACTION, MIN_BREAKS = 0.25, 10
-MAX_BATTERY_DISTANCE_S = 60.0  # a pack's voltage changes by less than 0.1 V a cell in a minute at rest
+# a pack's voltage changes by less than 0.1 V a cell in a minute at rest
+MAX_BATTERY_DISTANCE_S = 60.0
 
 
 class Clock(NamedTuple):
@@ -65,7 +72,9 @@ class Clock(NamedTuple):
             count = f"{num_rows - num_used} of {num_rows} rows of {name} left out"
             sentences.append(f"{count}: {', '.join(reasons)}")
         if self.faults[ROLL_OVER]:
-            sentences.append(f"32-bit clock of {name} rolled over {self.faults[ROLL_OVER]} times: unwrapped")
+            sentences.append(
+                f"32-bit clock of {name} rolled over {self.faults[ROLL_OVER]} times: unwrapped"
+            )
         if self.faults[SET_BACK]:
             count = f"clock of {name} set back {self.faults[SET_BACK]} times"
             sentences.append(f"{count}: a new segment begins at each")
@@ -89,9 +98,8 @@ def read_clock(source: str, name: str, stamps: np.ndarray, are_events: bool = Fa
         stamps: in the order in which the rows were written, s, (num_rows,).
         are_events: rows are written when something happens, so that any gap is possible.
 
-    Returns:
-        The clock; rows that are repeated or that do not fit their neighbours are not used. It has at least
-        one row.
+    Returns: The clock; rows that are repeated or that do not fit their neighbours are not used. It
+        has at least one row.
 
     Raises:
         LogError: no stamp is a finite number, or a quarter of them do not fit the one before.
@@ -115,11 +123,15 @@ def read_clock(source: str, name: str, stamps: np.ndarray, are_events: bool = Fa
     if len(breaks) > max(MIN_BREAKS, MAX_BREAK_FRACTION * len(rows)):
         found = f"found {len(breaks)} jumps in {len(rows)} stamps, expected steps of up to {max_gap_s:.3g} s"
         raise LogError(f"{source}: time of {name}: {found}")
-    times, is_kept, is_start, faults[ROLL_OVER] = _join_runs(stamps[rows], breaks, step_s, max_gap_s)
+    times, is_kept, is_start, faults[ROLL_OVER] = _join_runs(
+        stamps[rows], breaks, step_s, max_gap_s
+    )
     num_candidates = len(rows)
     rows, times, piece = rows[is_kept], times[is_kept], np.cumsum(is_start[is_kept]) - 1
     counts = np.bincount(piece)
-    min_rows = 1.0 if are_events else min(float(MIN_SEGMENT_ROWS), MIN_SEGMENT_FRACTION * counts.max())
+    min_rows = (
+        1.0 if are_events else min(float(MIN_SEGMENT_ROWS), MIN_SEGMENT_FRACTION * counts.max())
+    )
     is_long = counts[piece] >= min_rows
     rows, times = rows[is_long], times[is_long]
     faults[STRAY] = num_candidates - len(rows)
@@ -156,9 +168,8 @@ def _join_runs(
         step_s: the usual step.
         max_gap_s: the longest step within a segment.
 
-    Returns:
-        The times without roll-over, s; which rows are kept; which rows begin a piece, (num_rows,) each; and
-        the number of roll-overs.
+    Returns: The times without roll-over, s; which rows are kept; which rows begin a piece,
+        (num_rows,) each; and the number of roll-overs.
     """
     times, is_kept = stamps.copy(), np.ones(len(stamps), bool)
     is_start = np.zeros(len(stamps), bool)
@@ -195,7 +206,9 @@ def _cheapest_joint(
     for roll_s in (0.0, *ROLL_OVERS_S):
         span_s = apart_s + roll_s
         is_steady = span_s >= MIN_SPAN_FRACTION * step_s * rows_apart
-        fits = (span_s > 0.0) & (span_s <= max_gap_s) & (is_steady | (removed <= MAX_REORDERED_ROWS))
+        fits = (
+            (span_s > 0.0) & (span_s <= max_gap_s) & (is_steady | (removed <= MAX_REORDERED_ROWS))
+        )
         cost = np.where(fits, removed, best)
         row, column = np.unravel_index(np.argmin(cost), cost.shape)
         if cost[row, column] < best:
@@ -223,11 +236,15 @@ def put_on_one_line(
         LogError: two streams have no time in common, or were not set back equally often.
     """
     num_epochs = int(clocks[base].epochs[-1]) + 1
-    spacing_s = 2.0 * max(clock.max_gap_s for clock in clocks.values() if np.isfinite(clock.max_gap_s))
+    spacing_s = 2.0 * max(
+        clock.max_gap_s for clock in clocks.values() if np.isfinite(clock.max_gap_s)
+    )
     for name, clock in clocks.items():
         if int(clock.epochs[-1]) + 1 != num_epochs:
             counts = f"{clock.epochs[-1]} times, that of {base} {num_epochs - 1} times"
-            raise LogError(f"{source}: clock of {name}: set back {counts}; which rows belong together?")
+            raise LogError(
+                f"{source}: clock of {name}: set back {counts}; which rows belong together?"
+            )
         distance_s = MAX_BATTERY_DISTANCE_S if name in slow else 0.0
         if np.isfinite(clock.max_gap_s):  # the last event holds until the next
             _check_common(source, name, clock, base, clocks[base], distance_s)
@@ -252,7 +269,9 @@ def _check_common(
             return
     ranges = [f"{times[0]:.6f} to {times[-1]:.6f} s" for times in (clock.times, base_clock.times)]
     found = f"found {ranges[0]}, that of {base} {ranges[1]}"
-    raise LogError(f"{source}: clock of {name}: {found}; expected times in common, counted from one moment")
+    raise LogError(
+        f"{source}: clock of {name}: {found}; expected times in common, counted from one moment"
+    )
 
 
 def number_segments(times: np.ndarray, max_gap_s: float) -> np.ndarray:

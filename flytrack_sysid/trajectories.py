@@ -1,7 +1,8 @@
 """A flight log as trajectories to record: as measured, and as models fly it. Needs ``flytrack[viz]``.
 
-At the measured drone are the specific forces that models do not explain, means over 0.1 s in the world frame.
-A model flies by itself under the logged commands, and starts anew from a measured row every second.
+At the measured drone are the specific forces that models do not explain, means over 0.1 s in the
+world frame. A model flies by itself under the logged commands, and starts anew from a measured row
+every second.
 """
 
 from collections.abc import Mapping
@@ -18,13 +19,21 @@ from flytrack_env.viz_rerun import Trajectory
 from flytrack_sysid.diagnosis.traces import Traces, traces
 from flytrack_sysid.log import IN_STATE, FlightLog, time_in_line
 from flytrack_sysid.parameters import with_neutral_effects
-from flytrack_sysid.prediction import FLOWN, LONGEST_S, Prediction, free_flights, inputs_that_lack, predict
+from flytrack_sysid.prediction import (
+    FLOWN,
+    LONGEST_S,
+    Prediction,
+    free_flights,
+    inputs_that_lack,
+    predict,
+)
 from flytrack_sysid.record import fill_gaps
 
 WINDOW_S = 0.1  # of means: long enough for noise to average out, short beside a manoeuvre
 RESTART_S = 1.0  # of free flight: the horizon of the report's first sentence
 AWAY_M = 10.0  # from the measured path: a model that is farther off has diverged
-# Of one flight: 1 min at 100 Hz. Its path is most of a recording, and grows with the power 1.5 of its rows.
+# Of one flight: 1 min at 100 Hz. Its path is most of a recording, and grows with the power 1.5 of
+# its rows.
 MOST_ROWS = 6000
 
 
@@ -48,18 +57,25 @@ def trajectories_of(
 ) -> list[Trajectory]:
     """Return the trajectories of a log: measured, and one of each model that can fly it.
 
-    models: by the names to show. residuals: of these models (``traces``), if they are known. Of more than
-    6000 rows every n-th is shown. Raises RecordingError for a log without rows or without attitude.
+    models: by the names to show. residuals: of these models (``traces``), if they are known. Of
+    more than 6000 rows every n-th is shown. Raises RecordingError for a log without rows or without
+    attitude.
     """
     if not len(log) or "q" not in log:
         content = f"channels {', '.join(log.channels)}" if len(log) else "no rows"
-        raise RecordingError(f"{log.source}: found {content}, expected q (attitude) to show a flight")
+        raise RecordingError(
+            f"{log.source}: found {content}, expected q (attitude) to show a flight"
+        )
     positions, remark = position_of(log)
     placed = replace(log, channels={**log.channels, "p": positions})
     timed = _Timed(placed, time_in_line(log), -(-len(log) // MOST_ROWS))
     if residuals is None and models:
         residuals = traces(log, models, like=next(iter(models)))
-    forces_w = {} if residuals is None else {name: force_w(residuals, name, timed.time_s) for name in models}
+    forces_w = (
+        {}
+        if residuals is None
+        else {name: force_w(residuals, name, timed.time_s) for name in models}
+    )
     forces_w = {name: one for name, one in forces_w.items() if np.isfinite(one).any()}
     found = [_measured(timed, f"measured{remark}", forces_w)]
     if "p" in log or "v" in log:
@@ -100,7 +116,9 @@ def force_w(residuals: Traces, model: str, time_s: np.ndarray) -> np.ndarray:
     """
     force = np.full((len(time_s), 3), np.nan)
     time_s = time_s[residuals.row]
-    columns, counts = zip(*(residuals.column(model, f"force_world_{axis}") for axis in "xyz"), strict=True)
+    columns, counts = zip(
+        *(residuals.column(model, f"force_world_{axis}") for axis in "xyz"), strict=True
+    )
     parts = np.column_stack([*columns, np.ones(len(time_s))])
     # By duration, so that the noise of velocities cancels between the ends of a window.
     is_judged = counts[0] & np.isfinite(parts).all(axis=1)
@@ -165,22 +183,34 @@ def _free_flight(timed: _Timed, name: str, model: ModelParameters) -> Trajectory
     is_before, rows = rows < ends[:, None], np.minimum(rows, len(log) - 1)
     with np.errstate(over="ignore", invalid="ignore"):
         away_m = np.linalg.norm(states[..., POSITION] - log["p"][rows], axis=-1)
-    is_finite = np.all([np.isfinite(states[..., IN_STATE[one]]).all(axis=-1) for one in FLOWN], axis=0)
+    is_finite = np.all(
+        [np.isfinite(states[..., IN_STATE[one]]).all(axis=-1) for one in FLOWN], axis=0
+    )
     is_near = is_finite & (away_m < AWAY_M)
     is_near[:, 0] = True
     num_diverged = int((is_before & ~is_near).any(axis=1).sum())
     # Measured rows, until the next start or until it diverges.
-    is_shown = is_before & np.logical_and.accumulate(is_near, axis=1) & (filled.source_row[rows] >= 0)
+    is_shown = (
+        is_before & np.logical_and.accumulate(is_near, axis=1) & (filled.source_row[rows] >= 0)
+    )
     is_shown &= steps % timed.every == 0
-    shown, states, restarts = filled.source_row[rows[is_shown]], states[is_shown], is_shown.nonzero()[1] == 0
+    shown, states, restarts = (
+        filled.source_row[rows[is_shown]],
+        states[is_shown],
+        is_shown.nonzero()[1] == 0,
+    )
     if shown[0] > 0:  # begin with the log's first row, so that all have one clock
-        first = states_of({channel: timed.log[channel][:1] for channel in FLOWN if channel in timed.log})
+        first = states_of(
+            {channel: timed.log[channel][:1] for channel in FLOWN if channel in timed.log}
+        )
         shown, restarts = np.append(0, shown), np.append(True, restarts)
         states = np.concatenate([first, states])
     return Trajectory(
         name=name,
         states=states,
-        actions=np.full((len(shown), ACTION_SIZE), np.nan),  # the log's: one line would hide another
+        actions=np.full(
+            (len(shown), ACTION_SIZE), np.nan
+        ),  # the log's: one line would hide another
         time_s=timed.time_s[shown],
         ended=f"the log ends; anew every {RESTART_S:g} s"
         + (f"; diverged {num_diverged} times" if num_diverged else ""),

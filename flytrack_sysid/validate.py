@@ -11,7 +11,13 @@ from flytrack_sysid.log_motion import motion_notes, required_motion
 from flytrack_sysid.log_voltage import voltage_notes
 from flytrack_sysid.prediction import Prediction, predict
 from flytrack_sysid.record import fill_gaps
-from flytrack_sysid.steps import HELD_AFTER_S, HELD_BEFORE_S, LEAST_JUMP, StepResponse, step_responses
+from flytrack_sysid.steps import (
+    HELD_AFTER_S,
+    HELD_BEFORE_S,
+    LEAST_JUMP,
+    StepResponse,
+    step_responses,
+)
 
 NAMES = {
     "p": "position",
@@ -26,10 +32,10 @@ NAMES = {
 class Validation(NamedTuple):
     """Errors of a model on the judged rows of a log.
 
-    num_rows, num_judged: rows of the log, and those that were judged. one_step: errors of single steps.
-    rollouts: errors of free flight, by its length. steps: responses to commanded steps.
-    notes: sentences on what could not be judged and why, and on what was assumed.
-    thrust: None where the log has no measurement of it.
+    num_rows, num_judged: rows of the log, and those that were judged. one_step: errors of single
+    steps. rollouts: errors of free flight, by its length. steps: responses to commanded steps.
+    notes: sentences on what could not be judged and why, and on what was assumed. thrust: None
+    where the log has no measurement of it.
     """
 
     num_rows: int
@@ -65,7 +71,9 @@ def _json_of(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _json_of(item) for name, item in value.items()}
     if isinstance(value, (tuple, list, np.ndarray)):
-        return [_json_of(item) for item in (value.tolist() if isinstance(value, np.ndarray) else value)]
+        return [
+            _json_of(item) for item in (value.tolist() if isinstance(value, np.ndarray) else value)
+        ]
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
@@ -75,7 +83,9 @@ def _notes_of(prediction: Prediction) -> list[str]:
     for name, lacking in prediction.lacking.items():
         if name in log and lacking:
             verb = "is" if len(lacking) == 1 else "are"
-            notes.append(f"{NAMES[name]} ({name}): not judged; {', '.join(lacking)} {verb} not in the log")
+            notes.append(
+                f"{NAMES[name]} ({name}): not judged; {', '.join(lacking)} {verb} not in the log"
+            )
         elif name not in log and name not in ("a", "f"):
             notes.append(f"{NAMES[name]} ({name}): not in the log")
     if "a" not in log and "f" not in log:
@@ -97,15 +107,19 @@ def _notes_of(prediction: Prediction) -> list[str]:
 def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = None) -> Validation:
     """Return the errors of a model on a log, from the measured states under the logged commands.
 
-    rows: (num_rows,) bool, the judged ones (``split.held_out_rows``); all if None. Other rows are used only
-    for the applied action and the memories of effects. A measured log is replayed continuously, whatever the
-    model says, and a note says so.
+    rows: (num_rows,) bool, the judged ones (``split.held_out_rows``); all if None. Other rows are
+    used only for the applied action and the memories of effects. A measured log is replayed
+    continuously, whatever the model says, and a note says so.
     """
     rows = np.ones(len(log), bool) if rows is None else np.asarray(rows)
     if rows.shape != (len(log),) or rows.dtype != bool:
-        raise ValueError(f"rows: found {rows.dtype} of shape {rows.shape}, expected bool of ({len(log)},)")
+        raise ValueError(
+            f"rows: found {rows.dtype} of shape {rows.shape}, expected bool of ({len(log)},)"
+        )
     num_rows, num_judged = len(log), int(rows.sum())
-    contradictions = motion_notes(log, model, None, f"replayed as the model says ({model.motion.value})")
+    contradictions = motion_notes(
+        log, model, None, f"replayed as the model says ({model.motion.value})"
+    )
     model = model._replace(motion=required_motion(log) or model.motion)
     contradictions += voltage_notes(log, model.battery)
     filled = fill_gaps(log)

@@ -120,7 +120,9 @@ def text_of(validation: Validation, model_name: str, log: FlightLog) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def html_of(validation: Validation, model_name: str, log: FlightLog, pictures: dict[str, bytes]) -> str:
+def html_of(
+    validation: Validation, model_name: str, log: FlightLog, pictures: dict[str, bytes]
+) -> str:
     """Return a validation as a self-contained page; pictures: PNG files by figure's name."""
     tables = _tables(validation)
     sections = []
@@ -132,18 +134,28 @@ def html_of(validation: Validation, model_name: str, log: FlightLog, pictures: d
         sections.append(Section(heading, parts or [Text("Not judged; see the notes.")]))
     introduction: list[Any] = [Text(_head(validation, model_name, log))]
     if validation.notes:
-        introduction += [Text("What the log lacks, and what was assumed:"), Bullets(validation.notes)]
+        introduction += [
+            Text("What the log lacks, and what was assumed:"),
+            Bullets(validation.notes),
+        ]
     return page(f"Validation of {model_name}", sections, introduction)
 
 
-def write_validation(out: str | Path, validation: Validation, model_name: str, log: FlightLog) -> list[Path]:
+def write_validation(
+    out: str | Path, validation: Validation, model_name: str, log: FlightLog
+) -> list[Path]:
     """Write validation.json, .txt and .html and the figures into a folder; return their paths.
 
     Everything is computed before the first file is written.
     """
     figures = {"steps": draw_steps(validation.steps), "thrust": draw_thrust(validation.thrust)}
     pictures = {name: png_of(figure) for name, figure in figures.items()}
-    numbers = {"model": model_name, "log": log.source, "log_sha256": log.sha256, **validation.as_json()}
+    numbers = {
+        "model": model_name,
+        "log": log.source,
+        "log_sha256": log.sha256,
+        **validation.as_json(),
+    }
     document = json.dumps(numbers, indent=1, allow_nan=False) + "\n"
     files = {
         "validation.json": document.encode(),

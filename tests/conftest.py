@@ -21,7 +21,8 @@ MEMORY_MAPS, MOST_MEMORY_MAPS = Path("/proc/self/maps"), 25_000
 def few_programs_at_a_time():
     """Forget compiled programs before the process has more memory maps than the system allows.
 
-    A compiled program takes some maps, Linux allows 65,530 a process, and XLA aborts where it gets none.
+    A compiled program takes some maps, Linux allows 65,530 a process, and XLA aborts where it gets
+    none.
     """
     yield
     if MEMORY_MAPS.exists() and MEMORY_MAPS.read_bytes().count(b"\n") > MOST_MEMORY_MAPS:
@@ -49,7 +50,9 @@ def trainer() -> Any:
 
 
 @pytest.fixture(scope="module")
-def whole(trainer: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
+def whole(
+    trainer: Any, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, dict[str, np.ndarray]]:
     """A training run that nothing cut off: its folder and its metrics."""
     from tests.support.ppo_runs import EVERY_OTHER_UPDATE, SEED
 

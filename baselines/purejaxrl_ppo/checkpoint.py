@@ -1,7 +1,7 @@
 """Checkpoints: a policy, all that is needed to fly it and, in a run, all that training needs to continue.
 
-A checkpoint is a safetensors file: arrays named ``policy.*`` and ``training.*``, and in the header a JSON
-description and a SHA-256 checksum of description and arrays. Nothing in it is executed.
+A checkpoint is a safetensors file: arrays named ``policy.*`` and ``training.*``, and in the header
+a JSON description and a SHA-256 checksum of description and arrays. Nothing in it is executed.
 """
 
 import dataclasses
@@ -41,7 +41,10 @@ STEP_FILE = re.compile(rf"step_(\d+)\{SUFFIX}")
 REWARD = "reward."  # prefix of the reward's weights among the environment's parameters
 # What a run that continues must have in common with its checkpoint, beside its configuration.
 SAME_RUN = ("env_id", "seed", "missed_gate", "observation", "track_data", "model", "environment")
-WORDING = ("name", "unit")  # fields of a row of an observation that are for people, and may be reworded
+WORDING = (
+    "name",
+    "unit",
+)  # fields of a row of an observation that are for people, and may be reworded
 
 Arrays = dict[str, np.ndarray]
 logger = logging.getLogger(__name__)
@@ -74,15 +77,10 @@ class _Progress(msgspec.Struct):
 class Checkpoint(NamedTuple):
     """A trained policy and, in a run, the state of its training.
 
-    Attributes:
-        params: of the network.
-        config: of the training.
-        env_id: what it was trained on.
-        track: what it was trained on, a name or the path of a file.
-        observation_size: of the network's input.
-        meta: the whole description as stored.
-        training: named arrays of the rest of the training's state (optimizer, environments, random keys);
-            None for a policy alone.
+    Attributes: params: of the network. config: of the training. env_id: what it was trained on.
+        track: what it was trained on, a name or the path of a file. observation_size: of the
+        network's input. meta: the whole description as stored. training: named arrays of the rest
+        of the training's state (optimizer, environments, random keys); None for a policy alone.
         path: of its file.
     """
 
@@ -146,7 +144,9 @@ def find_differences(found: Any, expected: Any) -> list[str]:
     found, expected, lines = flatten(found), flatten(expected), []
     for name in sorted({**expected, **found}, key=lambda name: name.count(".")):
         if found.get(name) != expected.get(name):
-            values = (quote_value(tree[name]) if name in tree else "nothing" for tree in (found, expected))
+            values = (
+                quote_value(tree[name]) if name in tree else "nothing" for tree in (found, expected)
+            )
             lines.append("{}: found {}, expected {}".format(quote_name(name), *values))
     return lines
 
@@ -167,7 +167,9 @@ def _is_key(leaf: Any) -> bool:
 def as_named_arrays(tree: Any) -> Arrays:
     """Return the leaves of a tree by their dotted paths, bit for bit; random keys as their integers."""
     return {
-        name: np.asarray(jax.random.key_data(leaf) if isinstance(leaf, jax.Array) and _is_key(leaf) else leaf)
+        name: np.asarray(
+            jax.random.key_data(leaf) if isinstance(leaf, jax.Array) and _is_key(leaf) else leaf
+        )
         for name, leaf in flatten(tree).items()
     }
 
@@ -175,10 +177,8 @@ def as_named_arrays(tree: Any) -> Arrays:
 def from_named_arrays(where: Any, arrays: Arrays, target: Any) -> Any:
     """Return named arrays as a tree.
 
-    Args:
-        where: the file, for the message.
-        arrays: as ``as_named_arrays`` returns them; random keys are of JAX's default implementation.
-        target: the tree, of shapes and types.
+    Args: where: the file, for the message. arrays: as ``as_named_arrays`` returns them; random keys
+        are of JAX's default implementation. target: the tree, of shapes and types.
 
     Raises:
         CheckpointError: leaves that are missing, superfluous, or of another shape or type.
@@ -189,7 +189,9 @@ def from_named_arrays(where: Any, arrays: Arrays, target: Any) -> Any:
         array = jax.eval_shape(jax.random.key_data, array) if _is_key(array) else array
         return f"{np.dtype(array.dtype)} of shape {array.shape}"
 
-    found, expected = ({name: describe(leaf) for name, leaf in tree.items()} for tree in (arrays, leaves))
+    found, expected = (
+        {name: describe(leaf) for name, leaf in tree.items()} for tree in (arrays, leaves)
+    )
     check_equal(where, found, expected)
     values = (jnp.asarray(arrays[name]) for name in leaves)
     restored = [
@@ -209,16 +211,17 @@ def checksum(text: str, arrays: Arrays) -> str:
 
 
 def save_checkpoint(
-    path: str | Path, params: Any, config: Config, description: dict[str, Any], training: Arrays | None = None
+    path: str | Path,
+    params: Any,
+    config: Config,
+    description: dict[str, Any],
+    training: Arrays | None = None,
 ) -> None:
     """Write a checkpoint atomically.
 
-    Args:
-        path: of the file.
-        params: of the network.
-        config: of the training.
-        description: JSON values; needs env_id, track, missed_gate and observation_size, may hold more.
-        training: named arrays of what else training needs to continue; None: the file is a policy alone.
+    Args: path: of the file. params: of the network. config: of the training. description: JSON
+        values; needs env_id, track, missed_gate and observation_size, may hold more. training:
+        named arrays of what else training needs to continue; None: the file is a policy alone.
 
     Raises:
         OSError: the file cannot be written.
@@ -227,8 +230,12 @@ def save_checkpoint(
     text = json.dumps({**meta, "config": config.as_json()})
     arrays = {POLICY + name: array for name, array in as_named_arrays(params).items()}
     arrays |= {TRAINING + name: array for name, array in (training or {}).items()}
-    arrays = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in arrays.items()}
-    write_atomically(path, safetensors.numpy.save(arrays, {"meta": text, "sha256": checksum(text, arrays)}))
+    arrays = {
+        name: np.ascontiguousarray(array).reshape(array.shape) for name, array in arrays.items()
+    }
+    write_atomically(
+        path, safetensors.numpy.save(arrays, {"meta": text, "sha256": checksum(text, arrays)})
+    )
 
 
 def save_run(path: Path, runner: Runner, config: Config, description: dict[str, Any]) -> None:
@@ -241,9 +248,8 @@ def save_run(path: Path, runner: Runner, config: Config, description: dict[str, 
 def load_checkpoint(path: str | Path) -> Checkpoint:
     """Return the checkpoint in a file.
 
-    Raises:
-        CheckpointError: missing or damaged file, another format, or parameters that do not belong to the
-            network that the file describes.
+    Raises: CheckpointError: missing or damaged file, another format, or parameters that do not
+            belong to the network that the file describes.
     """
     path = Path(path)
     if path.is_dir():
@@ -258,7 +264,9 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     except CheckpointError:
         raise
     except (safetensors.SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"{path}: not a checkpoint, or damaged: {error_text(error)}") from error
+        raise CheckpointError(
+            f"{path}: not a checkpoint, or damaged: {error_text(error)}"
+        ) from error
 
 
 def _decode(path: Path, content: bytes) -> Checkpoint:
@@ -278,7 +286,11 @@ def _decode(path: Path, content: bytes) -> Checkpoint:
     observation = jax.ShapeDtypeStruct((1, description.observation_size), jnp.float32)
     target = jax.eval_shape(make_network(config).init, jax.random.key(0), observation)
     policy, training = (
-        {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+        {
+            name.removeprefix(prefix): array
+            for name, array in arrays.items()
+            if name.startswith(prefix)
+        }
         for prefix in (POLICY, TRAINING)
     )
     for name, array in policy.items():
@@ -320,9 +332,9 @@ def describe_run(env: Any, env_id: str, track: str, config: Config, seed: int) -
         config: of the training.
         seed: of the training.
 
-    Returns:
-        ``environment`` holds rewards, starts, time step and wrappers by their paths. ``machine`` holds what
-        decides the last bits of a result: XLA splits sums by the number of its threads.
+    Returns: ``environment`` holds rewards, starts, time step and wrappers by their paths.
+        ``machine`` holds what decides the last bits of a result: XLA splits sums by the number of
+        its threads.
     """
     params = env.default_params
     others = as_named_arrays(params.replace(model=None, course=None))
@@ -378,8 +390,8 @@ def restore_runner(start: Checkpoint, target: Runner) -> Runner:
 def newest_intact(path: Path) -> Checkpoint:
     """Return the checkpoint in a file, or the newest intact one in a folder, to continue from.
 
-    Raises:
-        CheckpointError: a file that cannot be used, a folder without an intact one, or a policy alone.
+    Raises: CheckpointError: a file that cannot be used, a folder without an intact one, or a policy
+        alone.
     """
     candidates = checkpoints_in(path) if path.is_dir() else [path]
     if not candidates:
@@ -396,8 +408,8 @@ def newest_intact(path: Path) -> Checkpoint:
 def _load_start(path: Path) -> Checkpoint:
     """Return a checkpoint that training can continue from.
 
-    Raises:
-        CheckpointError: a policy alone, or fields that are used before they are compared with the run.
+    Raises: CheckpointError: a policy alone, or fields that are used before they are compared with
+        the run.
     """
     start = load_checkpoint(path)
     if start.training is None:

@@ -24,10 +24,12 @@ from flytrack_env.plants import Plant
 from flytrack_env.tracks import Track
 from flytrack_env.wrappers import DomainRandomization, RandomizationParams
 
-MODEL_AS_GIVEN = RandomizationParams(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, low=(), high=())  # all factors are 1
+MODEL_AS_GIVEN = RandomizationParams(
+    1.0, 1.0, 1.0, 1.0, 1.0, 1.0, low=(), high=()
+)  # all factors are 1
 NUM_DRAWS = 7  # drag on three axes, thrust, wind and where it blows, delay
-# Drawn uniformly; what the robust baseline must tolerate. The drag is added to the model's on each body axis
-# independently, the wind from any direction, and the delay; the thrust is multiplied.
+# Drawn uniformly; what the robust baseline must tolerate. The drag is added to the model's on each
+# body axis independently, the wind from any direction, and the delay; the thrust is multiplied.
 RANGES = {
     "quadratic_drag_per_m": (0.0, 0.02),
     "thrust_scale": (0.88, 1.05),
@@ -60,11 +62,13 @@ def plant_env(
     return env
 
 
-def simulated_env(checkpoint: Checkpoint, track: str | Path | Track | None = None) -> EpisodicEnvironment:
+def simulated_env(
+    checkpoint: Checkpoint, track: str | Path | Track | None = None
+) -> EpisodicEnvironment:
     """Return the checkpoint's environment with the simulator and the model that it was trained on.
 
-    Raises:
-        CheckpointError, TrackError: a file that cannot be used, a checkpoint that does not hold its model.
+    Raises: CheckpointError, TrackError: a file that cannot be used, a checkpoint that does not hold
+        its model.
     """
     if "model" not in checkpoint.meta:
         raise CheckpointError("checkpoint: model: found none, expected the one it was trained on")
@@ -97,9 +101,8 @@ def with_model_as_given(params: EnvParams) -> EnvParams:
 class Plants(NamedTuple):
     """Drawn plants.
 
-    Attributes:
-        models: leaves (num_plants, ...).
-        drawn: values by the names of ``RANGES``, (num_plants,) each; of the drag, the mean of the three axes.
+    Attributes: models: leaves (num_plants, ...). drawn: values by the names of ``RANGES``,
+        (num_plants,) each; of the drag, the mean of the three axes.
     """
 
     models: ModelParameters
@@ -126,7 +129,9 @@ def draw_model(key: jax.Array, model: ModelParameters) -> ModelParameters:
     return make_plant(model, jax.random.uniform(key, (NUM_DRAWS,)))[0]
 
 
-def make_plant(model: ModelParameters, uniform: Any) -> tuple[ModelParameters, dict[str, jax.Array]]:
+def make_plant(
+    model: ModelParameters, uniform: Any
+) -> tuple[ModelParameters, dict[str, jax.Array]]:
     """Return a plant around a model: drag, wind and delay are added, and the thrust is multiplied.
 
     Args:
@@ -148,7 +153,10 @@ def make_plant(model: ModelParameters, uniform: Any) -> tuple[ModelParameters, d
     thrust, delay = model.effect("thrust_scale"), model.effect("command_delay")
     changed = model.with_effects(
         _clipped(
-            drag, k_x=drag.k_x + drag_per_m[0], k_y=drag.k_y + drag_per_m[1], k_z=drag.k_z + drag_per_m[2]
+            drag,
+            k_x=drag.k_x + drag_per_m[0],
+            k_y=drag.k_y + drag_per_m[1],
+            k_z=drag.k_z + drag_per_m[2],
         ),
         _clipped(
             wind,
@@ -158,11 +166,15 @@ def make_plant(model: ModelParameters, uniform: Any) -> tuple[ModelParameters, d
         _clipped(thrust, factor=thrust.factor * thrust_scale),
         _clipped(delay, delay_s=delay.delay_s + delay_s),
     )
-    return changed, dict(zip(RANGES, (drag_per_m.mean(), thrust_scale, wind_m_s, delay_s), strict=True))
+    return changed, dict(
+        zip(RANGES, (drag_per_m.mean(), thrust_scale, wind_m_s, delay_s), strict=True)
+    )
 
 
 def _clipped(parameters: Any, **values: jax.Array) -> Any:
     """Return an effect's parameters with new values, clipped to its ranges."""
     ranges = effect_of(parameters).ranges
-    clipped = {name: jnp.clip(value, ranges[name].low, ranges[name].high) for name, value in values.items()}
+    clipped = {
+        name: jnp.clip(value, ranges[name].low, ranges[name].high) for name, value in values.items()
+    }
     return parameters._replace(**clipped)

@@ -49,7 +49,8 @@ NonNegativeFloat = Annotated[float, Meta(ge=0, le=MAX_FLOAT)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 
 
-# What --help shows of flags that may be left out; tyro's own would be {None}|PATH and (default: None).
+# What --help shows of flags that may be left out; tyro's own would be {None}|PATH and (default:
+# None).
 OPTIONAL = "(optional)"
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint=OPTIONAL)]
 OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint=OPTIONAL)]
@@ -68,10 +69,12 @@ class Config:
     """Steps of every environment per update."""
     episode_steps: PositiveInt = 200
     """Time limit of training episodes, in environment steps. Long ones spend most experience on the one
-    line that the policy flies already, and a policy that knows nothing beside it fails on another plant."""
+    line that the policy flies already, and a policy that knows nothing beside it fails on another
+    plant."""
     gate_margin: NonNegativeFloat = 0.15
     """Metres by which the drone is thicker, to every side, in training than in the race. A policy that
-    uses the whole opening is perfect in the simulator and crashes where the plant differs a little."""
+    uses the whole opening is perfect in the simulator and crashes where the plant differs a
+    little."""
     update_epochs: PositiveInt = 1
     """Passes over the collected batch per update. Gradients are nearly all of the time that training takes,
     so that one pass in many small steps gets further in a second than several in larger ones."""
@@ -153,7 +156,9 @@ class Config:
                 f"{config.batch_size} steps (num_envs x num_steps)"
             )
         is_by_env = config.memory_size > 0
-        rows, what = (config.num_envs, "environments") if is_by_env else (config.batch_size, "steps")
+        rows, what = (
+            (config.num_envs, "environments") if is_by_env else (config.batch_size, "steps")
+        )
         if rows % config.num_minibatches:
             raise ConfigError(
                 f"num_minibatches: found {config.num_minibatches}, expected a divisor of the {rows} {what} "
@@ -165,13 +170,15 @@ class Config:
 def read_config(where: str, values: Any) -> Config:
     """Read a configuration from a TOML or JSON object; fields that it lacks have their defaults.
 
-    Raises:
-        ConfigError: not an object, an unknown field, or a value of another type or out of its range.
+    Raises: ConfigError: not an object, an unknown field, or a value of another type or out of its
+        range.
     """
     names = [field.name for field in dataclasses.fields(Config)]
     for name in values if isinstance(values, dict) else ():
         if name not in names:
-            raise ConfigError(f"{where}: {quote_name(name)}: unknown; expected one of {', '.join(names)}")
+            raise ConfigError(
+                f"{where}: {quote_name(name)}: unknown; expected one of {', '.join(names)}"
+            )
     try:
         return convert(where, values, Config)
     except ValueError as error:

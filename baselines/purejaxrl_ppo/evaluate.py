@@ -106,7 +106,9 @@ class EvaluationSettings:
     def check(self) -> None:
         """Raise ValueError, naming the flag, for settings that cannot be used."""
         if self.plants is not None and self.black_box is not None:
-            raise ValueError(f"--plants: found --black-box {self.black_box} as well, expected one of the two")
+            raise ValueError(
+                f"--plants: found --black-box {self.black_box} as well, expected one of the two"
+            )
         limits = {
             "steps": (1, MAX_STEPS),
             "episodes": (1, MAX_FLIGHTS),
@@ -211,7 +213,9 @@ class Report:
             "env_id": self.checkpoint.env_id,
             "track": self.env.track.name,
             "gates_per_lap": len(self.env.track.gates),
-            "black_box": None if plants is not None else str(settings.black_box or blackbox.SHIPPED),
+            "black_box": None
+            if plants is not None
+            else str(settings.black_box or blackbox.SHIPPED),
             "seed": settings.seed,
             "steps_limit": settings.steps,
             "laps": settings.num_laps,
@@ -261,7 +265,9 @@ class Report:
         lines = [f"rollout: {rollout}"]
         if settings.ghost and self.references is not None:
             ghost = ghost_path(rollout)
-            save_rollout(ghost, *ghost_rollout(self.references, self.numbers["first_flight"]["steps"]))
+            save_rollout(
+                ghost, *ghost_rollout(self.references, self.numbers["first_flight"]["steps"])
+            )
             lines.append(f"ghost: {ghost}")
         if settings.rrd is not None:
             shown = ", ".join(self.record(settings.rrd, with_ghost=settings.ghost))
@@ -277,8 +283,8 @@ class Report:
     def record(self, path: Path, with_ghost: bool) -> list[str]:
         """Write a Rerun recording of the first flight, and return the names of the flights in it.
 
-        Beside it is the flight from the same start in the simulator with the model that the policy was
-        trained on: it shows what that simulator gets wrong.
+        Beside it is the flight from the same start in the simulator with the model that the policy
+        was trained on: it shows what that simulator gets wrong.
 
         Args:
             path: of the recording.

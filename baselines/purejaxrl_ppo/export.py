@@ -1,9 +1,10 @@
 """Write a policy for the drone itself: ``flytrack export CHECKPOINT --c policy.h``.
 
-The files take the drone's state and the gate to fly, and give the stick commands (docs/export.md), as the
-evaluator computes them: observation before the gate, network, mean action, clipped to [-1, 1]. Noise of
-sensors and drawn models are of the environment, and no part of it. ``policy_template.h`` is the text of a C99
-header without dependencies, ``policy_template.onnxtxt`` that of an ONNX graph for any number of drones.
+The files take the drone's state and the gate to fly, and give the stick commands (docs/export.md),
+as the evaluator computes them: observation before the gate, network, mean action, clipped to [-1,
+1]. Noise of sensors and drawn models are of the environment, and no part of it.
+``policy_template.h`` is the text of a C99 header without dependencies, ``policy_template.onnxtxt``
+that of an ONNX graph for any number of drones.
 """
 
 import dataclasses
@@ -44,7 +45,10 @@ PAST = {  # what a policy that reads earlier actions has besides
         observation[FLYTRACK_OF_DRONE + 6 + i] = past[i];
     }""",
 }
-OF_NEXT_GATE = ("next_gate", "next_direction")  # the last entries of OBSERVATION, which no state changes
+OF_NEXT_GATE = (
+    "next_gate",
+    "next_direction",
+)  # the last entries of OBSERVATION, which no state changes
 OF_DRONE = tuple(entry for entry in OBSERVATION if entry.key not in OF_NEXT_GATE)
 KINDS_OF_PAST = ("commanded", "applied")
 SENTENCES = {
@@ -72,19 +76,15 @@ SENTENCES = {
 class ExportedPolicy(NamedTuple):
     """A policy as arrays, float64, and what its files say about it.
 
-    Attributes:
-        centres: of the gates, world, (num_gates, 3), m.
-        frames: of the gates, rows forward, left, up, world, (num_gates, 3, 3).
-        free: half of the opening less the drone's radius, (num_gates,), m.
-        next_rows: rows of the observation about the gate after the next, (num_gates, 6).
-        offsets: of the rows before these, (23,): clip((quantity - offset) * factor, -limit, limit).
-        factors: as ``offsets``.
-        limits: as ``offsets``.
-        past: entries of earlier actions, behind ``next_rows``.
-        layers: kernel (num_inputs, num_outputs) and bias; tanh between layers.
-        blend: share of the way to the command that the lags of the checkpoint's model go in a step, (4,).
-        about: sentences about the policy.
-        meanings: of inputs and output, by name.
+    Attributes: centres: of the gates, world, (num_gates, 3), m. frames: of the gates, rows forward,
+        left, up, world, (num_gates, 3, 3). free: half of the opening less the drone's radius,
+        (num_gates,), m. next_rows: rows of the observation about the gate after the next,
+        (num_gates, 6). offsets: of the rows before these, (23,): clip((quantity - offset) * factor,
+        -limit, limit). factors: as ``offsets``. limits: as ``offsets``. past: entries of earlier
+        actions, behind ``next_rows``. layers: kernel (num_inputs, num_outputs) and bias; tanh
+        between layers. blend: share of the way to the command that the lags of the checkpoint's
+        model go in a step, (4,). about: sentences about the policy. meanings: of inputs and output,
+        by name.
     """
 
     centres: np.ndarray
@@ -109,9 +109,9 @@ class ExportedPolicy(NamedTuple):
 def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> ExportedPolicy:
     """Return the policy of a checkpoint on a track, by default its own; name: of the checkpoint's file.
 
-    Raises:
-        CheckpointError, TrackError: a checkpoint that does not fit its environment, whose policy remembers,
-            or whose observation has rows that cannot be exported; a track that cannot be used.
+    Raises: CheckpointError, TrackError: a checkpoint that does not fit its environment, whose
+            policy remembers, or whose observation has rows that cannot be exported; a track that
+            cannot be used.
     """
     if checkpoint.config.memory_size:
         raise CheckpointError(
@@ -145,7 +145,9 @@ def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> Ex
     middle_v, half_v = battery.voltage(0.5), 0.5 * (battery.full_v - battery.empty_v)
     return ExportedPolicy(
         **_gates(params),
-        offsets=np.repeat([middle_v if entry.key == "battery" else 0.0 for entry in OF_DRONE], sizes),
+        offsets=np.repeat(
+            [middle_v if entry.key == "battery" else 0.0 for entry in OF_DRONE], sizes
+        ),
         factors=np.repeat(
             [1.0 / (half_v if entry.key == "battery" else entry.scale) for entry in OF_DRONE], sizes
         ),
@@ -154,7 +156,9 @@ def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> Ex
         layers=_layers(checkpoint),
         blend=1.0 - np.exp(-params.dt / np.asarray(params.model.tau, float)),
         about=f"FlyTrack {flytrack_env.__version__}: policy of {name}, track {env.track.name}, {rate}.",
-        meanings={key: text.format(**words) for key, text in SENTENCES.items() if past or key != "past"},
+        meanings={
+            key: text.format(**words) for key, text in SENTENCES.items() if past or key != "past"
+        },
     )
 
 
@@ -182,9 +186,12 @@ def _gates(params: EnvParams) -> dict[str, np.ndarray]:
 def _layers(checkpoint: Checkpoint) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     """Return the actor's layers, with the initial action in the last bias."""
     tower = checkpoint.params["params"]["actor_tower"]
-    names = takewhile(tower.__contains__, (f"layers_{2 * i}" for i in count()))  # tanh has the odd numbers
+    names = takewhile(
+        tower.__contains__, (f"layers_{2 * i}" for i in count())
+    )  # tanh has the odd numbers
     layers = [
-        (np.asarray(tower[name]["kernel"], float), np.asarray(tower[name]["bias"], float)) for name in names
+        (np.asarray(tower[name]["kernel"], float), np.asarray(tower[name]["bias"], float))
+        for name in names
     ]
     kernel, bias = layers[-1]
     return (*layers[:-1], (kernel, bias + checkpoint.config.initial_action))
@@ -195,16 +202,25 @@ def c_of(policy: ExportedPolicy) -> bytes:
     tables, calls = [], []
     for i, (kernel, bias) in enumerate(policy.layers):
         inputs, outputs = kernel.shape
-        for name, size, array in (("kernel", f"{outputs} * {inputs}", kernel.T), ("bias", outputs, bias)):
-            tables.append(f"static const float flytrack_{name}_{i}[{size}] = {{\n{_numbers(array)}\n}};")
-        arguments = f"flytrack_kernel_{i}, flytrack_bias_{i}, {inputs}, {outputs}, layer_{i}, layer_{i + 1}"
+        for name, size, array in (
+            ("kernel", f"{outputs} * {inputs}", kernel.T),
+            ("bias", outputs, bias),
+        ):
+            tables.append(
+                f"static const float flytrack_{name}_{i}[{size}] = {{\n{_numbers(array)}\n}};"
+            )
+        arguments = (
+            f"flytrack_kernel_{i}, flytrack_bias_{i}, {inputs}, {outputs}, layer_{i}, layer_{i + 1}"
+        )
         calls += [f"float layer_{i + 1}[{outputs}];", f"flytrack_layer({arguments});"]
         calls.append(f"flytrack_tanh({outputs}, layer_{i + 1});")
     text = Template((FOLDER / "policy_template.h").read_text(encoding="utf-8")).substitute(
         {name: _numbers(getattr(policy, name)) for name in NAMES},
         **(PAST if policy.past else dict.fromkeys(PAST, "")),
         about=_comment(policy.about).removeprefix(" * "),
-        meanings="\n".join(" *\n" + _comment(f"{name}: {text}") for name, text in policy.meanings.items()),
+        meanings="\n".join(
+            " *\n" + _comment(f"{name}: {text}") for name, text in policy.meanings.items()
+        ),
         state_size=STATE_SIZE,
         num_gates=len(policy.centres),
         num_past=policy.num_past,
@@ -226,7 +242,9 @@ def _numbers(array: np.ndarray) -> str:
 
 def _comment(text: str) -> str:
     """Return text as lines inside a comment, which nothing in it can end."""
-    return textwrap.fill(text.replace("*/", "* /"), WIDTH, initial_indent=" * ", subsequent_indent=" * ")
+    return textwrap.fill(
+        text.replace("*/", "* /"), WIDTH, initial_indent=" * ", subsequent_indent=" * "
+    )
 
 
 def onnx_of(policy: ExportedPolicy, is_float64: bool = False) -> bytes:
@@ -244,7 +262,9 @@ def onnx_of(policy: ExportedPolicy, is_float64: bool = False) -> bytes:
     arrays |= {"rotation_of_products": rotation_of_products(), "identity": np.eye(3).ravel()}
     arrays["highest"] = np.array(1.0)
     lines = [f"real_past = Cast <to = {real}> (past)"] if policy.past else []
-    lines += [f"layer_0 = Concat <axis = 1> (clipped, next_gate{', real_past' if policy.past else ''})"]
+    lines += [
+        f"layer_0 = Concat <axis = 1> (clipped, next_gate{', real_past' if policy.past else ''})"
+    ]
     for i, (kernel, bias) in enumerate(policy.layers):
         arrays |= {f"kernel_{i}": kernel, f"bias_{i}": bias}
         lines.append(f"sum_{i} = Gemm (layer_{i}, kernel_{i}, bias_{i})")
@@ -259,7 +279,9 @@ def onnx_of(policy: ExportedPolicy, is_float64: bool = False) -> bytes:
     )
     model = onnx.parser.parse_model(text)
     dtype = np.float64 if is_float64 else np.float32
-    tensors = (onnx.numpy_helper.from_array(array.astype(dtype), name) for name, array in arrays.items())
+    tensors = (
+        onnx.numpy_helper.from_array(array.astype(dtype), name) for name, array in arrays.items()
+    )
     model.graph.initializer.extend(tensors)
     model.producer_name, model.doc_string = "flytrack", policy.about
     for value in (*model.graph.input, *model.graph.output):
@@ -271,7 +293,8 @@ def onnx_of(policy: ExportedPolicy, is_float64: bool = False) -> bytes:
 def rotation_of_products() -> np.ndarray:
     """Return the matrix (16, 9) from products q_i q_j to a rotation matrix, row by row, less the identity.
 
-    A quadratic form's coefficient of q_i q_j and of q_j q_i is half of Q(e_i + e_j) - Q(e_i) - Q(e_j).
+    A quadratic form's coefficient of q_i q_j and of q_j q_i is half of Q(e_i + e_j) - Q(e_i) -
+    Q(e_j).
     """
 
     def form(quaternion: np.ndarray) -> np.ndarray:
@@ -298,11 +321,15 @@ class ExportSettings:
 
     def check(self) -> None:
         """Raise ValueError, naming the flag, for settings that cannot be used."""
-        paths = [path.resolve() for path in (self.checkpoint, self.onnx, self.c) if path is not None]
+        paths = [
+            path.resolve() for path in (self.checkpoint, self.onnx, self.c) if path is not None
+        ]
         if len(paths) == 1:
             raise ValueError("--onnx, --c: found neither, expected a file to write")
         if len(set(paths)) < len(paths):
-            raise ValueError("--onnx, --c: found a file that is read or written twice, expected another")
+            raise ValueError(
+                "--onnx, --c: found a file that is read or written twice, expected another"
+            )
         if self.float64 and self.onnx is None:
             raise ValueError("--float64: found no --onnx, expected one: a C header is float32")
 
@@ -314,7 +341,9 @@ def export(settings: ExportSettings) -> list[Path]:
         ValueError, ImportError, OSError: settings, packages or files that cannot be used.
     """
     settings.check()
-    policy = policy_of(load_checkpoint(settings.checkpoint), settings.checkpoint.name, settings.track)
+    policy = policy_of(
+        load_checkpoint(settings.checkpoint), settings.checkpoint.name, settings.track
+    )
     contents = {}  # all of them before any is written
     if settings.onnx is not None:
         contents[settings.onnx] = onnx_of(policy, settings.float64)

@@ -1,8 +1,8 @@
 """Flying a policy from noisy start poses: rollouts, their outcomes and their score.
 
-``fly_episode`` and ``fly_many`` keep every step; ``race_many`` keeps the outcomes only, flies no step beyond
-the last flight's end, and is for thousands of flights. Both are made of the same step. Rerun is imported when
-a recording is written.
+``fly_episode`` and ``fly_many`` keep every step; ``race_many`` keeps the outcomes only, flies no
+step beyond the last flight's end, and is for thousands of flights. Both are made of the same step.
+Rerun is imported when a recording is written.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,24 +25,21 @@ from flytrack_env.state import POSITION, pack
 from flytrack_env.terminations import Causes
 from flytrack_env.tracks import Track, cross_gate
 
-CANNOT_RECORD = "found no rerun-sdk, or RERUN turned off; expected pip install 'flytrack[viz]', RERUN unset"
+CANNOT_RECORD = (
+    "found no rerun-sdk, or RERUN turned off; expected pip install 'flytrack[viz]', RERUN unset"
+)
 BATCH = 1024  # flights side by side: more exceed a core's cache, fewer leave its vector units idle
 
 
 class Rollout(NamedTuple):
     """One episode; leaves (num_steps, ...), or (num_episodes, num_steps, ...) for many.
 
-    Attributes:
-        states: before the step, (21,).
-        actions: clipped as commanded, (4,).
-        is_flying: whether the step was flown; what follows the end is padding.
-        gates_passed: number, after the step.
-        laps: number, after the step.
-        lap_completed: whether the step completed a lap.
-        lap_time_s: of that lap.
-        gate_time_s: when the step passed a gate, s since the reset, interpolated; 0 without one, of the first
-            where two are passed in one step.
-        causes: of termination, in the step that ended the episode.
+    Attributes: states: before the step, (21,). actions: clipped as commanded, (4,). is_flying:
+        whether the step was flown; what follows the end is padding. gates_passed: number, after the
+        step. laps: number, after the step. lap_completed: whether the step completed a lap.
+        lap_time_s: of that lap. gate_time_s: when the step passed a gate, s since the reset,
+        interpolated; 0 without one, of the first where two are passed in one step. causes: of
+        termination, in the step that ended the episode.
     """
 
     states: jax.Array
@@ -107,7 +104,9 @@ class Outcomes(NamedTuple):
     def ends(self) -> dict[str, np.ndarray]:
         """Return masks, (num_flights,), of the flights that each cause ended before their last lap."""
         is_complete = self.is_complete()
-        causes = {name: np.asarray(cause) & ~is_complete for name, cause in self.causes._asdict().items()}
+        causes = {
+            name: np.asarray(cause) & ~is_complete for name, cause in self.causes._asdict().items()
+        }
         is_ended = np.any(list(causes.values()), axis=0)
         return {**causes, "time_limit": ~is_complete & ~is_ended}
 
@@ -131,7 +130,9 @@ class Score(NamedTuple):
 def save_flight(path: Path, rollout: Rollout) -> None:
     """Write the steps of one rollout that were flown as a rollout file."""
     is_flying = np.asarray(rollout.is_flying)
-    save_rollout(path, np.asarray(rollout.states)[is_flying], np.asarray(rollout.actions)[is_flying])
+    save_rollout(
+        path, np.asarray(rollout.states)[is_flying], np.asarray(rollout.actions)[is_flying]
+    )
 
 
 def can_record() -> bool:
@@ -193,7 +194,9 @@ def score(outcomes: Outcomes) -> Score:
 
 def start_pose_params(params: EnvParams, num_steps: int) -> EnvParams:
     """Return parameters whose episodes begin at the noisy start pose and may last that many steps."""
-    return params.replace(reset=params.reset._replace(course_fraction=0.0), max_steps_in_episode=num_steps)
+    return params.replace(
+        reset=params.reset._replace(course_fraction=0.0), max_steps_in_episode=num_steps
+    )
 
 
 Step = Callable[..., tuple[Any, ...]]
@@ -202,13 +205,17 @@ Step = Callable[..., tuple[Any, ...]]
 def make_step(env: EpisodicEnvironment, policy: Policy, params: EnvParams, num_laps: Any) -> Step:
     """Return one step of the mean action as a function ``step(memory, observation, state, index)``.
 
-    ``index`` counts steps from 0. The function returns the next memory, observation and state, whether the
-    flight is over, and the step as a ``Rollout`` without its axis of steps.
+    ``index`` counts steps from 0. The function returns the next memory, observation and state,
+    whether the flight is over, and the step as a ``Rollout`` without its axis of steps.
     """
 
-    def step(memory: Memory, observation: jax.Array, state: Any, index: jax.Array) -> tuple[Any, ...]:
+    def step(
+        memory: Memory, observation: jax.Array, state: Any, index: jax.Array
+    ) -> tuple[Any, ...]:
         memory, action = policy.network.act(policy.params, memory, observation)
-        next_observation, next_state, _, terminated, info = env.step_env(None, state, action, params)
+        next_observation, next_state, _, terminated, info = env.step_env(
+            None, state, action, params
+        )
         before, race = env.drone(state), env.race(state)
         after = env.drone(next_state)
         fraction = cross_gate(race.gate, before.pos_w, after.pos_w, params.drone_radius).fraction
@@ -231,7 +238,12 @@ def make_step(env: EpisodicEnvironment, policy: Policy, params: EnvParams, num_l
 
 @partial(jax.jit, static_argnames=("env", "num_steps"))
 def fly_episode(
-    env: EpisodicEnvironment, policy: Policy, key: jax.Array, params: EnvParams, num_steps: int, num_laps: int
+    env: EpisodicEnvironment,
+    policy: Policy,
+    key: jax.Array,
+    params: EnvParams,
+    num_steps: int,
+    num_laps: int,
 ) -> Rollout:
     """Return one episode of the mean action, from a reset to its end or to ``num_laps`` laps."""
     step = make_step(env, policy, params, num_laps)
@@ -257,12 +269,19 @@ def fly_episode(
 
 
 def fly_many(
-    env: EpisodicEnvironment, policy: Policy, seed: int, num_episodes: int, num_steps: int, num_laps: int
+    env: EpisodicEnvironment,
+    policy: Policy,
+    seed: int,
+    num_episodes: int,
+    num_steps: int,
+    num_laps: int,
 ) -> Rollout:
     """Return episodes from noisy start poses, leaves (num_episodes, num_steps, ...)."""
     params = start_pose_params(env.default_params, num_steps)
     fly = partial(fly_episode, env, policy)
-    flights = jax.vmap(lambda key: fly(key, params, num_steps, num_laps))(start_keys(seed, num_episodes))
+    flights = jax.vmap(lambda key: fly(key, params, num_steps, num_laps))(
+        start_keys(seed, num_episodes)
+    )
     jax.block_until_ready(flights)
     env.plant.check_alive()
     return flights
@@ -345,7 +364,8 @@ def _race_batch(
             return *after, is_over, _update_outcome(outcome, flown)
 
         nothing = _no_outcome(num_laps, params.course.num_gates)
-        # Under vmap the loop runs until no flight is left, and flights that are over stay as they are.
+        # Under vmap the loop runs until no flight is left, and flights that are over stay as they
+        # are.
         start = (policy.network.first_memory(), *env.reset(key, own), jnp.asarray(False), nothing)
         return jax.lax.while_loop(is_flying, advance, start)[-1]
 
@@ -364,20 +384,17 @@ def race_many(
 ) -> Outcomes:
     """Return the outcomes of flights from noisy start poses, one per key, as NumPy arrays.
 
-    Args:
-        env: that is flown in.
-        policy: whose mean action flies.
-        keys: of the flights, (num_flights,).
-        num_steps: time limit of a flight.
-        num_laps: laps to complete.
-        params: of the environment, its default if None.
-        models: a simulated drone for each flight, leaves (num_flights, ...); None: that of the parameters, or
-            a black box.
-        report: called with the number of flights flown and of all.
+    Args: env: that is flown in. policy: whose mean action flies. keys: of the flights,
+        (num_flights,). num_steps: time limit of a flight. num_laps: laps to complete. params: of
+        the environment, its default if None. models: a simulated drone for each flight, leaves
+        (num_flights, ...); None: that of the parameters, or a black box. report: called with the
+        number of flights flown and of all.
     """
     params = start_pose_params(env.default_params if params is None else params, num_steps)
     num_flights = len(keys)
-    size = -(-num_flights // -(-num_flights // BATCH))  # equal batches: one compiled program serves them
+    size = -(
+        -num_flights // -(-num_flights // BATCH)
+    )  # equal batches: one compiled program serves them
     parts = []
     for first in range(0, num_flights, size):
         # The last batch is filled up with its last flight.

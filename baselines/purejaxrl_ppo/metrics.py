@@ -6,7 +6,11 @@ import numpy as np
 
 # Counts are summed over updates; means are weighted by them.
 EPISODE_COUNT, LAP_COUNT = "episodes_ended", "laps_completed"
-NOT_PER_EPISODE = ("done", "last_return", "lap_time_s")  # a lap time is zero at the end of most episodes
+NOT_PER_EPISODE = (
+    "done",
+    "last_return",
+    "lap_time_s",
+)  # a lap time is zero at the end of most episodes
 
 
 def summarize_episodes(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
@@ -28,9 +32,8 @@ def summarize_episodes(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
 def summarize_race(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
     """Return metrics of the race in an update; nothing for an environment without a race.
 
-    Returns:
-        ``laps_completed``: number. ``lap_time_s``: mean, 0 without a lap. ``gate_distance_m``: mean over all
-        steps.
+    Returns: ``laps_completed``: number. ``lap_time_s``: mean, 0 without a lap. ``gate_distance_m``:
+        mean over all steps.
     """
     if "lap_completed" not in log:
         return {}
@@ -46,8 +49,8 @@ def summarize_race(log: dict[str, jax.Array]) -> dict[str, jax.Array]:
 def summarize_updates(metrics: dict[str, np.ndarray]) -> dict[str, float]:
     """Return one value per metric for several updates.
 
-    Counts are summed; means per episode are weighted by episodes, and lap times by laps. Means over nothing
-    are left out.
+    Counts are summed; means per episode are weighted by episodes, and lap times by laps. Means over
+    nothing are left out.
 
     Args:
         metrics: by name, (num_updates,) each.

@@ -28,12 +28,16 @@ from flytrack_env.tracks import Track
 
 NUM_LAPS = 3
 NUM_STEPS = 2500  # 25 s at 100 Hz: three laps of the slowest shipped track, flown by a beginner
-EVALUATION_SEED = 20_000  # of the noisy starts: the same at every evaluation, unlike usual training seeds
+# of the noisy starts: the same at every evaluation, unlike usual training seeds
+EVALUATION_SEED = 20_000
 BIN_M = 0.1
 MARGIN_M = 3.0
 SAMPLE_MS = 10.0
 LIMITS_MS = (0.1, 100.0)  # a few of many flights, to all of them on one line, lap after lap
-AXES, SCALE = (0.08, 0.06, 0.76, 0.89), (0.86, 0.15, 0.03, 0.7)  # left, bottom, width, height of the figure
+AXES, SCALE = (
+    (0.08, 0.06, 0.76, 0.89),
+    (0.86, 0.15, 0.03, 0.7),
+)  # left, bottom, width, height of the figure
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +51,9 @@ def evaluation_metrics(outcomes: Outcomes) -> dict[str, float]:
         "steps": outcomes.steps.mean(),
         **{f"ended_{name}": happened.mean() for name, happened in outcomes.ends().items()},
     }
-    return {f"evaluation_{name}": float(value) for name, value in values.items() if np.isfinite(value)}
+    return {
+        f"evaluation_{name}": float(value) for name, value in values.items() if np.isfinite(value)
+    }
 
 
 def evaluate_policy(
@@ -85,7 +91,9 @@ def evaluate_policy(
             record_flights(recording, {"policy": first}, env.track, NUM_LAPS)
             files.append(recording)
         elif is_recorded:
-            logger.warning("evaluation after %d steps: no recording (.rrd): %s", steps, CANNOT_RECORD)
+            logger.warning(
+                "evaluation after %d steps: no recording (.rrd): %s", steps, CANNOT_RECORD
+            )
     except Exception as error:  # whatever libraries that draw and record raise
         message = "evaluation after %d steps failed: %s: %s; training goes on"
         logger.warning(message, steps, type(error).__name__, error_text(error))
@@ -97,8 +105,9 @@ def draw_position_density(
 ) -> None:
     """Write a PNG heat map of x-y positions in bins of 0.1 m x 0.1 m.
 
-    The colour is the time that a flight spends in a bin, ms, on a logarithmic scale that is the same for all
-    charts, so that those of one run can be compared. The bins cover gates and start and some way around them.
+    The colour is the time that a flight spends in a bin, ms, on a logarithmic scale that is the
+    same for all charts, so that those of one run can be compared. The bins cover gates and start
+    and some way around them.
 
     Args:
         path: of the file.
@@ -121,7 +130,8 @@ def draw_position_density(
         cmin=LIMITS_MS[0] * 1e-3,
         norm=LogNorm(*LIMITS_MS),
     )
-    # Plain numbers: what parses the powers of ten keeps, in its exceptions, all that the callers hold.
+    # Plain numbers: what parses the powers of ten keeps, in its exceptions, all that the callers
+    # hold.
     figure.colorbar(image, cax=scale, label="time per flight in 0.1 m x 0.1 m (ms)", format="%g")
     draw_gates(axes, track, [0, 1])
     label_from_above(axes, track)

@@ -25,7 +25,9 @@ class _Gru(nn.Module):
     size: int
 
     @nn.compact
-    def __call__(self, memory: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def __call__(
+        self, memory: jax.Array, step: tuple[jax.Array, jax.Array]
+    ) -> tuple[jax.Array, jax.Array]:
         """Return the memory after a step: for the next one, and before a reset."""
         observation, done = step
         memory, _ = nn.GRUCell(self.size)(memory, observation)
@@ -57,7 +59,11 @@ class ActorCritic(nn.Module):
             self.log_std = self.param("log_std", start, (len(self.initial_action),))
         if self.memory_size:
             over_steps = nn.scan(
-                _Gru, variable_broadcast="params", split_rngs={"params": False}, in_axes=1, out_axes=1
+                _Gru,
+                variable_broadcast="params",
+                split_rngs={"params": False},
+                in_axes=1,
+                out_axes=1,
             )
             self.gru = over_steps(self.memory_size)
 
@@ -89,7 +95,9 @@ class ActorCritic(nn.Module):
         """Return what is remembered at the start of an episode, (*batch_shape, memory_size); or ()."""
         return jnp.zeros((*batch_shape, self.memory_size)) if self.memory_size else ()
 
-    def step(self, memory: Memory, observation: jax.Array) -> tuple[Memory, distrax.Distribution, jax.Array]:
+    def step(
+        self, memory: Memory, observation: jax.Array
+    ) -> tuple[Memory, distrax.Distribution, jax.Array]:
         """Return the memory after a step, policy and value."""
         memory, known = self._remember(memory, observation)
         return memory, self.policy(known), self.value(known)
@@ -103,10 +111,9 @@ class ActorCritic(nn.Module):
     ) -> tuple[distrax.Distribution, jax.Array]:
         """Return policy and value of steps: in any order, or with a memory in their order.
 
-        Args:
-            memory: (num_envs, num_steps, memory_size), of which that of the first step counts; or ().
-            observation: (num_envs, num_steps, size) with a memory, else (num_rows, size).
-            done: whether an episode ends after the step, (num_envs, num_steps).
+        Args: memory: (num_envs, num_steps, memory_size), of which that of the first step counts; or
+            (). observation: (num_envs, num_steps, size) with a memory, else (num_rows, size). done:
+            whether an episode ends after the step, (num_envs, num_steps).
         """
         if self.memory_size:
             remembered = self.gru(memory[:, 0], (observation, done))[1]

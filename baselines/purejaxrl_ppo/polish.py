@@ -1,10 +1,10 @@
 """Polishing a trained policy: gradient descent on its race time, through the simulator itself.
 
-PPO finds out how to race; near the optimum its noise costs more than a gate's edge gains. The simulator is
-differentiable, and a policy that already races is stable, so that the gradient of the time of its last gate
-along the whole flight (backpropagation through time) says how to fly faster. A gate's opening is wider
-here, so that a pass beyond its edge still counts and has a gradient; the real edge is a penalty. Only the
-actor changes. The policy is that of the mean action.
+PPO finds out how to race; near the optimum its noise costs more than a gate's edge gains. The
+simulator is differentiable, and a policy that already races is stable, so that the gradient of the
+time of its last gate along the whole flight (backpropagation through time) says how to fly faster.
+A gate's opening is wider here, so that a pass beyond its edge still counts and has a gradient; the
+real edge is a penalty. Only the actor changes. The policy is that of the mean action.
 """
 
 from collections.abc import Callable
@@ -24,24 +24,21 @@ from flytrack_env.params import EnvParams
 from flytrack_env.state import Action
 from flytrack_env.tracks import cross_gate
 
-QUADRATIC_OFFSET = 0.1  # offset beyond the limit up to which the penalty is quadratic, linear from there
+# offset beyond the limit up to which the penalty is quadratic, linear from there
+QUADRATIC_OFFSET = 0.1
 
 
 class Settings(NamedTuple):
     """How a policy is polished.
 
-    Attributes:
-        updates: of the policy.
-        learning_rate: at the start; it falls to 0 as a cosine.
-        flights: of one update, from noisy start poses.
-        laps: of a flight.
-        slowest_lap_s: mean lap time from which a flight is cut off (s).
-        offset_limit: of a pass, over the free half opening, from which it is penalised.
-        penalty_s: seconds for the square of an offset beyond the limit.
-        widened_m: by which half openings are widened.
-        largest_gradient: norm at which the gradient of an update is clipped.
-        gradient_decay: share of a state's gradient that is passed on to the step before; below 1 it looks
-            ahead for 1 / (1 - share) steps and cannot overflow.
+    Attributes: updates: of the policy. learning_rate: at the start; it falls to 0 as a cosine.
+            flights: of one update, from noisy start poses. laps: of a flight. slowest_lap_s: mean
+            lap time from which a flight is cut off (s). offset_limit: of a pass, over the free half
+            opening, from which it is penalised. penalty_s: seconds for the square of an offset
+            beyond the limit. widened_m: by which half openings are widened. largest_gradient: norm
+            at which the gradient of an update is clipped. gradient_decay: share of a state's
+            gradient that is passed on to the step before; below 1 it looks ahead for 1 / (1 -
+            share) steps and cannot overflow.
     """
 
     updates: int = 1500
@@ -96,7 +93,8 @@ def fly(
         # Linear far out: one lost flight must not outweigh all that race.
         linear = QUADRATIC_OFFSET * (2.0 * beyond - QUADRATIC_OFFSET)
         flown = Flown(
-            time_s=flown.time_s + jnp.where(counts, (index + crossing.fraction) * params.dt, 0.0) / last_gate,
+            time_s=flown.time_s
+            + jnp.where(counts, (index + crossing.fraction) * params.dt, 0.0) / last_gate,
             gates=flown.gates + counts,
             penalty=flown.penalty + jnp.where(beyond < QUADRATIC_OFFSET, beyond * beyond, linear),
         )
@@ -160,21 +158,29 @@ def polish(
         own = params if draw_model is None else params.replace(model=draw_model(key_model))
         flown = fly(env, Policy(policy.network, policy_params), key_start, own, settings)
         is_complete = flown.gates >= last_gate
-        return jnp.where(is_complete, flown.time_s, 0.0) + settings.penalty_s * flown.penalty, is_complete
+        return jnp.where(
+            is_complete, flown.time_s, 0.0
+        ) + settings.penalty_s * flown.penalty, is_complete
 
     @partial(jax.jit, donate_argnums=(0, 1))
-    def update(policy_params: Any, optimizer_state: Any, key: jax.Array) -> tuple[Any, Any, jax.Array]:
+    def update(
+        policy_params: Any, optimizer_state: Any, key: jax.Array
+    ) -> tuple[Any, Any, jax.Array]:
         keys = jax.random.split(key, settings.flights)
         gradients, is_complete = jax.vmap(jax.grad(compute_cost, has_aux=True), (None, 0))(
             policy_params, keys
         )
         num_complete = is_complete.sum()
-        gradient = jax.tree.map(lambda leaf: leaf.sum(axis=0) / jnp.maximum(num_complete, 1), gradients)
+        gradient = jax.tree.map(
+            lambda leaf: leaf.sum(axis=0) / jnp.maximum(num_complete, 1), gradients
+        )
         gradient = projection_l2_ball(gradient, scale=settings.largest_gradient)
         change, optimizer_state = optimizer.update(gradient, optimizer_state)
         return optax.apply_updates(policy_params, change), optimizer_state, num_complete
 
-    policy_params = jax.tree.map(jnp.array, policy.params)  # the caller's stay, though updates donate
+    policy_params = jax.tree.map(
+        jnp.array, policy.params
+    )  # the caller's stay, though updates donate
     optimizer_state = optimizer.init(policy_params)
     keys = jax.random.split(jax.random.key(seed), settings.updates)
     for done, key in enumerate(keys, start=1):

@@ -1,7 +1,7 @@
 """Proximal policy optimisation, top to bottom, as PureJaxRL writes it.
 
-Source: J. Schulman et al., arXiv 1707.06347; C. Lu et al., PureJaxRL. Differences from PureJaxRL, the reason
-for each, and the setting (``config.py``) that switches it off:
+Source: J. Schulman et al., arXiv 1707.06347; C. Lu et al., PureJaxRL. Differences from PureJaxRL,
+the reason for each, and the setting (``config.py``) that switches it off:
 
 - Truncation is bootstrapped: the value of the final observation is added to the last reward of an episode
   that the time limit cut off, because the race would have gone on (``bootstrap_at_truncation = false``).
@@ -97,7 +97,9 @@ def choose_step(env: Any, config: Config) -> Callable[..., Any]:
     return step
 
 
-def generalized_advantages(batch: Batch, last_value: jax.Array, gamma: float, gae_lambda: float) -> jax.Array:
+def generalized_advantages(
+    batch: Batch, last_value: jax.Array, gamma: float, gae_lambda: float
+) -> jax.Array:
     """Return GAE advantages, (num_steps, num_envs); arXiv 1506.02438, equation 16.
 
     The reward of a truncated step already holds the bootstrapped value of its final observation.
@@ -205,7 +207,8 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
     network: Any = make_network_for(env, env_params, config)
     optimizer, schedule = make_optimizer(config), make_schedule(config)
     step_all = choose_step(env, config)
-    # What minibatches are drawn from: steps, or whole environments where the order of their steps matters.
+    # What minibatches are drawn from: steps, or whole environments where the order of their steps
+    # matters.
     num_rows = config.num_envs if config.memory_size else config.batch_size
 
     def as_rows(leaf: jax.Array) -> jax.Array:
@@ -253,7 +256,9 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
         )
         return runner, (batch, log)
 
-    def update_minibatch(train_state: TrainState, minibatch: tuple[Any, ...]) -> tuple[TrainState, Metrics]:
+    def update_minibatch(
+        train_state: TrainState, minibatch: tuple[Any, ...]
+    ) -> tuple[TrainState, Metrics]:
         gradient = jax.grad(ppo_loss, has_aux=True)
         grads, parts = gradient(train_state.params, network, *minibatch, config)
         return train_state.apply_gradients(grads=grads), parts
@@ -311,7 +316,9 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
     return Algorithm(start, update)
 
 
-def make_train(env: Any, env_params: Any, config: Config) -> Callable[[jax.Array], tuple[Runner, Metrics]]:
+def make_train(
+    env: Any, env_params: Any, config: Config
+) -> Callable[[jax.Array], tuple[Runner, Metrics]]:
     """Return ``train(key) -> (runner, metrics)``, to be jitted: a whole run; metrics (num_updates,).
 
     Raises:
@@ -320,6 +327,8 @@ def make_train(env: Any, env_params: Any, config: Config) -> Callable[[jax.Array
     ppo = make_ppo(env, env_params, config)
 
     def train(key: jax.Array) -> tuple[Runner, Metrics]:
-        return jax.lax.scan(lambda runner, _: ppo.update(runner), ppo.start(key), None, config.num_updates)
+        return jax.lax.scan(
+            lambda runner, _: ppo.update(runner), ppo.start(key), None, config.num_updates
+        )
 
     return train

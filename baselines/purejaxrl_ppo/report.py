@@ -41,10 +41,9 @@ def distribution(times_s: np.ndarray) -> dict[str, Any]:
 def summarize(outcomes: Outcomes, is_limited: bool) -> dict[str, Any]:
     """Return a summary of flights, as JSON values.
 
-    Args:
-        outcomes: of the flights; several causes can end one.
-        is_limited: whether there is a number of laps to complete. Without, ``success`` is None, and a flight
-            whose steps ran out counts as ended by the time limit.
+    Args: outcomes: of the flights; several causes can end one. is_limited: whether there is a
+            number of laps to complete. Without, ``success`` is None, and a flight whose steps ran
+            out counts as ended by the time limit.
     """
     is_complete = outcomes.is_complete()
     ended = {"laps_complete": is_complete, **outcomes.ends()}
@@ -67,9 +66,8 @@ def summarize_plants(drawn: dict[str, np.ndarray], is_complete: np.ndarray) -> d
         drawn: values by the names of ``RANGES``, (num_plants,) each.
         is_complete: of flights, (num_plants, num_episodes).
 
-    Returns:
-        ``by_thirds`` shows how success depends on each quantity: a row for each third of the plants, with the
-        smallest and the largest value in it.
+    Returns: ``by_thirds`` shows how success depends on each quantity: a row for each third of the
+        plants, with the smallest and the largest value in it.
     """
     is_passed, rows = np.asarray(is_complete.all(axis=1)), []
     for name, values in drawn.items():
@@ -93,9 +91,8 @@ def compare_with_optimum(summary: dict[str, Any], references: References) -> dic
         summary: as ``summarize`` returns it.
         references: time-optimal flights.
 
-    Returns:
-        For each kind of lap ``time_s`` of the optimum, and ``mean_percent_above`` and ``min_percent_above``
-        of the laps flown, None where there were none.
+    Returns: For each kind of lap ``time_s`` of the optimum, and ``mean_percent_above`` and
+        ``min_percent_above`` of the laps flown, None where there were none.
     """
     comparison: dict[str, Any] = {"model": references["flying"].model_name}
     for lap, kind in KINDS.items():
@@ -112,7 +109,8 @@ def compute_time_lost(
 ) -> list[dict[str, Any]]:
     """Return the mean time lost on the way to each gate, s, as JSON values: one row per gate, with its id.
 
-    Only complete laps count, so that the rows add up to mean lap time minus optimum; None without any.
+    Only complete laps count, so that the rows add up to mean lap time minus optimum; None without
+    any.
     """
     shape = (-1, outcomes.lap_times_s.shape[-1], len(gate_ids))  # flights, laps, gates
     legs_s = np.diff(outcomes.gate_times_s.astype(float), axis=-1, prepend=0.0).reshape(shape)
@@ -152,9 +150,7 @@ def describe_times(times: dict[str, Any], optimal: dict[str, Any] | None) -> str
         return "none"
     text = "{number}, mean {mean:.3f} s, shortest {min:.3f} s, 5/50/95 %: {q05:.3f}/{q50:.3f}/{q95:.3f} s"
     if optimal is not None:
-        text += (
-            "\n  mean {mean_percent_above:.1f} %, shortest {min_percent_above:.1f} % above the time-optimal"
-        )
+        text += "\n  mean {mean_percent_above:.1f} %, shortest {min_percent_above:.1f} % above the time-optimal"
         text += " {time_s:.3f} s"
     return text.format(**times, **(optimal or {}))
 
@@ -168,7 +164,11 @@ def describe_report(report: dict[str, Any]) -> str:
         where = f"{number} plants drawn around the checkpoint's model, in the simulator, not on a black box"
     lines = [f"{report['flights']} flights, track {report['track']}: on {where}"]
     if report["success"] is not None:
-        ended = (f"{name.replace('_', ' ')} {number}" for name, number in report["ended"].items() if number)
+        ended = (
+            f"{name.replace('_', ' ')} {number}"
+            for name, number in report["ended"].items()
+            if number
+        )
         lines += [
             f"flights that complete {limit} laps: {describe_share(report['success'])}",
             f"gates: {report['gates_mean']:.2f} of {limit * report['gates_per_lap']}",
@@ -179,7 +179,9 @@ def describe_report(report: dict[str, Any]) -> str:
     for lap, label in LAPS.items():
         lines.append(f"{label}: {describe_times(report[lap], optimal and optimal[lap])}")
     if plants is not None:
-        lines.append(f"plants on which every flight completes its laps: {describe_share(plants['success'])}")
+        lines.append(
+            f"plants on which every flight completes its laps: {describe_share(plants['success'])}"
+        )
         lines.append("by thirds of the drawn values:")
         for row in plants["by_thirds"]:
             bounds = f"{row['from']:.4g} to {row['to']:.4g}"

@@ -1,9 +1,10 @@
 """PPO by self-play: ``python -m baselines.purejaxrl_ppo.self_play [--out FOLDER]``.
 
-One network learns to race a pool of opponents: a trained policy that stays, and its own past policies. The
-training is that of ``ppo.py`` on a race whose opponents are frozen (``flytrack_env.multi_drone.Versus``). The
-pool is a part of the environment's parameters. After every few updates the learner replaces the oldest of its
-past policies. At the end, the result races the policy that stayed, and its wins are printed.
+One network learns to race a pool of opponents: a trained policy that stays, and its own past
+policies. The training is that of ``ppo.py`` on a race whose opponents are frozen
+(``flytrack_env.multi_drone.Versus``). The pool is a part of the environment's parameters. After
+every few updates the learner replaces the oldest of its past policies. At the end, the result races
+the policy that stayed, and its wins are printed.
 """
 
 import dataclasses
@@ -33,7 +34,8 @@ from flytrack_env.multi_drone import MultiDroneRace, Opponent, Versus, VersusPar
 
 CHAMPION = Path(__file__).parent / "champion" / "flytrack.safetensors"
 FIRST_LAYER = "layers_0"
-# Small steps, and nearly deterministic actions: the first policy races already, and noise would undo it.
+# Small steps, and nearly deterministic actions: the first policy races already, and noise would
+# undo it.
 CONFIG_CHANGES = {"learning_rate": 5e-5, "episode_steps": 400, "gamma": 0.998, "min_std": 0.01}
 NUM_LAPS, NUM_RACE_STEPS = 3, 1500  # 15 s: the champions need 12
 
@@ -122,6 +124,10 @@ def make_training_params(env: Versus, config: Config, settings: Settings) -> Ver
     return params._replace(race=params.race._replace(flight=flight, rules=rules))
 
 
+def _replace_row(row: int, rows: jax.Array, new: jax.Array) -> jax.Array:
+    return rows.at[row].set(new)
+
+
 def train(
     start: Checkpoint, race: MultiDroneRace, config: Config, settings: Settings
 ) -> Iterator[tuple[int, Any, Metrics]]:
@@ -133,8 +139,8 @@ def train(
         config: of PPO.
         settings: of self-play.
 
-    Yields:
-        Updates so far, the learner's parameters, and the metrics of the updates since the last time.
+    Yields: Updates so far, the learner's parameters, and the metrics of the updates since the last
+        time.
 
     Raises:
         ValueError: settings that cannot be trained with.
@@ -156,7 +162,9 @@ def train(
     @jax.jit
     def train_phase(runner: Runner, params: VersusParams) -> tuple[Runner, Metrics]:
         ppo = make_ppo(env, params, config)
-        return jax.lax.scan(lambda runner, _: ppo.update(runner), runner, None, settings.updates_per_phase)
+        return jax.lax.scan(
+            lambda runner, _: ppo.update(runner), runner, None, settings.updates_per_phase
+        )
 
     runner = jax.jit(make_ppo(env, params, config).start)(jax.random.key(settings.seed))
     learner = set_std(first, settings.std)
@@ -165,7 +173,8 @@ def train(
         runner, metrics = train_phase(runner, params)
         learner = runner.train_state.params
         oldest = 1 + phase % settings.num_past
-        pool = jax.tree.map(lambda leaf, new: leaf.at[oldest].set(new), params.opponents[0], learner)  # noqa: B023
+        replace_oldest = partial(_replace_row, oldest)
+        pool = jax.tree.map(replace_oldest, params.opponents[0], learner)
         params = params._replace(opponents=(pool,))
         yield (phase + 1) * settings.updates_per_phase, learner, metrics
 
@@ -191,9 +200,8 @@ def fly_races(
         keys: of the races, (num_races,).
         num_laps: of a race.
 
-    Returns:
-        When each drone finishes (num_races, 2), s, infinity if never; whether drones collide before anyone
-        finishes (num_races,).
+    Returns: When each drone finishes (num_races, 2), s, infinity if never; whether drones collide
+        before anyone finishes (num_races,).
     """
     flight, rules = race.default_params
     flight = flight.replace(
@@ -206,7 +214,9 @@ def fly_races(
 
     def step(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], None]:
         observations, states, time_s, finish_s, has_collided = carry
-        actions = jnp.stack([act(learner, observations[:, 0]), act(opponent, observations[:, 1])], axis=1)
+        actions = jnp.stack(
+            [act(learner, observations[:, 0]), act(opponent, observations[:, 1])], axis=1
+        )
         step_env = jax.vmap(race.step_env, (0, 0, None))
         observations, states, *_, info = step_env(states, actions, params)
         is_racing = jnp.isinf(finish_s).all(axis=1)
@@ -226,7 +236,9 @@ def summarize(finish_s: jax.Array, has_collided: jax.Array) -> RaceResults:
     """Return the learner's results of races, as ``fly_races`` returns them."""
     own_s, other_s = finish_s.T
     return RaceResults(
-        float(jnp.isfinite(own_s).mean()), float((own_s < other_s).mean()), float(has_collided.mean())
+        float(jnp.isfinite(own_s).mean()),
+        float((own_s < other_s).mean()),
+        float(has_collided.mean()),
     )
 
 
@@ -242,10 +254,14 @@ def main(settings: Settings) -> None:
     learner = None
     for updates, params, metrics in train(start, race, config, settings):
         learner = params
-        print(f"{updates * config.batch_size} steps: mean return {metrics['episode_return'][-1]:.1f}")
+        print(
+            f"{updates * config.batch_size} steps: mean return {metrics['episode_return'][-1]:.1f}"
+        )
     if learner is None:
         least = settings.updates_per_phase * config.batch_size
-        raise SystemExit(f"total_timesteps: found {settings.total_timesteps}, expected at least {least}")
+        raise SystemExit(
+            f"total_timesteps: found {settings.total_timesteps}, expected at least {least}"
+        )
     path = settings.out / "final.safetensors"
     description = {
         **start.meta,
@@ -269,4 +285,6 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Settings, prog="python -m baselines.purejaxrl_ppo.self_play", description=__doc__))
+    main(
+        tyro.cli(Settings, prog="python -m baselines.purejaxrl_ppo.self_play", description=__doc__)
+    )

@@ -1,7 +1,7 @@
 """MLflow tracking of a run, which goes on without it when the store cannot be reached.
 
-MLflow is imported when a run is tracked. The id of a folder's MLflow run is in ``mlflow_run.json``, so that a
-resumed training continues the same run; steps that the store has are not recorded again.
+MLflow is imported when a run is tracked. The id of a folder's MLflow run is in ``mlflow_run.json``,
+so that a resumed training continues the same run; steps that the store has are not recorded again.
 """
 
 import json
@@ -28,9 +28,11 @@ GROUPS = {
 EVERY_STEP = "ppo/learning_rate"  # a metric that is recorded at every step
 SEND_EVERY_S = 5.0  # a transaction of the store costs as much as hundreds of values in it
 RETRY_EVERY_S = 60.0
-RECORDS_AT_ONCE = 16  # their metrics are one transaction: a step is in the store as a whole or not at all
+# their metrics are one transaction: a step is in the store as a whole or not at all
+RECORDS_AT_ONCE = 16
 MAX_PARAM_LENGTH = 6000
-# A server that is down should cost seconds, where MLflow's own settings are minutes; and no telemetry.
+# A server that is down should cost seconds, where MLflow's own settings are minutes; and no
+# telemetry.
 SETTINGS = {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
@@ -73,7 +75,8 @@ def describe_params(description: dict[str, Any]) -> dict[str, str]:
 class Tracker:
     """The MLflow run of a training.
 
-    A store that cannot be reached is a warning: records are kept in memory and sent when it is back.
+    A store that cannot be reached is a warning: records are kept in memory and sent when it is
+    back.
 
     Args:
         folder: of the run; its MLflow run is continued, if it has one.
@@ -160,7 +163,9 @@ class Tracker:
         else:
             # MLflow would put the files of a local store into the working directory.
             store = Path(self._uri.removeprefix(SQLITE)).resolve()
-            location = (store.parent / LOCAL_ARTIFACTS).as_uri() if self._uri.startswith(SQLITE) else None
+            location = (
+                (store.parent / LOCAL_ARTIFACTS).as_uri() if self._uri.startswith(SQLITE) else None
+            )
             experiment_id = client.create_experiment(EXPERIMENT, artifact_location=location)
         self.run_id = client.create_run(experiment_id, run_name=self._name).info.run_id
         params = [Param(*pair) for pair in describe_params(self._description).items()]

@@ -9,9 +9,21 @@ from typing import Annotated, Any, NoReturn
 
 import tyro
 
-from baselines.purejaxrl_ppo.checkpoint import FINAL, Checkpoint, CheckpointError, newest_intact, rewards_of
+from baselines.purejaxrl_ppo.checkpoint import (
+    FINAL,
+    Checkpoint,
+    CheckpointError,
+    newest_intact,
+    rewards_of,
+)
 from baselines.purejaxrl_ppo.config import Config, OptionalPath, read_config_file
-from baselines.purejaxrl_ppo.training import DEFAULT_OPTIONS, DivergedError, Options, Stopped, Trainer
+from baselines.purejaxrl_ppo.training import (
+    DEFAULT_OPTIONS,
+    DivergedError,
+    Options,
+    Stopped,
+    Trainer,
+)
 from flytrack_env.messages import error_text
 from flytrack_env.model_file import model_from_json
 
@@ -74,7 +86,10 @@ def parse(words: Sequence[str]) -> tuple[Settings, Checkpoint | None]:
     if sources.resume is not None:
         start = newest_intact(sources.resume)
         defaults = Settings(
-            env_id=start.env_id, track=start.track, seed=start.meta["seed"], hyperparameters=start.config
+            env_id=start.env_id,
+            track=start.track,
+            seed=start.meta["seed"],
+            hyperparameters=start.config,
         )
     if sources.config is not None:
         config = read_config_file(sources.config, defaults.hyperparameters)
@@ -110,7 +125,9 @@ def train(words: Sequence[str]) -> None:
     trainer = make_trainer(settings, start)
     options, out = settings.run, settings.out or DEFAULT_OUT
     if settings.no_tracking:
-        options = Options(options.checkpoint_every, options.evaluate_every, options.evaluation_episodes)
+        options = Options(
+            options.checkpoint_every, options.evaluate_every, options.evaluation_episodes
+        )
     if start is not None:
         out = settings.out or start.path.parent
         print(f"seed {settings.seed}: from step {start.steps}, {start.path}")

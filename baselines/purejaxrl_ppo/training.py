@@ -1,7 +1,7 @@
 """Trainings: begun or resumed, checked before anything is written, evaluated, recorded and stored.
 
-The compiled program is one update, so that neither what is done between updates nor where a run was cut off
-and resumed changes a bit of the result.
+The compiled program is one update, so that neither what is done between updates nor where a run was
+cut off and resumed changes a bit of the result.
 """
 
 import signal
@@ -36,7 +36,8 @@ from flytrack_env.validation import convert
 
 Metrics = dict[str, np.ndarray]
 RECORD_EVERY = 131_072  # environment steps: metrics are recorded a few times a second
-MAY_BE_UNDEFINED = "explained_variance"  # where all returns are the same there is no variance to explain
+# where all returns are the same there is no variance to explain
+MAY_BE_UNDEFINED = "explained_variance"
 MAX_NAMES = 4  # in the message on numbers that are not finite: where one is not, most soon are not
 
 
@@ -86,7 +87,8 @@ def training_params(env: EpisodicEnvironment, config: Config) -> EnvParams:
     """Return the parameters to train with: short episodes, and a drone that is thicker than in the race."""
     params = env.default_params
     params = params.replace(
-        max_steps_in_episode=config.episode_steps, drone_radius=params.drone_radius + config.gate_margin
+        max_steps_in_episode=config.episode_steps,
+        drone_radius=params.drone_radius + config.gate_margin,
     )
     try:
         env.check_params(params)
@@ -102,7 +104,9 @@ def track_reference(track: str | Path) -> str:
         ValueError: a ``Track``, which no checkpoint could name; save it to a file first.
     """
     if not isinstance(track, (str, Path)):
-        raise ValueError(f"track: found a {type(track).__name__}, expected a name or the path of a file")
+        raise ValueError(
+            f"track: found a {type(track).__name__}, expected a name or the path of a file"
+        )
     return str(Path(track).resolve()) if str(track).endswith(".toml") else str(track)
 
 
@@ -110,8 +114,9 @@ def track_reference(track: str | Path) -> str:
 def collect_signals() -> Iterator[list[int]]:
     """Collect SIGINT and SIGTERM in a list, so that a training can end between two updates.
 
-    The second signal raises KeyboardInterrupt at once. Nothing is collected in another thread than the main
-    one, where signals cannot be handled, nor of a signal that the caller handles or ignores.
+    The second signal raises KeyboardInterrupt at once. Nothing is collected in another thread than
+    the main one, where signals cannot be handled, nor of a signal that the caller handles or
+    ignores.
     """
     received: list[int] = []
 
@@ -122,7 +127,11 @@ def collect_signals() -> Iterator[list[int]]:
 
     defaults = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
     is_main = threading.current_thread() is threading.main_thread()
-    handled = {number: old for number, old in defaults.items() if is_main and signal.getsignal(number) is old}
+    handled = {
+        number: old
+        for number, old in defaults.items()
+        if is_main and signal.getsignal(number) is old
+    }
     for number in handled:
         signal.signal(number, handle)
     try:
@@ -164,7 +173,9 @@ class Trainer:
         ppo = make_ppo(self.env, params, self.config)
         self.network = make_network_for(self.env, params, self.config)
         # Weak types become strong ones, as they come from a file: one program for both.
-        strong = partial(jax.tree.map, lambda leaf: jnp.asarray(leaf).astype(jnp.asarray(leaf).dtype))
+        strong = partial(
+            jax.tree.map, lambda leaf: jnp.asarray(leaf).astype(jnp.asarray(leaf).dtype)
+        )
         self.start = jax.jit(lambda key: strong(ppo.start(key)))
         self.update = jax.jit(ppo.update)
 
@@ -218,7 +229,9 @@ class Trainer:
         files.check_same_run(start, description)
         total = self.config.num_updates * self.config.batch_size
         if start.steps > total:
-            raise CheckpointError(f"{start.path}: steps: found {start.steps}, expected at most {total}")
+            raise CheckpointError(
+                f"{start.path}: steps: found {start.steps}, expected at most {total}"
+            )
 
 
 class Run:
@@ -277,7 +290,9 @@ class Run:
         """Train to the end; once a signal has arrived, write a checkpoint and raise ``Stopped``."""
         config, status = self.config, "FAILED"
         total = config.num_updates * config.batch_size
-        bar = progress_bar("steps", total=total, initial=self.steps, unit_scale=True, desc="compile")
+        bar = progress_bar(
+            "steps", total=total, initial=self.steps, unit_scale=True, desc="compile"
+        )
         try:
             if self.options.checkpoint_every and self.update == 0:
                 self._store(files.step_file(0))
@@ -382,10 +397,8 @@ def train_policy(
     Returns:
         The final checkpoint, and the metrics of every update made here.
 
-    Raises:
-        ValueError: settings, id, track, model or checkpoint that cannot be used, or ``out`` that holds
-            another run, before any training.
-        DivergedError: numbers that are not finite.
+    Raises: ValueError: settings, id, track, model or checkpoint that cannot be used, or ``out``
+        that holds another run, before any training. DivergedError: numbers that are not finite.
         Stopped: SIGINT or SIGTERM ended it, after a last checkpoint.
     """
     return Trainer(config, env_id, **env_arguments).train(out, seed, options, resume)

@@ -1,8 +1,8 @@
 """Flights of hidden drones, for grading the diagnosis.
 
 ``draw_base``, ``draw_effect``, ``draw_truth``, ``draw_outside``, ``draw_gust``, ``draw_onset`` and
-``draw_late`` draw a ``Truth``; its ``motion`` and ``step_s`` say how it moves and is logged; ``fly``
-flies it; ``measure`` turns the clean log into what sensors would have logged.
+``draw_late`` draw a ``Truth``; its ``motion`` and ``step_s`` say how it moves and is logged;
+``fly`` flies it; ``measure`` turns the clean log into what sensors would have logged.
 """
 
 from benchmarks.hidden.draws import (

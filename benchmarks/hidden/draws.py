@@ -1,7 +1,8 @@
 """How plants with hidden effects are drawn.
 
-Each effect is drawn by its **size**, log-uniform between what a flight of a minute barely shows under the
-noise of ``benchmarks.hidden.noise`` and what cannot be missed. ``EFFECTS`` gives the unit of each size.
+Each effect is drawn by its **size**, log-uniform between what a flight of a minute barely shows
+under the noise of ``benchmarks.hidden.noise`` and what cannot be missed. ``EFFECTS`` gives the unit
+of each size.
 """
 
 import math
@@ -56,7 +57,10 @@ def _factors(*names: str) -> Callable[[float, Rng], Values]:
     def make(size: float, rng: Rng) -> Values:
         shares = rng.uniform(*OTHER_AXES, len(names))
         shares[rng.integers(len(names))] = 1.0
-        return {name: math.exp(size * share * _sign(rng)) for name, share in zip(names, shares, strict=True)}
+        return {
+            name: math.exp(size * share * _sign(rng))
+            for name, share in zip(names, shares, strict=True)
+        }
 
     return make
 
@@ -70,7 +74,10 @@ def _drag(prefix: str, upright: tuple[float, float]) -> Callable[[float, Rng], V
 
     def make(size: float, rng: Rng) -> Values:
         shares = (1.0, rng.uniform(*SIDEWAYS), rng.uniform(*upright))
-        return {f"{prefix}_{axis}": float(size * share) for axis, share in zip("xyz", shares, strict=True)}
+        return {
+            f"{prefix}_{axis}": float(size * share)
+            for axis, share in zip("xyz", shares, strict=True)
+        }
 
     return make
 
@@ -79,14 +86,18 @@ def _ground(size: float, rng: Rng) -> Values:
     return {"gain": size, "height_m": float(rng.uniform(*GROUND_M))}
 
 
-def _per_axis(suffix: str = "", signs: tuple[float, ...] = (1.0,)) -> Callable[[float, Rng], Values]:
+def _per_axis(
+    suffix: str = "", signs: tuple[float, ...] = (1.0,)
+) -> Callable[[float, Rng], Values]:
     """Return a maker of values of one sign: the size on one axis, half of it or more on the others."""
 
     def make(size: float, rng: Rng) -> Values:
         shares = rng.uniform(*OTHER_AXES, len(STICKS))
         shares[rng.integers(len(STICKS))] = rng.choice(signs)
         shares = np.copysign(shares, shares[np.abs(shares).argmax()])
-        return {name + suffix: float(size * share) for name, share in zip(STICKS, shares, strict=True)}
+        return {
+            name + suffix: float(size * share) for name, share in zip(STICKS, shares, strict=True)
+        }
 
     return make
 
@@ -111,7 +122,9 @@ EFFECTS: dict[str, EffectRange] = {
     "yaw_reaction": EffectRange(0.003, 0.05, "rad", _signed("angle")),
     "second_order_rates": EffectRange(0.002, 0.025, "s, 1 / wn", _oscillator),
     "rate_slew_limit": EffectRange(0.02, 0.25, "s, centre to full stick", _per_axis("_s")),
-    "wind": EffectRange(0.12, 1.5, "m/s^2; with drag 6 times that in m/s", direction("a_x", "a_y", "a_z")),
+    "wind": EffectRange(
+        0.12, 1.5, "m/s^2; with drag 6 times that in m/s", direction("a_x", "a_y", "a_z")
+    ),
     "thrust_scale": EffectRange(0.01, 0.2, "|ln factor|", _log_factor("factor")),
     "translational_lift": EffectRange(0.03, 0.4, "share of thrust", _positive("gain")),
     "ground_effect": EffectRange(0.06, 0.5, "share of thrust", _ground),
@@ -155,7 +168,8 @@ def draw_base(rng: Rng) -> Truth:
     curved, cubic = rng.uniform(*CURVED), rng.uniform(*CUBIC)
     volt, both = rng.uniform(*PER_VOLT), rng.uniform(*PER_VOLT_STICK)
     span = full - idle
-    # With s = (1 + u) / 2: idle + span ((1 - curved) s + curved s^2 + cubic (u^3 - u)) at the reference.
+    # With s = (1 + u) / 2: idle + span ((1 - curved) s + curved s^2 + cubic (u^3 - u)) at the
+    # reference.
     one = idle + span * ((1.0 - curved) / 2.0 + curved / 4.0)
     linear = span * ((1.0 - curved) / 2.0 + curved / 2.0 - cubic)
     coeffs = (

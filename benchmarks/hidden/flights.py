@@ -19,8 +19,9 @@ CHANNELS = {"u": 4, "p": 3, "v": 3, "q": 4, "a": 3, "f": 3, "w": 3, "slope": 3, 
 def fly(truth: Truth, seconds: float, rng: np.random.Generator) -> FlightLog:
     """Return the clean log of a flight, float64, one segment, a row per step of the truth.
 
-    Channels u, p, v, a, f, q, w and v_bat; f and w are accelerometer and gyro, with the hidden effects of the
-    sensors and without noise. A flight below 0.1 m or beyond 20 m/s is flown again, higher and slower.
+    Channels u, p, v, a, f, q, w and v_bat; f and w are accelerometer and gyro, with the hidden
+    effects of the sensors and without noise. A flight below 0.1 m or beyond 20 m/s is flown again,
+    higher and slower.
 
     Raises:
         RuntimeError: eight attempts left the envelope.
@@ -48,10 +49,14 @@ def fly(truth: Truth, seconds: float, rng: np.random.Generator) -> FlightLog:
     )
 
 
-def _attempt(truth: Truth, seconds: float, rng: np.random.Generator, caution: int) -> dict[str, np.ndarray]:
+def _attempt(
+    truth: Truth, seconds: float, rng: np.random.Generator, caution: int
+) -> dict[str, np.ndarray]:
     """Return the channels of one attempt, including the time to settle."""
     moments = plan(seconds, rng, caution)
-    settling = [moments[0]._replace(vel_w=(0.0, 0.0, 0.0), acc_w=(0.0, 0.0, 0.0))] * round(SETTLE_S / DT_S)
+    settling = [moments[0]._replace(vel_w=(0.0, 0.0, 0.0), acc_w=(0.0, 0.0, 0.0))] * round(
+        SETTLE_S / DT_S
+    )
     start = Start(moments[0].pos_w, moments[0].heading, float(rng.uniform(*OPEN_V)), HOVER_STICK)
     # An effect of position is centred on a point of the planned path.
     share = truth.outside.shape.get("at_share", 0.0) if truth.outside is not None else 0.0
@@ -79,7 +84,8 @@ def _vector(truth: Truth, name: str, neutral: float) -> np.ndarray:
 def _delayed(truth: Truth, values: np.ndarray, latency_s: float) -> np.ndarray:
     """Return values delayed by a latency, (num_rows, n).
 
-    Linear between rows; in fine motion the plant has recorded each at its instant, but for whole steps.
+    Linear between rows; in fine motion the plant has recorded each at its instant, but for whole
+    steps.
     """
     late, rows = latency_s / truth.step_s, np.arange(len(values), dtype=float)
     late = np.floor(late + SAME_S) if truth.motion == "fine" else late
@@ -91,15 +97,19 @@ def imu_readings(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return accelerometer and gyro, (num_rows, 3), m/s^2 and rad/s.
 
-    force_b, rates_b, slopes_b: of the centre of mass, a row per step; slopes are not used but in fine motion.
-    Applied in this order: lever arm f + w x (w x r) + dw/dt x r of an IMU at r ("imu_offset", m), scale,
-    bias, latency ("imu_latency", s).
+    force_b, rates_b, slopes_b: of the centre of mass, a row per step; slopes are not used but in
+    fine motion. Applied in this order: lever arm f + w x (w x r) + dw/dt x r of an IMU at r
+    ("imu_offset", m), scale, bias, latency ("imu_latency", s).
     """
     offset_b = _vector(truth, "imu_offset", 0.0)
     if truth.motion != "fine":
         slopes_b = np.diff(rates_b, axis=0, prepend=rates_b[:1]) / truth.step_s
-    force_b = force_b + np.cross(rates_b, np.cross(rates_b, offset_b)) + np.cross(slopes_b, offset_b)
-    force_b = _vector(truth, "accelerometer_scale", 1.0) * force_b + _vector(truth, "accelerometer_bias", 0.0)
+    force_b = (
+        force_b + np.cross(rates_b, np.cross(rates_b, offset_b)) + np.cross(slopes_b, offset_b)
+    )
+    force_b = _vector(truth, "accelerometer_scale", 1.0) * force_b + _vector(
+        truth, "accelerometer_bias", 0.0
+    )
     rates_b = _vector(truth, "gyro_scale", 1.0) * rates_b + _vector(truth, "gyro_bias", 0.0)
     latency_s = truth.effects.get("imu_latency", {}).get("latency_s", 0.0)
     return _delayed(truth, force_b, latency_s), _delayed(truth, rates_b, latency_s)

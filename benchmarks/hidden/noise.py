@@ -1,7 +1,8 @@
 """Sensor noise: how a flight is logged.
 
-All kinds have the same standard deviations, quantise, and lose rows; they differ in the distribution of
-errors ("heavy": Student's t with 3 degrees of freedom) and in their correlation ("coloured": AR(1)).
+All kinds have the same standard deviations, quantise, and lose rows; they differ in the
+distribution of errors ("heavy": Student's t with 3 degrees of freedom) and in their correlation
+("coloured": AR(1)).
 """
 
 from collections.abc import Callable
@@ -15,7 +16,14 @@ from flytrack_bench.hidden.laws import SCALES
 from flytrack_sysid.log import FlightLog
 
 # SI; q: about each axis. Laws outside the list are drawn in units of the noise in their channel.
-STD = {"p": 0.01, "v": 0.05, "f": SCALES["force"], "q": np.deg2rad(0.5), "w": SCALES["rate"], "v_bat": 0.0}
+STD = {
+    "p": 0.01,
+    "v": 0.05,
+    "f": SCALES["force"],
+    "q": np.deg2rad(0.5),
+    "w": SCALES["rate"],
+    "v_bat": 0.0,
+}
 # Resolution of a logged number: m, m/s, m/s^2, 1, rad/s, V; 16 bits over 32 g and 4000 deg/s.
 BITS = 2**16
 DIGIT = {

@@ -1,8 +1,8 @@
 """What a log could show of a truth: lambda of each hidden effect, and beside its closest rival.
 
-From the clean log (the same rows, no noise) and the sensors' true noise: the residual of a model that lacks
-an effect is then the effect's signature, whatever its law, and minus twice the log likelihood its squared
-length. All else is fitted again, each rival in the effect's place too.
+From the clean log (the same rows, no noise) and the sensors' true noise: the residual of a model
+that lacks an effect is then the effect's signature, whatever its law, and minus twice the log
+likelihood its squared length. All else is fitted again, each rival in the effect's place too.
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,13 @@ from flytrack_sysid.diagnosis.model_selection import MOST_RIVALS, ablate
 from flytrack_sysid.diagnosis.noise import fit_noise
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import CANDIDATES
-from flytrack_sysid.diagnosis.search import FittedModel, Held, SearchState, add_effect, score_candidates
+from flytrack_sysid.diagnosis.search import (
+    FittedModel,
+    Held,
+    SearchState,
+    add_effect,
+    score_candidates,
+)
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import THRUST_COEFFS
 
@@ -51,7 +57,9 @@ def true_noise(step_s: float) -> np.ndarray:
     return np.stack([np.log(direct), np.log(level), np.log(wander), *rest])
 
 
-def clean_problem(clean: FlightLog, log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Problem:
+def clean_problem(
+    clean: FlightLog, log: FlightLog, judged: np.ndarray, model: ModelParameters
+) -> Problem:
     """Return the problem of the clean rows that a measured log kept, with the sensors' true noise.
 
     Of the voltage that is rounding, which lasts while the battery drains by a digit: it is fitted.
@@ -94,7 +102,11 @@ def _scale_known(state: SearchState, model: FittedModel) -> Known:
     less = state.fitted(model.candidates, vector)
     state, nearby = state.linearized(less.vector)
     rivals = {}
-    others = [one for one in score_candidates(state, nearby, less) if one.candidate.effect != "thrust_scale"]
+    others = [
+        one
+        for one in score_candidates(state, nearby, less)
+        if one.candidate.effect != "thrust_scale"
+    ]
     for one in others[:MOST_RIVALS]:
         rivals[one.candidate.effect] = add_effect(state, nearby, less, one).cost
     rival = min(rivals, key=rivals.__getitem__, default="")
@@ -126,11 +138,13 @@ def known(
     return result
 
 
-def removed(clean: FlightLog, base: ModelParameters, extended: ModelParameters) -> tuple[float, float]:
+def removed(
+    clean: FlightLog, base: ModelParameters, extended: ModelParameters
+) -> tuple[float, float]:
     """Return the share of a clean flight's explainable error that an extended model removes, and that error.
 
-    base: refitted, without effects, in the same motion. The error is the rms whitened residual of that, 1 is
-    the noise.
+    base: refitted, without effects, in the same motion. The error is the rms whitened residual of
+    that, 1 is the noise.
     """
     with jax.enable_x64(True):
         lanes = lanes_of(clean, np.ones(len(clean), bool), base)
@@ -149,9 +163,14 @@ def removed(clean: FlightLog, base: ModelParameters, extended: ModelParameters) 
 def _expected(truth: Truth, log: FlightLog, tau: np.ndarray, coeffs: np.ndarray) -> np.ndarray:
     """Return specific force, body rates and voltage of the plant without effects, (num_rows, 7).
 
-    tau, coeffs: lags, s, from the first command on, and coefficients of thrust, in place of the truth's.
+    tau, coeffs: lags, s, from the first command on, and coefficients of thrust, in place of the
+    truth's.
     """
-    sticks, step_s, applied = np.vstack([log["u"][:1], log["u"][:-1]]), log.time[1] - log.time[0], []
+    sticks, step_s, applied = (
+        np.vstack([log["u"][:1], log["u"][:-1]]),
+        log.time[1] - log.time[0],
+        [],
+    )
     for column, keep in zip(sticks.T, np.exp(-step_s / tau), strict=True):
         applied.append(signal.lfilter([1.0 - keep], [1.0, -keep], column, zi=[keep * column[0]])[0])
     stick, volt = applied[3], np.concatenate([log["v_bat"][:1, 0], log["v_bat"][:-1, 0]])
@@ -166,10 +185,11 @@ def _expected(truth: Truth, log: FlightLog, tau: np.ndarray, coeffs: np.ndarray)
 def signal_to_noise(truth: Truth, log: FlightLog) -> float:
     """Return how far clean accelerometer, gyro and voltage are from those of the plant without effects.
 
-    The root of the sum of squared differences, each over the noise of ``benchmarks.hidden.noise`` (voltage:
-    over its resolution): by about how many standard deviations the effects are visible to an observer who
-    knows their shape. Position, velocity and attitude are not used and would show more of some effects.
-    Only what other lags and another thrust curve cannot explain counts. log: clean, from ``fly``.
+    The root of the sum of squared differences, each over the noise of ``benchmarks.hidden.noise``
+    (voltage: over its resolution): by about how many standard deviations the effects are visible to
+    an observer who knows their shape. Position, velocity and attitude are not used and would show
+    more of some effects. Only what other lags and another thrust curve cannot explain counts. log:
+    clean, from ``fly``.
     """
     measured = np.column_stack([log["f"], log["w"], log["v_bat"]])
 

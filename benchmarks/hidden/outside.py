@@ -53,13 +53,20 @@ def _draw_position(rng: Rng) -> ChannelAndShape:
     side, lean = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, MOST_LEAN)
     way = (math.sin(lean) * math.cos(side), math.sin(lean) * math.sin(side), up * math.cos(lean))
     shape = dict(zip(AXES, way, strict=True))
-    return "force", shape | {"radius_m": rng.uniform(*RADIUS_M), "at_share": rng.uniform(*MIDDLE_SHARE)}
+    return "force", shape | {
+        "radius_m": rng.uniform(*RADIUS_M),
+        "at_share": rng.uniform(*MIDDLE_SHARE),
+    }
 
 
 def _draw_time(rng: Rng) -> ChannelAndShape:
     is_step, is_thrust = rng.random() < 0.5, rng.random() < 0.5
     width = rng.uniform(*(STEP_WIDTH_SHARE if is_step else HUMP_WIDTH_SHARE))
-    shape = {"is_step": float(is_step), "middle_share": rng.uniform(*MIDDLE_SHARE), "width_share": width}
+    shape = {
+        "is_step": float(is_step),
+        "middle_share": rng.uniform(*MIDDLE_SHARE),
+        "width_share": width,
+    }
     sign = float(rng.choice([-1.0, 1.0]))
     if is_thrust:
         return "thrust", {**shape, "x": 0.0, "y": 0.0, "z": sign}
@@ -87,7 +94,10 @@ def _draw_command(rng: Rng) -> ChannelAndShape:
 
 
 def _draw_periodic(rng: Rng) -> ChannelAndShape:
-    shape = {"frequency_hz": log_uniform(*FREQUENCY_HZ, rng), "phase": rng.uniform(-math.pi, math.pi)}
+    shape = {
+        "frequency_hz": log_uniform(*FREQUENCY_HZ, rng),
+        "phase": rng.uniform(-math.pi, math.pi),
+    }
     return ("force" if rng.random() < 0.5 else "rate"), {**shape, **direction(*AXES)(1.0, rng)}
 
 
@@ -102,7 +112,10 @@ DRAWS: dict[str, tuple[str, Callable[[Rng], ChannelAndShape]]] = {
     "heading": ("heading", _draw_heading),
     "airspeed": (
         "airspeed",
-        lambda rng: ("force", {"speed_ms": rng.uniform(*SPEED_MS), "width_ms": rng.uniform(*SPEED_WIDTH_MS)}),
+        lambda rng: (
+            "force",
+            {"speed_ms": rng.uniform(*SPEED_MS), "width_ms": rng.uniform(*SPEED_WIDTH_MS)},
+        ),
     ),
     "attitude": ("tilt", _draw_attitude),
     "command": ("command", _draw_command),
@@ -112,10 +125,16 @@ DRAWS: dict[str, tuple[str, Callable[[Rng], ChannelAndShape]]] = {
 KINDS = tuple(DRAWS)
 # Drawn by name only: laws that a learner may find (benchmarks.beyond).
 DRAWS |= {
-    "flapping": ("airspeed", lambda rng: ("rate", {"x": 0.0, "y": float(rng.choice([-1.0, 1.0])), "z": 0.0})),
+    "flapping": (
+        "airspeed",
+        lambda rng: ("rate", {"x": 0.0, "y": float(rng.choice([-1.0, 1.0])), "z": 0.0}),
+    ),
     "cable": (
         "heading",
-        lambda rng: ("force", {"phase": rng.uniform(-math.pi, math.pi), **direction(*AXES)(1.0, rng)}),
+        lambda rng: (
+            "force",
+            {"phase": rng.uniform(-math.pi, math.pi), **direction(*AXES)(1.0, rng)},
+        ),
     ),
     "heating": ("time", lambda rng: ("thrust", DOWN | {"warming_s": rng.uniform(*WARMING_S)})),
     "payload": ("airspeed", lambda rng: ("force", {"string_m": rng.uniform(*STRING_M)})),

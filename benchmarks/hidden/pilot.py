@@ -1,11 +1,12 @@
 """A pilot who knows the drone, and plans of what is to be flown, put together from legs and manoeuvres.
 
-The pilot is cascaded control from position to sticks, on the true state. The gains follow the plant's own
-lags, so that slow drones are flown gently and no hidden effect makes the loop oscillate. The pilot knows the
-thrust curve without effects and integrates steady force errors in flight.
+The pilot is cascaded control from position to sticks, on the true state. The gains follow the
+plant's own lags, so that slow drones are flown gently and no hidden effect makes the loop
+oscillate. The pilot knows the thrust curve without effects and integrates steady force errors in
+flight.
 
-A plan does not depend on the plant, so where it leads is known before the flight. It has everything: legs of
-0 to 18 m/s, low passes, waves on one stick, flips, thrust steps.
+A plan does not depend on the plant, so where it leads is known before the flight. It has
+everything: legs of 0 to 18 m/s, low passes, waves on one stick, flips, thrust steps.
 """
 
 import math
@@ -19,13 +20,21 @@ from benchmarks.hidden.draws import log_uniform
 from flytrack_bench.hidden import DT_S, STICKS, HiddenDrone, Truth
 from flytrack_bench.hidden.drone import Sticks
 from flytrack_bench.hidden.laws import FirstOrderNoise
-from flytrack_bench.hidden.vectors import Vector, add, clip_length, norm, rotation, to_body, wrap_angle
+from flytrack_bench.hidden.vectors import (
+    Vector,
+    add,
+    clip_length,
+    norm,
+    rotation,
+    to_body,
+    wrap_angle,
+)
 
 Rng = np.random.Generator
 CLIMB, TURN_RATE = 5.0, math.radians(70.0)  # m/s, rad/s: what a plan asks for
 SMOOTH_S = 0.4  # over which a plan's velocity and heading are smoothed
-# Manoeuvres.
-# Amplitudes of rate sticks: in a minute, each axis gets one of each row. Beyond QUICK, pulses are short.
+# Manoeuvres. Amplitudes of rate sticks: in a minute, each axis gets one of each row. Beyond QUICK,
+# pulses are short.
 AMPLITUDES, QUICK = ((0.1, 0.2), (0.35, 0.6), (1.0,)), 0.6
 PULSE_S, QUICK_PULSE_S = (0.15, 0.3), (0.08, 0.16)  # a full stick turns by 90 degrees in 0.15 s
 CHIRP_S, CHIRP_FROM_HZ, CHIRP_HZ_PER_S = 1.3, 1.2, (3.0, 8.0)
@@ -46,7 +55,12 @@ BEGIN_S = 0.5  # of hover before something begins
 START_SPREAD_M = 5.0
 HIGHER_M = 1.5  # of the start, per repeated attempt
 # Each gain is a share of the inner loop's, so that no loop is faster than the one inside it.
-ATTITUDE_PER_LAG, VELOCITY_PER_ATTITUDE, POSITION_PER_VELOCITY, LEARN_PER_VELOCITY = 0.4, 0.3, 0.35, 0.3
+ATTITUDE_PER_LAG, VELOCITY_PER_ATTITUDE, POSITION_PER_VELOCITY, LEARN_PER_VELOCITY = (
+    0.4,
+    0.3,
+    0.35,
+    0.3,
+)
 QUICKEST_ATTITUDE, QUICKEST_HEIGHT = 12.0, 5.0  # 1/s
 YAW_GAIN, MOST_YAW_RATE = 2.5, 1.6  # 1/s, rad/s
 MOST_TILTED = math.radians(65.0)  # of the commanded thrust
@@ -54,7 +68,11 @@ MOST_UP, MOST_DOWN = 14.0, 6.0  # m/s^2
 MOST_LESSON = 2.0  # m/s, limit of the speed error in the integrator
 MOST_SPEED, MOST_CORRECTION, MOST_LEARNT = 18.0, 4.0, 5.0  # m/s, m/s, m/s^2
 UPRIGHT = 0.3  # cosine of the tilt beyond which the heading is undefined
-TINY, LEAST_SLOPE, CUBE_POWER = 1e-9, 1.0, 3.0  # m/s^2; N per stick; of the thrust curve's last term
+TINY, LEAST_SLOPE, CUBE_POWER = (
+    1e-9,
+    1.0,
+    3.0,
+)  # m/s^2; N per stick; of the thrust curve's last term
 TREMBLE, TREMBLE_S = 0.01, 0.1  # of sticks that are held still, and its time constant, s
 USUAL_TURN = 0.25  # of a stick, change that a slew limit stretches
 NEWTON_STEPS = 4  # from the previous stick, which is close
@@ -137,7 +155,10 @@ class Sketch:
         rows = np.column_stack([np.array(self._velocities), np.array(self._headings)])
         padded = np.concatenate([np.tile(rows[0] * [0, 0, 0, 1], (width, 1)), rows])
         smooth = np.stack(
-            [np.convolve(column, kernel / kernel.sum())[width : width + len(rows)] for column in padded.T],
+            [
+                np.convolve(column, kernel / kernel.sum())[width : width + len(rows)]
+                for column in padded.T
+            ],
             axis=1,
         )
         vel_w, heading = smooth[:, :3], smooth[:, 3]
@@ -166,7 +187,9 @@ def leg(sketch: Sketch, speed: float, hold_s: float, turning: float) -> None:
     sketch.turn_to(sketch.heading + rng.uniform(-1.0, 1.0) * math.pi * rng.integers(2))
     nose = rng.uniform(-1.0, 1.0) * MOST_NOSE_RATE
     ramp = max(1, steps_of(speed / SPEEDING_UP))
-    shares = np.concatenate([np.linspace(0, 1, ramp), np.ones(steps_of(hold_s)), np.linspace(1, 0, ramp)])
+    shares = np.concatenate(
+        [np.linspace(0, 1, ramp), np.ones(steps_of(hold_s)), np.linspace(1, 0, ramp)]
+    )
     for share in shares.tolist():
         way += turning * DT_S
         vel_w = (share * speed * math.cos(way), share * speed * math.sin(way), 0.0)
@@ -178,7 +201,9 @@ def wave(axis: int, amplitude: float, rng: Rng) -> np.ndarray:
     name, sign = rng.choice(["doublet", "chirp", "pulses"]), rng.choice([-1.0, 1.0])
     if name == "chirp":
         time = np.arange(steps_of(CHIRP_S)) * DT_S
-        shape = np.cos(2.0 * np.pi * (CHIRP_FROM_HZ * time + 0.5 * rng.uniform(*CHIRP_HZ_PER_S) * time**2))
+        shape = np.cos(
+            2.0 * np.pi * (CHIRP_FROM_HZ * time + 0.5 * rng.uniform(*CHIRP_HZ_PER_S) * time**2)
+        )
     else:
         steps = steps_of(rng.uniform(*(QUICK_PULSE_S if amplitude >= QUICK else PULSE_S)))
         gap = 0 if name == "doublet" else steps
@@ -197,7 +222,10 @@ def manoeuvre(sketch: Sketch, axis: int, amplitude: float) -> None:
 def flip(sketch: Sketch) -> None:
     """Append a jump, about one turn at full stick, and time to recover."""
     rng = sketch.rng
-    jump, turn = np.full((steps_of(JUMP_S), 4), np.nan), np.zeros((steps_of(rng.uniform(*FLIP_S)), 4))
+    jump, turn = (
+        np.full((steps_of(JUMP_S), 4), np.nan),
+        np.zeros((steps_of(rng.uniform(*FLIP_S)), 4)),
+    )
     jump[:, 3] = JUMP_STICK
     turn[:, rng.integers(2)], turn[:, 3] = rng.choice([-1.0, 1.0]), rng.uniform(*FLIP_STICK)
     sketch.hands_on(np.concatenate([jump, turn]))
@@ -291,7 +319,9 @@ class Pilot:
         effects = truth.effects
         delay = effects.get("command_delay", {}).get("delay_s", 0.0) + max(DT_S, truth.step_s)
         loop = effects.get("second_order_rates", {})
-        ringing = max((loop[f"{axis}_s"] / loop[f"{axis}_damping"] for axis in STICKS if loop), default=0.0)
+        ringing = max(
+            (loop[f"{axis}_s"] / loop[f"{axis}_damping"] for axis in STICKS if loop), default=0.0
+        )
         slew = USUAL_TURN * max(effects.get("rate_slew_limit", {}).values(), default=0.0)
         slow_fall = max(1.0, effects.get("thrust_lag_asymmetry", {}).get("ratio", 1.0))
         turn_lag = max(truth.tau[:3]) + delay + ringing + slew
@@ -328,14 +358,19 @@ class Pilot:
             for gain, there, here in zip(gains, moment.pos_w, drone.pos_w, strict=True)
         )
         wanted = add(clip_length(away, MOST_CORRECTION), moment.vel_w)
-        error = tuple(a - b for a, b in zip(clip_length(wanted, MOST_SPEED), drone.vel_w, strict=True))
+        error = tuple(
+            a - b for a, b in zip(clip_length(wanted, MOST_SPEED), drone.vel_w, strict=True)
+        )
         acc = [
-            a + gain * e + k for a, gain, e, k in zip(moment.acc_w, gains, error, self._learnt_w, strict=True)
+            a + gain * e + k
+            for a, gain, e, k in zip(moment.acc_w, gains, error, self._learnt_w, strict=True)
         ]
         if is_free:
             learn = tuple(
                 known + DT_S * LEARN_PER_VELOCITY * gain * gain * e
-                for known, gain, e in zip(self._learnt_w, gains, clip_length(error, MOST_LESSON), strict=True)
+                for known, gain, e in zip(
+                    self._learnt_w, gains, clip_length(error, MOST_LESSON), strict=True
+                )
             )
             self._learnt_w = clip_length(learn, MOST_LEARNT)
         ahead = drone.pos_w[2] + LOOK_AHEAD_S * drone.vel_w[2]

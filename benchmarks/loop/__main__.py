@@ -1,9 +1,10 @@
 """Does the diagnosis make better policies? ``python -m benchmarks.loop [--plants 5 | --laws 10]``.
 
-Closes the loop (``flytrack_loop.close_loop``) on the shipped black box and on plants with hidden effects
-drawn from the seed, or on plants with a law outside the package's list, and trains three alternatives with as
-many steps: on the nominal model, on the refitted base model, and on randomised models without any
-identification. One process per core. Writes a page and a chart; finished jobs are not run again.
+Closes the loop (``flytrack_loop.close_loop``) on the shipped black box and on plants with hidden
+effects drawn from the seed, or on plants with a law outside the package's list, and trains three
+alternatives with as many steps: on the nominal model, on the refitted base model, and on randomised
+models without any identification. One process per core. Writes a page and a chart; finished jobs
+are not run again.
 """
 
 import os
@@ -51,9 +52,9 @@ def main(
 ) -> None:
     """Run what is missing, print and write the page; exit 1 where a job failed or the target is missed.
 
-    plants: with hidden effects, beside the shipped one. laws: plants with a law outside the list, instead.
-    seed: of plants, trainings, logs and evaluations. steps: of every training. out: folder of all runs. page:
-    by default loop.md in it.
+    plants: with hidden effects, beside the shipped one. laws: plants with a law outside the list,
+    instead. seed: of plants, trainings, logs and evaluations. steps: of every training. out: folder
+    of all runs. page: by default loop.md in it.
     """
     jobs = [f"{LAW}{number}" for number in range(laws)] or ["shipped", *map(str, range(plants))]
     results = run_all(jobs, out, steps, seed)

@@ -1,8 +1,8 @@
 """The jobs of the loop's benchmark, each on one core: policies that need no plant, and one job per plant.
 
-A job is ``nominal`` or ``randomised`` (shared policies), ``shipped``, the number of a hidden plant, or
-``law_`` and that of a plant with a law outside the package's list. JAX is
-imported by the jobs only, because its threads stay on the core to which ``pin`` has moved the process.
+A job is ``nominal`` or ``randomised`` (shared policies), ``shipped``, the number of a hidden plant,
+or ``law_`` and that of a plant with a law outside the package's list. JAX is imported by the jobs
+only, because its threads stay on the core to which ``pin`` has moved the process.
 """
 
 import json
@@ -31,13 +31,15 @@ def pin(free_cores: Any) -> None:
 def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
     """Return a job's result, from its file if it was finished before; an unfinished job starts again.
 
-    What it prints, and the traceback of an error, go to a log in the job's folder. Programs are forgotten,
-    since a process may map only so many into its memory.
+    What it prints, and the traceback of an error, go to a log in the job's folder. Programs are
+    forgotten, since a process may map only so many into its memory.
     """
     folder = out / job
     if (folder / RESULT).exists():
         return dict(json.loads((folder / RESULT).read_text()))
-    shutil.rmtree(folder, ignore_errors=True)  # else its trainings would be refused as another run's
+    shutil.rmtree(
+        folder, ignore_errors=True
+    )  # else its trainings would be refused as another run's
     folder.mkdir(parents=True)
     import jax
 

@@ -78,12 +78,17 @@ def model_table(results: list[dict[str, Any]]) -> str:
     rows = []
     for result in results:
         errors = [stage(result, name)["errors"] for name in ("before", "refitted_base", "after")]
-        cells = [[_number(one["one_step_nrmse"].get(channel), ".4f") for one in errors] for channel in "vq"]
+        cells = [
+            [_number(one["one_step_nrmse"].get(channel), ".4f") for one in errors]
+            for channel in "vq"
+        ]
         cells.append([_number(one["position_m"].get("1"), ".3f") for one in errors])
         names = ", ".join(result["causes"]) or "nothing"
         log = f"{result['race_log_s']:g} s"
         rows.append([result["job"], result["hidden"], names, log, *map(" / ".join, cells)])
-    return report.table("plant | hidden | named | log | velocity | attitude | free flight of 1 s (m)", rows)
+    return report.table(
+        "plant | hidden | named | log | velocity | attitude | free flight of 1 s (m)", rows
+    )
 
 
 def figures(results: list[dict[str, Any]]) -> tuple[list[report.Figure], bool]:
@@ -104,7 +109,9 @@ def figures(results: list[dict[str, Any]]) -> tuple[list[report.Figure], bool]:
         report.Figure(f"plants that matter: {goal}", f"{TARGET_SHARE:.0%}", *report.share(reached)),
         report.Figure("all plants: fewest that finish", "", f"{lowest:.1%}", len(results)),
         report.Figure("all plants: largest lap gap", "", f"{widest:.2f} %", len(results)),
-        report.Figure("flying lap, shorter than the minimal model's policy's", "", middle, len(shorter)),
+        report.Figure(
+            "flying lap, shorter than the minimal model's policy's", "", middle, len(shorter)
+        ),
     ]
     return found, sum(reached) >= TARGET_SHARE * len(matter)
 
@@ -116,7 +123,13 @@ def draw_chart(results: list[dict[str, Any]]) -> bytes:
     for place, (name, (label, marker, colour)) in enumerate(POLICIES.items()):
         stages = [stage(result, name) for result in results]
         where = [index + SPREAD * (place - 2) for index in range(len(results))]
-        style = {"linestyle": "", "marker": marker, "color": colour, "label": label, "markersize": 7}
+        style = {
+            "linestyle": "",
+            "marker": marker,
+            "color": colour,
+            "label": label,
+            "markersize": 7,
+        }
         success.plot(where, [100.0 * one["plant"]["success"] for one in stages], **style)
         gap.plot(where, [min(gap_percent(one), LARGEST_GAP_PERCENT) for one in stages], **style)
     success.set_ylabel("finish 3 laps on the plant (%)")

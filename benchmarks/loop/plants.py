@@ -29,7 +29,13 @@ EFFECTS = (
 LAG_SPREAD, THRUST_SPREAD = 0.2, 0.05  # |ln factor| of the lags, and of the thrust map, at most
 LARGE = 2.0 / 3.0  # smallest size drawn, as a share of the log range
 # Hidden effects of the first plants: named, or a number of random ones.
-HIDDEN: tuple[tuple[str, ...] | int, ...] = (("command_delay",), ("quadratic_drag",), ("thrust_scale",), 2, 3)
+HIDDEN: tuple[tuple[str, ...] | int, ...] = (
+    ("command_delay",),
+    ("quadratic_drag",),
+    ("thrust_scale",),
+    2,
+    3,
+)
 LAW_AMPLITUDES = (1.0, 3.0)  # times the sensor's noise, as in benchmarks.beyond
 LATER = 5  # random effects of all later plants
 

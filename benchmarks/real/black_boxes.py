@@ -1,7 +1,8 @@
 """Black-box models of a drone, trained on the rows that a diagnosis learns from, flown as it is.
 
-All give the body rates after a step and the specific force within it; attitude, velocity and position follow
-by integration. None sees where the drone is: a path that all flights share cannot help them.
+All give the body rates after a step and the specific force within it; attitude, velocity and
+position follow by integration. None sees where the drone is: a path that all flights share cannot
+help them.
 
 ==========  =================================================================================
 name        what it is
@@ -31,7 +32,11 @@ from flytrack_sysid.prediction_windows import HORIZONS_S, Windows
 from flytrack_sysid.record import fill_gaps
 from flytrack_sysid.split import held_out_rows
 
-LONG_S, PAST_RATES_S, SHORT = 0.3, 0.05, 3  # of commands, of rates; SHORT: which part of the commands
+LONG_S, PAST_RATES_S, SHORT = (
+    0.3,
+    0.05,
+    3,
+)  # of commands, of rates; SHORT: which part of the commands
 RIDGE = 1e-3  # in units of the regressors' variance
 WIDTH, EPOCHS, PATIENCE, MINIBATCH, RATE = 16, 200, 15, 256, 3e-3
 GRAVITY = np.array([0.0, 0.0, 9.80665])
@@ -40,8 +45,9 @@ GRAVITY = np.array([0.0, 0.0, 9.80665])
 class Rows(NamedTuple):
     """Rows with enough of a past, and what comes of each; all (num_rows, ...).
 
-    commands: (num_rows, past, 4), the latest last. past_rates_b: (num_rows, past, 3). base: rates after
-    the step and specific force of the refitted base, body, (num_rows, 6). target: the measured ones.
+    commands: (num_rows, past, 4), the latest last. past_rates_b: (num_rows, past, 3). base: rates
+    after the step and specific force of the refitted base, body, (num_rows, 6). target: the
+    measured ones.
     """
 
     commands: np.ndarray
@@ -68,7 +74,9 @@ def rows_of(log: FlightLog, model: ModelParameters) -> Rows:
     long, past_rates = _past(step_s)
     starts = np.flatnonzero(log.is_start())
     first = np.repeat(starts, np.diff(np.append(starts, len(log))))
-    now = np.flatnonzero((np.arange(len(log)) - first >= long - 1) & np.append(~log.is_start()[1:], False))
+    now = np.flatnonzero(
+        (np.arange(len(log)) - first >= long - 1) & np.append(~log.is_start()[1:], False)
+    )
     turned = Rotation.from_quat(log["q"][now], scalar_first=True).inv()
     acc_w = (log["v"][now + 1] - log["v"][now]) / step_s
     return Rows(
@@ -113,7 +121,9 @@ def _arx(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
 def linear(rows: Rows, regressors: Callable[[Rows], tuple[np.ndarray, np.ndarray]]) -> Answer:
     """Return a ridge regression of rates and of force, each on its own regressors."""
     fits = []
-    for known, wanted in zip(regressors(rows), (rows.target[:, :3], rows.target[:, 3:]), strict=True):
+    for known, wanted in zip(
+        regressors(rows), (rows.target[:, :3], rows.target[:, 3:]), strict=True
+    ):
         mean, spread = known.mean(axis=0), known.std(axis=0) + 1e-9
         scaled = np.c_[(known - mean) / spread, np.ones(len(known))]
         damping = RIDGE * len(known) * np.diag([*np.ones(len(mean)), 1e-9])
@@ -161,7 +171,9 @@ def network(rows: Rows) -> Answer:
     rng, memory = np.random.default_rng(0), chain.init(weights)
     learnt, best, lowest, waited = np.flatnonzero(~rows.is_held_out), weights, np.inf, 0
     for _ in range(EPOCHS):
-        for part in np.split(rng.permutation(learnt), np.arange(MINIBATCH, len(learnt), MINIBATCH))[:-1]:
+        for part in np.split(rng.permutation(learnt), np.arange(MINIBATCH, len(learnt), MINIBATCH))[
+            :-1
+        ]:
             weights, memory = update(weights, memory, known[part], left[part])
         now = float(loss(weights, known[rows.is_held_out], left[rows.is_held_out]))
         best, lowest, waited = (weights, now, 0) if now < lowest else (best, lowest, waited + 1)

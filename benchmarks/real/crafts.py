@@ -58,7 +58,9 @@ def gecko(data: Path) -> Record:
         steps, boxes = base_steps(base, log), linear_ones(rows_of(log.select(~held_out), base))
         for name, answer in boxes.items():
             rates = flown(answer, windows, steps).rms()[0, :, QUANTITIES.index("rates")]
-            by_horizon = dict(zip(map("{:g}".format, HORIZONS_S), rates.round(6).tolist(), strict=True))
+            by_horizon = dict(
+                zip(map("{:g}".format, HORIZONS_S), rates.round(6).tolist(), strict=True)
+            )
             record["diagnosis"]["prediction"]["errors"][name] = {"rates_rad_per_s": by_horizon}
     return record | {"best_linear_rad_per_s": best_linear(found.log, held_out)}
 
@@ -83,7 +85,9 @@ def gecko_part(record: Record) -> str:
     """Return the figures, and the errors of all models."""
     found = record["diagnosis"]["prediction"]["errors"]
     errors = {name: one["rates_rad_per_s"] for name, one in found.items()}
-    degrees = {name: [f"{np.rad2deg(value):.3g}" for value in one.values()] for name, one in errors.items()}
+    degrees = {
+        name: [f"{np.rad2deg(value):.3g}" for value in one.values()] for name, one in errors.items()
+    }
     rows = [[name.replace("_", " "), *cells] for name, cells in degrees.items()]
     figures = []
     for name, target in TARGETS.items():
@@ -94,7 +98,9 @@ def gecko_part(record: Record) -> str:
         "real_gecko",
         figures=report.figures_table(figures),
         best_linear=np.rad2deg(record["best_linear_rad_per_s"]),
-        errors=table(["body rates, rms, deg/s, after", *(f"{one:g} s" for one in HORIZONS_S)], rows),
+        errors=table(
+            ["body rates, rms, deg/s, after", *(f"{one:g} s" for one in HORIZONS_S)], rows
+        ),
         mapping=GECKO_MAPPING,
     )
 
@@ -102,8 +108,8 @@ def gecko_part(record: Record) -> str:
 def nanobench(data: Path) -> Record:
     """Return diagnoses of a Crazyflie in angle mode, under Vicon, and extended over base errors by flight.
 
-    The ten flights are of eight kinds of trajectory. Two diagnoses, each learnt from one half of the flights
-    and judged on the other, so that every flight is held out once.
+    The ten flights are of eight kinds of trajectory. Two diagnoses, each learnt from one half of
+    the flights and judged on the other, so that every flight is held out once.
     """
     names = " ".join(HALVES).split()
     found = import_log([data / NANOBENCH / f"{name}.csv.gz" for name in names], "csv", NANOBENCH)
@@ -127,7 +133,9 @@ def nanobench(data: Path) -> Record:
 def nanobench_part(record: Record) -> str:
     """Return how each held-out flight is predicted."""
     rows, every = [], []
-    for name, ratios in sorted(pair for fold in record["folds"] for pair in fold["by_flight"].items()):
+    for name, ratios in sorted(
+        pair for fold in record["folds"] for pair in fold["by_flight"].items()
+    ):
         cells = np.array(ratios)
         known = cells[cells > 0.0]
         every.append(known)
@@ -141,12 +149,16 @@ def nanobench_part(record: Record) -> str:
         seconds=SECONDS,
         figures=report.figures_table(
             [
-                report.Figure("cells of at most 1.00", "100 %", *report.share((cells <= AS_GOOD).tolist())),
+                report.Figure(
+                    "cells of at most 1.00", "100 %", *report.share((cells <= AS_GOOD).tolist())
+                ),
                 report.Figure("median", "at most 1.00", f"{np.median(cells):.2f}", len(cells)),
                 report.Figure("largest", "at most 1.00", f"{cells.max():.2f}", len(cells)),
             ]
         ),
-        flights=table(["held-out flight", *heads, "largest of all horizons", "cells above 1.00"], rows),
+        flights=table(
+            ["held-out flight", *heads, "largest of all horizons", "cells above 1.00"], rows
+        ),
     )
 
 
@@ -170,9 +182,13 @@ PAIRS = {
 }
 
 
-def payload_flights(data: Path, names: Sequence[str], mass_kg: float) -> tuple[FlightLog, ModelParameters]:
+def payload_flights(
+    data: Path, names: Sequence[str], mass_kg: float
+) -> tuple[FlightLog, ModelParameters]:
     """Return logs as one, and the nominal model of a mass."""
-    found = imported([data / name for name in names], "usd", PAYLOAD_MAPPING.format(mass_kg=mass_kg))
+    found = imported(
+        [data / name for name in names], "usd", PAYLOAD_MAPPING.format(mass_kg=mass_kg)
+    )
     return found.log, found.nominal_model()
 
 
@@ -188,23 +204,28 @@ def in_proportion(model: ModelParameters, per_command: float) -> ModelParameters
 def thrust_of(model: ModelParameters, log: FlightLog) -> float:
     """Return the mean thrust over the mass that a model gives to a log's commands, m/s^2."""
     stick = log["u"][:, 3]
-    thrust = collective_thrust(stick, model.battery.voltage(0.5), np.asarray(model.thrust_coeffs, float))
+    thrust = collective_thrust(
+        stick, model.battery.voltage(0.5), np.asarray(model.thrust_coeffs, float)
+    )
     return float(np.mean(thrust) * float(model.effect("thrust_scale").factor) / float(model.m))
 
 
 def payload(data: Path) -> Record:
     """Return a record of each pair: a hidden payload, for models of a Crazyflie's flights with another mass.
 
-    Between series: the model of logs 182 and 183, on logs 202 and 203, which carry 5 g on a cable. Thrust
-    commands of the two series do not compare (docs/real_logs.md), so there is a second pair within one
-    series: the model of log 182, which carries a payload, on log 183, which does not. And logs 202 and 203
-    by the model that was imported with them, whose mass is right: what a load does beside its weight.
+    Between series: the model of logs 182 and 183, on logs 202 and 203, which carry 5 g on a cable.
+    Thrust commands of the two series do not compare (docs/real_logs.md), so there is a second pair
+    within one series: the model of log 182, which carries a payload, on log 183, which does not.
+    And logs 202 and 203 by the model that was imported with them, whose mass is right: what a load
+    does beside its weight.
     """
     records = {}
     for name, pair in PAIRS.items():
         known, nominal = payload_flights(data, pair.known, pair.known_kg)
         judged, _ = payload_flights(data, pair.judged, pair.judged_kg)
-        per_command = [np.median(log["f"][:, 2]) / np.median(log["u"][:, 3] + 1.0) for log in (known, judged)]
+        per_command = [
+            np.median(log["f"][:, 2]) / np.median(log["u"][:, 3] + 1.0) for log in (known, judged)
+        ]
         model, of_model = diagnosed(known, in_proportion(nominal, per_command[0]))
         reference = in_proportion(model.extended, per_command[0])
         found, record = diagnosed(judged, reference)
@@ -221,11 +242,15 @@ def payload_part(record: Record) -> str:
     """Return ratios found and true, and whether anything was named that is not there."""
     rows = []
     for name, pair in PAIRS.items():
-        one, names = record[name], [cause["effect"] for cause in record[name]["diagnosis"]["causes"]]
+        one, names = (
+            record[name],
+            [cause["effect"] for cause in record[name]["diagnosis"]["causes"]],
+        )
         ratio, true_ratio = one["ratio"], pair.known_kg / pair.judged_kg  # of thrust over mass
         false = ", ".join(f"`{effect}`" for effect in names if effect in UNWANTED) or "none"
         logs = [
-            " and ".join(path.rpartition("log")[2] for path in paths) for paths in (pair.known, pair.judged)
+            " and ".join(path.rpartition("log")[2] for path in paths)
+            for paths in (pair.known, pair.judged)
         ]
         found = [f"{ratio:.3f}", f"{true_ratio:.3f}", f"{ratio / true_ratio - 1.0:+.1%}"]
         is_named = "yes" if "thrust_scale" in names else "no"
@@ -239,7 +264,9 @@ def payload_part(record: Record) -> str:
 
 def crazyflie(data: Path) -> Record:
     """Return the diagnosis of the Crazyflie's flights; held out are those of some policies."""
-    (learnt, model), (judged, _) = (flights(data / FOLDER, policies) for policies in (LEARNT, JUDGED))
+    (learnt, model), (judged, _) = (
+        flights(data / FOLDER, policies) for policies in (LEARNT, JUDGED)
+    )
     log = joined([learnt, judged])
     return diagnosed(log, model, np.arange(len(log)) >= len(learnt))[1]
 
@@ -253,8 +280,8 @@ def betaflight(data: Path) -> Record:
 class Craft(NamedTuple):
     """A drone: its title, the folder of its flights, how it is measured, and its part of the page.
 
-    folder: within the folder of all data, which ``measure`` is given. part: of a record, what stands before
-    its diagnoses; or a text. diagnoses: of a record, by title.
+    folder: within the folder of all data, which ``measure`` is given. part: of a record, what
+    stands before its diagnoses; or a text. diagnoses: of a record, by title.
     """
 
     title: str
@@ -269,14 +296,18 @@ CRAFTS = {
         "Crazyflie 2.1, flown by learned policies: one diagnosis",
         FOLDER,
         crazyflie,
-        lambda record: report.filled("real_learnt", learnt=", ".join(LEARNT), judged=", ".join(JUDGED)),
+        lambda record: report.filled(
+            "real_learnt", learnt=", ".join(LEARNT), judged=", ".join(JUDGED)
+        ),
     ),
     "payload": Craft(
         "Crazyflie 2.1 with a payload on a cable",
         STANDARD,
         payload,
         payload_part,
-        lambda record: {f"Pair: {name}" if name in PAIRS else name: one for name, one in record.items()},
+        lambda record: {
+            f"Pair: {name}" if name in PAIRS else name: one for name, one in record.items()
+        },
     ),
     "nanobench": Craft(
         "Crazyflie 2.1 in angle mode (NanoBench)",
@@ -288,7 +319,9 @@ CRAFTS = {
             for one in record["folds"]
         },
     ),
-    "gecko": Craft("Betaflight quadcopter with 4S (Gecko), one acro flight", GECKO, gecko, gecko_part),
+    "gecko": Craft(
+        "Betaflight quadcopter with 4S (Gecko), one acro flight", GECKO, gecko, gecko_part
+    ),
     "betaflight": Craft(
         "Betaflight quadcopter with 6S, one acro flight",
         BETAFLIGHT,

@@ -1,12 +1,13 @@
 """Crazyflie flights: each policy's are judged by models that are refined on the flights of all others.
 
-``python -m benchmarks.real.crazyflie [--policies 50,66] [--seconds 30]`` learns from at most so many seconds
-of each other policy, and judges on the left-out flights, which the models never see, beside black boxes
-that are trained on the same rows. The effects in question are those that single steps propose, and drag,
-which every drone has (``PROPOSED``; a search for each policy would take hours); which of them stay, and all
-values, are found without the left-out policy. It appends a line of JSON for each policy to
-benchmarks/data/real/crazyflie.jsonl. ``--fits`` fits one structure to the flights of each policy alone
-instead, to crazyflie_fits.json beside it. ``python -m benchmarks.real_logs`` writes the page.
+``python -m benchmarks.real.crazyflie [--policies 50,66] [--seconds 30]`` learns from at most so
+many seconds of each other policy, and judges on the left-out flights, which the models never see,
+beside black boxes that are trained on the same rows. The effects in question are those that single
+steps propose, and drag, which every drone has (``PROPOSED``; a search for each policy would take
+hours); which of them stay, and all values, are found without the left-out policy. It appends a line
+of JSON for each policy to benchmarks/data/real/crazyflie.jsonl. ``--fits`` fits one structure to
+the flights of each policy alone instead, to crazyflie_fits.json beside it. ``python -m
+benchmarks.real_logs`` writes the page.
 """
 
 import json
@@ -90,7 +91,9 @@ def models_of(learnt: FlightLog, nominal: ModelParameters) -> tuple[np.ndarray, 
     model = state.fitted(candidates, vector)
     state = state.with_noise(fit_noise(problem.lanes, problem.residuals(model.vector[None])[0]))
     base, model = state.fitted((), base.vector), state.fitted(candidates, model.vector)
-    return base.vector, refinement.refine(state, base, model, learnt, parts.held_out, is_explained=False)
+    return base.vector, refinement.refine(
+        state, base, model, learnt, parts.held_out, is_explained=False
+    )
 
 
 def fold(folder: Path, judged: str, seconds: float) -> dict[str, Any]:
@@ -108,7 +111,10 @@ def fold(folder: Path, judged: str, seconds: float) -> dict[str, Any]:
     if refined.base is not None:
         vectors["refitted_to_flights"] = refined.base
     errors = refinement.errors_at(refined.problem, np.stack(list(vectors.values())), windows).errors
-    results = {name: refinement.Tested(one[None], windows) for name, one in zip(vectors, errors, strict=True)}
+    results = {
+        name: refinement.Tested(one[None], windows)
+        for name, one in zip(vectors, errors, strict=True)
+    }
     plain = from_vector(base, problem.like)._replace(effects=())
     rows, steps = rows_of(learnt, plain), base_steps(plain, own)
     boxes = {**linear_ones(rows), "network": network(rows)}
@@ -126,12 +132,15 @@ def fold(folder: Path, judged: str, seconds: float) -> dict[str, Any]:
         "rms": {name: one.rms()[0].round(6).tolist() for name, one in results.items()},
         "by_flight": by_flight(results, own.segment[windows.start]),
         "values": {
-            problem.names[place]: [float(extended[place]), float(half)] for place, half in widths.items()
+            problem.names[place]: [float(extended[place]), float(half)]
+            for place, half in widths.items()
         },
     }
 
 
-def by_flight(results: dict[str, refinement.Tested], segment: np.ndarray) -> dict[str, list[list[float]]]:
+def by_flight(
+    results: dict[str, refinement.Tested], segment: np.ndarray
+) -> dict[str, list[list[float]]]:
     """Return the extended model's errors over the base's, (horizons, quantities), by flight."""
     ratios = {}
     for number in np.unique(segment):
@@ -140,11 +149,14 @@ def by_flight(results: dict[str, refinement.Tested], segment: np.ndarray) -> dic
         own = windows._replace(counts=windows.counts[:, part])
         tested = (results[name].errors[:, :, part] for name in ("refitted_base", "extended"))
         base, extended = (refinement.Tested(errors, own).rms()[0] for errors in tested)
-        ratios[str(number)] = np.nan_to_num(extended / base, nan=0.0).round(4).tolist()  # 0: no window
+        no_window_as_0 = np.nan_to_num(extended / base, nan=0.0)
+        ratios[str(number)] = no_window_as_0.round(4).tolist()
     return ratios
 
 
-def fits_of(folder: Path, structure: Sequence[str], start: dict[str, float]) -> list[dict[str, Any]]:
+def fits_of(
+    folder: Path, structure: Sequence[str], start: dict[str, float]
+) -> list[dict[str, Any]]:
     """Return values of one structure and times to half response, of the flights of each policy alone."""
     result = []
     for policy in report.progress(policies_in(folder), "policies"):
@@ -160,9 +172,13 @@ def fits_of(folder: Path, structure: Sequence[str], start: dict[str, float]) -> 
         scale = refinement.errors_at(problem, vector[None], windows).rms()[0]
         target = refinement.Target(problem, windows, scale, np.ones(scale.shape, bool))
         fields = [name for name in problem.names if name.partition(".")[0] in structure]
-        fit = target.fitted(vector, problem.index([*TAUS, *THRUST_COEFFS, *fields]), refinement.MOST_ROUNDS)
+        fit = target.fitted(
+            vector, problem.index([*TAUS, *THRUST_COEFFS, *fields]), refinement.MOST_ROUNDS
+        )
         pairs = zip(fit.places, fit.half_widths, strict=True)
-        values = {problem.names[place]: [float(fit.vector[place]), float(half)] for place, half in pairs}
+        values = {
+            problem.names[place]: [float(fit.vector[place]), float(half)] for place, half in pairs
+        }
         half_s = half_responses(fit.vector[None], problem.like, SMALL_STEP)[0]
         times = dict(zip(STICKS, half_s.tolist(), strict=True))
         result.append({"policy": policy, "values": values, "half_response_s": times})
@@ -221,7 +237,9 @@ def policies_table(lines: list[Line]) -> str:
         cells = [f"{found[_cell(quantity, horizon)]:.2f}" for quantity, horizon, _ in FIGURES]
         worse = f"{np.sum(flights > AS_GOOD)} of {len(flights)}"
         kept = ", ".join(f"`{name}`" for name in line["kept"]) or "none: the refitted base"
-        rows.append([line["policy"], kept, *cells, f"{np.nanmax(found):.2f}", worse, f"{line['cpu_s']:.0f}"])
+        rows.append(
+            [line["policy"], kept, *cells, f"{np.nanmax(found):.2f}", worse, f"{line['cpu_s']:.0f}"]
+        )
     heads = [f"{quantity} {horizon:g} s" for quantity, horizon, _ in FIGURES]
     header = ["left-out policy", "effects that stay", *heads, "largest of all cells"]
     return table([*header, "cells worse, by flight", "CPU s"], rows)
@@ -244,7 +262,9 @@ def fits_table() -> str:
         cells = [f"{time:.1f} ms" for time in times_ms]
         rows.append([f"half response, {stick}", *cells, f"{sum(agree)} of {len(agree)}"])
     heads = [f"policy {one['policy']}" for one in fits]
-    return table(["parameter", *heads, f"pairs that overlap (times: within {WITHIN_MS:g} ms)"], rows)
+    return table(
+        ["parameter", *heads, f"pairs that overlap (times: within {WITHIN_MS:g} ms)"], rows
+    )
 
 
 def crazyflie_part() -> str:
@@ -262,7 +282,9 @@ def crazyflie_part() -> str:
     )
 
 
-def main(data: Path = DATA, policies: str = "", seconds: float = SECONDS, fits: bool = False) -> None:
+def main(
+    data: Path = DATA, policies: str = "", seconds: float = SECONDS, fits: bool = False
+) -> None:
     """Refine and judge for each policy, all by default, or fit each policy's flights alone."""
     folder = data / FOLDER
     LINES.parent.mkdir(parents=True, exist_ok=True)

@@ -81,7 +81,11 @@ def number(value: float | None, unit: str = "1") -> str:
 def in_degrees(key: str, value: float) -> tuple[float, str]:
     """Return an error and its unit, turns in degrees; key: "attitude_rad", "rates_rad_per_s", ..."""
     unit = key.split("_", 1)[1].replace("_per_", "/")
-    return (float(np.rad2deg(value)), unit.replace("rad", "deg")) if unit.startswith("rad") else (value, unit)
+    return (
+        (float(np.rad2deg(value)), unit.replace("rad", "deg"))
+        if unit.startswith("rad")
+        else (value, unit)
+    )
 
 
 def paragraph(measured: Record) -> str:
@@ -97,7 +101,8 @@ def _values(found: Record) -> str:
         told = cause["parameters"]
         told = {name: one for name, one in told.items() if name == "mean_factor"} or told
         values = [
-            f"{name.replace('_', ' ')} {number(one['value'], one['unit'])}" for name, one in told.items()
+            f"{name.replace('_', ' ')} {number(one['value'], one['unit'])}"
+            for name, one in told.items()
         ]
         if len(values) <= MOST_VALUES:
             texts.append(f"{words_of(cause['effect'])}: {', '.join(values)}")
@@ -135,7 +140,9 @@ def _flights(prediction: Record) -> str:
             ]
             nominal, base, own = (f"{value:.3g}" for value, _ in pairs)
             what = key.split("_")[0]
-            texts.append(f"{what} {own} {pairs[0][1]} after {horizon} s (nominal {nominal}, refitted {base})")
+            texts.append(
+                f"{what} {own} {pairs[0][1]} after {horizon} s (nominal {nominal}, refitted {base})"
+            )
     said = f"Errors of free flight that was held out: {'; '.join(texts)}." if texts else ""
     silent = [what for what, horizons in prediction["evidence"].items() if not horizons]
     if silent:
@@ -157,7 +164,9 @@ def draw(measured: Record) -> Figure | None:
             if by_horizon:
                 values = [in_degrees(key, one)[0] for one in by_horizon.values()]
                 label = name.replace("_", " ")
-                plain(axes).loglog([*map(float, by_horizon)], values, markersize=3, label=label, **style)
+                plain(axes).loglog(
+                    [*map(float, by_horizon)], values, markersize=3, label=label, **style
+                )
         axes.set_title(f"{key.split('_')[0]} ({unit})", fontsize="small", loc="left")
         axes.set_xticks([*map(float, errors["extended"][key])], [*errors["extended"][key]])
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -178,13 +187,17 @@ def causes_table(found: Record) -> str:
             f"{name} {number(one['value'], one['unit'])} ({' to '.join(map(number, one['ci95']))})"
             for name, one in cause["parameters"].items()
         )
-        values += f"<br>**not named; beyond the list: {cause['beyond']}**" if cause["beyond"] else ""
+        values += (
+            f"<br>**not named; beyond the list: {cause['beyond']}**" if cause["beyond"] else ""
+        )
         rival = cause["closest_rival"]
         against = f"no (closest: {rival})" if rival else "not tried"
         gains = (cause["chi2_gain"], cause["heldout_gain"], cause["lambda"], cause["lambda_sep"])
         alike = ", ".join(cause["equivalent"]) or against
         rows.append([f"`{cause['effect']}`", values, *map(number, gains), alike])
-    header = "cause | values, 95 % intervals | chi2_gain | heldout_gain | lambda | lambda_sep | alike?"
+    header = (
+        "cause | values, 95 % intervals | chi2_gain | heldout_gain | lambda | lambda_sep | alike?"
+    )
     return table(header, rows)
 
 
@@ -204,7 +217,9 @@ def errors_table(found: Record) -> str:
             + [number(flights.get(name, {}).get(quantity, {}).get(horizon)) for name in columns]
             for horizon in by_horizon
         ]
-    return table(["rms error on held-out rows", *(name.replace("_", " ") for name in columns)], rows)
+    return table(
+        ["rms error on held-out rows", *(name.replace("_", " ") for name in columns)], rows
+    )
 
 
 def changed_table(found: Record) -> str:
@@ -213,7 +228,8 @@ def changed_table(found: Record) -> str:
         [
             f"`{one['name']}`",
             number(one["nominal"], one["unit"]),
-            number(one["value"], one["unit"]) + (" (end of what is searched)" if one["is_at_bound"] else ""),
+            number(one["value"], one["unit"])
+            + (" (end of what is searched)" if one["is_at_bound"] else ""),
             " to ".join(map(number, one["ci95"])),
         ]
         for one in found["changed"]
@@ -230,12 +246,16 @@ def section(measured: Record, picture: str) -> str:
     """Return what was found in one diagnosis; picture: the file of ``draw``."""
     found = measured["diagnosis"]
     left, learned = found["unexplained"]["times_sensor_noise"], found.get("learned")
-    shares = ", ".join(f"{name} ({number(share)} times the sensor's noise)" for name, share in left.items())
+    shares = ", ".join(
+        f"{name} ({number(share)} times the sensor's noise)" for name, share in left.items()
+    )
     small = ", ".join(f"`{cause['effect']}`" for cause in found["negligible"])
     cost = f"{measured['cpu_s']:.0f} CPU s, compilation included; commit {measured['commit']}"
     parts = [
         paragraph(measured),
-        f"![Errors of free flight over its length]({picture})" if found["prediction"]["errors"] else "",
+        f"![Errors of free flight over its length]({picture})"
+        if found["prediction"]["errors"]
+        else "",
         f"{measured['num_rows']} rows; verdict `{found['verdict']}`; motion `{found['motion']}`; {cost}.",
         causes_table(found),
         f"Significant, and too small to matter: {small}." if small else "",

@@ -1,8 +1,8 @@
 """Hidden drones: the truth that models and policies are judged on.
 
-Their equations share nothing with the simulator of ``flytrack_env``. ``HiddenDrone`` flies in plain floats
-and has every effect, law and motion; ``HiddenPlant`` flies the same equations in an environment, but those
-that remember or change with the time.
+Their equations share nothing with the simulator of ``flytrack_env``. ``HiddenDrone`` flies in plain
+floats and has every effect, law and motion; ``HiddenPlant`` flies the same equations in an
+environment, but those that remember or change with the time.
 """
 
 from flytrack_bench.hidden.drone import HiddenDrone, Start

@@ -6,11 +6,11 @@
   follow by the midpoint rule in parts of 1 ms or less, cut where a delayed command or an instant of a late
   sensor falls. What the sensors say is true at an instant, not of a step.
 
-An effect acts at a stage: commands, body rates, thrust, forces. Its function takes its parameters and returns
-a hook, a function of the drone and the value so far: sticks (roll, pitch, yaw, thrust) in [-1, 1], body rates
-in rad/s, thrust in N. Hooks of forces take the drone alone and return what they add to the specific force,
-body, m/s^2. Where the package has another law for an effect of the same name, the difference is intended: no
-real plant follows the package's laws.
+An effect acts at a stage: commands, body rates, thrust, forces. Its function takes its parameters
+and returns a hook, a function of the drone and the value so far: sticks (roll, pitch, yaw, thrust)
+in [-1, 1], body rates in rad/s, thrust in N. Hooks of forces take the drone alone and return what
+they add to the specific force, body, m/s^2. Where the package has another law for an effect of the
+same name, the difference is intended: no real plant follows the package's laws.
 """
 
 import cmath
@@ -21,7 +21,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from flytrack_bench.hidden.laws import SCALES, FirstOrderNoise, command_hook, noise_hook, vector_hook
+from flytrack_bench.hidden.laws import (
+    SCALES,
+    FirstOrderNoise,
+    command_hook,
+    noise_hook,
+    vector_hook,
+)
 from flytrack_bench.hidden.truth import STICKS, Truth
 from flytrack_bench.hidden.vectors import (
     Number,
@@ -74,7 +80,9 @@ def _rate_saturation(values: Parameters) -> Hook:
     """
     # At a bend x, tanh(x) / x is what is left.
     left = (1.0 - values[axis] for axis in STICKS)
-    bends = [brentq(lambda x, share: math.tanh(x) - share * x, TINY, LARGE, share) for share in left]
+    bends = [
+        brentq(lambda x, share: math.tanh(x) - share * x, TINY, LARGE, share) for share in left
+    ]
     return lambda drone, sticks: (
         *(tanh(bend * u) / bend for u, bend in zip(sticks, bends, strict=False)),
         sticks[3],
@@ -84,13 +92,18 @@ def _rate_saturation(values: Parameters) -> Hook:
 def _rate_cross_coupling(values: Parameters) -> Hook:
     """omega_z += from_roll omega_x + from_pitch omega_y."""
     from_roll, from_pitch = values["from_roll"], values["from_pitch"]
-    return lambda drone, rates: (*rates[:2], rates[2] + from_roll * rates[0] + from_pitch * rates[1])
+    return lambda drone, rates: (
+        *rates[:2],
+        rates[2] + from_roll * rates[0] + from_pitch * rates[1],
+    )
 
 
 def _motor_imbalance(values: Parameters) -> Hook:
     """omega_x += roll T/m, omega_y += pitch T/m; rad/s per m/s^2."""
     gains = (values["roll"], values["pitch"], 0.0)
-    return lambda drone, rates: tuple(w + k * drone.thrust_acc for w, k in zip(rates, gains, strict=True))
+    return lambda drone, rates: tuple(
+        w + k * drone.thrust_acc for w, k in zip(rates, gains, strict=True)
+    )
 
 
 def _yaw_reaction(values: Parameters) -> Hook:
@@ -102,8 +115,8 @@ def _yaw_reaction(values: Parameters) -> Hook:
 class RateLoop:
     """y'' / wn^2 + lag_s y' + y = omega, with lag_s = 2 damping / wn: an oscillator per axis.
 
-    Exact for rates held over the step. Each axis has its own lag, s, and damping, not 1. rates_b, slopes_b: y
-    and y', rad/s and rad/s^2.
+    Exact for rates held over the step. Each axis has its own lag, s, and damping, not 1. rates_b,
+    slopes_b: y and y', rad/s and rad/s^2.
     """
 
     def __init__(self, values: Parameters):
@@ -115,7 +128,9 @@ class RateLoop:
     def follow(self, asked_b: Vector, step_s: float) -> Vector:
         """Return the body rates after a step in which these are asked for."""
         if step_s not in self._known:
-            self._known[step_s] = [_response(damping, lag_s, step_s) for damping, lag_s in self._axes]
+            self._known[step_s] = [
+                _response(damping, lag_s, step_s) for damping, lag_s in self._axes
+            ]
         axes = zip(self._known[step_s], asked_b, self.rates_b, self.slopes_b, strict=True)
         after = []
         for (stay, follow, pull, keep), rate, now, slope in axes:
@@ -214,7 +229,8 @@ def _wind(values: Parameters) -> Hook:
     return lambda drone: to_body(drone.rows, push_w)
 
 
-# In the order in which they act: first what a flight controller makes of the sticks, then the frame.
+# In the order in which they act: first what a flight controller makes of the sticks, then the
+# frame.
 COMMAND_EFFECTS = {
     "rate_expo": _rate_expo,
     "rate_saturation": _rate_saturation,
@@ -277,11 +293,12 @@ class Part(NamedTuple):
 class HiddenDrone:
     """A drone in flight; attributes are its state, updated by ``step``.
 
-    pos_w, vel_w, acc_w: m, m/s, m/s^2. quat: body to world; rows: of the matrix in which the force acted.
-    rates_b: rad/s. force_b: specific force, m/s^2. applied: lagged sticks; thrust_stick_slope: of the last of
-    them, 1/s. battery_v, open_v: V, under load and without. thrust_acc: thrust over mass, m/s^2. airspeed_b:
-    m/s. time_s: s. past: commands that a delay remembers, the latest first, once has_flown.
-    felt, tracked: what the sensors report of this step; in fine motion, at a late sensor's instant in it.
+    pos_w, vel_w, acc_w: m, m/s, m/s^2. quat: body to world; rows: of the matrix in which the force
+    acted. rates_b: rad/s. force_b: specific force, m/s^2. applied: lagged sticks;
+    thrust_stick_slope: of the last of them, 1/s. battery_v, open_v: V, under load and without.
+    thrust_acc: thrust over mass, m/s^2. airspeed_b: m/s. time_s: s. past: commands that a delay
+    remembers, the latest first, once has_flown. felt, tracked: what the sensors report of this
+    step; in fine motion, at a late sensor's instant in it.
     """
 
     def __init__(
@@ -296,10 +313,19 @@ class HiddenDrone:
         """duration_s, centre_w: of the flight, for effects outside the list. settle_s: before its log."""
         self.truth, self.duration_s, self.centre_w = truth, duration_s, centre_w
         self.pos_w, self.vel_w, self.acc_w = start.pos_w, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        self.quat: Quaternion = (math.cos(0.5 * start.heading), 0.0, 0.0, math.sin(0.5 * start.heading))
+        self.quat: Quaternion = (
+            math.cos(0.5 * start.heading),
+            0.0,
+            0.0,
+            math.sin(0.5 * start.heading),
+        )
         self.rates_b: Vector = (0.0, 0.0, 0.0)
         self.rows = rotation(self.quat)
-        self.force_b, self.airspeed_b, self.thrust_acc = (0.0, 0.0, truth.gravity), (0.0, 0.0, 0.0), 0.0
+        self.force_b, self.airspeed_b, self.thrust_acc = (
+            (0.0, 0.0, truth.gravity),
+            (0.0, 0.0, 0.0),
+            0.0,
+        )
         self.applied: Sticks = (0.0, 0.0, 0.0, start.thrust_stick)
         self.thrust_stick_slope = 0.0
         self.full_rates = tuple(math.radians(rate) for rate in truth.max_rate)
@@ -317,14 +343,20 @@ class HiddenDrone:
         self._hooks(rng)
         self._parts = self._planned_parts()
         steps = {truth.step_s, *(0.5 * part.length_s for part in self._parts)}
-        self._shares = {step: tuple(-math.expm1(-step / tau) for tau in self._taus) for step in steps}
+        self._shares = {
+            step: tuple(-math.expm1(-step / tau) for tau in self._taus) for step in steps
+        }
 
     def _hooks(self, rng: np.random.Generator) -> None:
         """Collect the hooks of each stage, in the order of its table."""
         effects, outside, gust = self.truth.effects, self.truth.outside, self.truth.gust
 
         def made(makers: Mapping[str, Callable[[Parameters], Hook]]) -> list[Hook]:
-            return [self._from_onset(make(effects[name])) for name, make in makers.items() if name in effects]
+            return [
+                self._from_onset(make(effects[name]))
+                for name, make in makers.items()
+                if name in effects
+            ]
 
         self._command_hooks, self._rate_hooks = made(COMMAND_EFFECTS), made(RATE_EFFECTS)
         self._thrust_hooks, self._force_hooks = made(THRUST_EFFECTS), made(FORCE_EFFECTS)
@@ -348,11 +380,15 @@ class HiddenDrone:
             self._add_noise(gust.time_constant, gust.std, "force", rng)
             self._add_noise(gust.time_constant, gust.rate_std, "rate", rng)
 
-    def _add_noise(self, time_constant_s: float, size: float, channel: str, rng: np.random.Generator) -> None:
+    def _add_noise(
+        self, time_constant_s: float, size: float, channel: str, rng: np.random.Generator
+    ) -> None:
         process, is_rate = FirstOrderNoise(time_constant_s, rng), channel == "rate"
         if size:
             self._noises.insert(0 if is_rate else len(self._noises), process)
-            (self._turn_hooks if is_rate else self._force_hooks).append(noise_hook(process, size, channel))
+            (self._turn_hooks if is_rate else self._force_hooks).append(
+                noise_hook(process, size, channel)
+            )
 
     def _from_onset(self, hook: Hook) -> Hook:
         """Return a hook that acts from the onset on."""
@@ -379,7 +415,9 @@ class HiddenDrone:
             count = math.ceil((end - begin) / LONGEST_PART_S - SAME_S)
             is_felt, is_tracked = (abs(end - instant) < SAME_S for instant in (felt_s, tracked_s))
             plain = Part((end - begin) / count, begin > arrives_s - SAME_S, False, False)
-            parts += [plain] * (count - 1) + [plain._replace(is_felt=is_felt, is_tracked=is_tracked)]
+            parts += [plain] * (count - 1) + [
+                plain._replace(is_felt=is_felt, is_tracked=is_tracked)
+            ]
             begin = end
         return parts
 
@@ -452,7 +490,10 @@ class HiddenDrone:
         sticks = self._shaped(sticks)
         self._lag(sticks, half_s)
         self._pass_time(half_s)
-        self.pos_w, self.vel_w = add(pos_w, scale(half_s, vel_w)), add(vel_w, scale(half_s, self.acc_w))
+        self.pos_w, self.vel_w = (
+            add(pos_w, scale(half_s, vel_w)),
+            add(vel_w, scale(half_s, self.acc_w)),
+        )
         rates = self._asked(turn(quat, self._turning_b, half_s))
         if self._loop is not None:
             before = self._loop.rates_b

@@ -23,7 +23,8 @@ from flytrack_bench.hidden.vectors import (
     to_body,
 )
 
-# An amplitude of 1, the noise of common sensors: m/s^2 of forces and of thrust over mass, rad/s of rates.
+# An amplitude of 1, the noise of common sensors: m/s^2 of forces and of thrust over mass, rad/s of
+# rates.
 SCALES = {"force": 1.5, "thrust": 1.5, "rate": 0.1}
 HEADING_ORDERS = (2, 3)
 REFERENCE_V = 23.0  # at which the slope of the thrust turns a force into a share of the stick
@@ -57,7 +58,11 @@ def _position(shape: Any, drone: Any) -> Number:
 
 
 def _time(shape: Any, drone: Any) -> Number:
-    share, middle, width = drone.time_s / drone.duration_s, shape["middle_share"], shape["width_share"]
+    share, middle, width = (
+        drone.time_s / drone.duration_s,
+        shape["middle_share"],
+        shape["width_share"],
+    )
     is_step = shape["is_step"]
     return 0.5 + 0.5 * tanh((share - middle) / width) if is_step else _bump(share, middle, width)
 
@@ -69,7 +74,9 @@ def _heading(drone: Any) -> Number:
 def heading_waves(shape: Any, heading: Any) -> Any:
     """Return the sum of waves of orders 2 and 3 in the heading, rad: a number or an array."""
     cosine = np.cos if isinstance(heading, np.ndarray) else cos
-    return sum(shape[f"size_{n}"] * cosine(n * heading + shape[f"phase_{n}"]) for n in HEADING_ORDERS)
+    return sum(
+        shape[f"size_{n}"] * cosine(n * heading + shape[f"phase_{n}"]) for n in HEADING_ORDERS
+    )
 
 
 def _attitude(shape: Any, drone: Any) -> Number:
@@ -81,7 +88,9 @@ def _heating(shape: Any, drone: Any) -> float:
     """Return half of a temperature that follows the square of the thrust; it is kept in the drone."""
     now = drone.time_s
     last, warmth = getattr(drone, "heat", (now, 0.0))
-    warmth += -math.expm1(-(now - last) / shape["warming_s"]) * ((drone.thrust_acc / GRAVITY) ** 2 - warmth)
+    warmth += -math.expm1(-(now - last) / shape["warming_s"]) * (
+        (drone.thrust_acc / GRAVITY) ** 2 - warmth
+    )
     drone.heat = now, warmth
     return 0.5 * warmth
 
@@ -92,7 +101,8 @@ def _payload(shape: Any, drone: Any) -> Vector:
     last, off, speed = getattr(drone, "swing", (now, (0.0,) * 3, (0.0,) * 3))
     step_s, stiffness = now - last, GRAVITY / shape["string_m"]
     pull = tuple(
-        -acc - stiffness * x - DAMPING * v for acc, x, v in zip(drone.acc_w, off, speed, strict=True)
+        -acc - stiffness * x - DAMPING * v
+        for acc, x, v in zip(drone.acc_w, off, speed, strict=True)
     )
     speed = tuple(v + step_s * a for v, a in zip(speed, pull, strict=True))
     off = tuple(x + step_s * v for x, v in zip(off, speed, strict=True))
@@ -105,7 +115,9 @@ SIGNALS: dict[str, Callable[[Any, Any], Number]] = {
     "position": _position,
     "time": _time,
     "heading": lambda shape, drone: heading_waves(shape, _heading(drone)) / shape["largest"],
-    "airspeed": lambda shape, drone: _bump(norm(drone.airspeed_b), shape["speed_ms"], shape["width_ms"]),
+    "airspeed": lambda shape, drone: _bump(
+        norm(drone.airspeed_b), shape["speed_ms"], shape["width_ms"]
+    ),
     "attitude": _attitude,
     "periodic": lambda shape, drone: math.sin(
         2.0 * math.pi * shape["frequency_hz"] * drone.time_s + shape["phase"]

@@ -56,9 +56,13 @@ class HiddenPlant(Plant):
         self.truth = truth
         unknown = sorted(set(truth.effects) - EFFECTS)
         if unknown:
-            raise ValueError(f"effects: found {', '.join(unknown)}, expected some of {sorted(EFFECTS)}")
+            raise ValueError(
+                f"effects: found {', '.join(unknown)}, expected some of {sorted(EFFECTS)}"
+            )
         if truth.outside is not None and truth.outside.kind not in STATELESS_KINDS:
-            raise ValueError(f"outside: found {truth.outside.kind!r}, expected one of {STATELESS_KINDS}")
+            raise ValueError(
+                f"outside: found {truth.outside.kind!r}, expected one of {STATELESS_KINDS}"
+            )
         others = {"motion": truth.motion == "fine", "step_s": truth.step_s != DT_S}
         others |= {name: getattr(truth, name) is not None for name in ("gust", "onset_s")}
         for name in (name for name, is_wrong in others.items() if is_wrong):
@@ -97,10 +101,14 @@ class HiddenPlant(Plant):
             battery_v=self._hidden(state).battery_v,
         )
 
-    def step(self, state: HiddenState, command: Action, dt: Scalar, model: ModelParameters) -> HiddenState:
+    def step(
+        self, state: HiddenState, command: Action, dt: Scalar, model: ModelParameters
+    ) -> HiddenState:
         """Return the plant 0.01 s later under a held command in [-1, 1]; ``dt``, ``model`` are not used."""
         hidden = self._hidden(state)
-        hidden.step(tuple(jnp.clip(jnp.asarray(stick, jnp.float32), -1.0, 1.0) for stick in command))
+        hidden.step(
+            tuple(jnp.clip(jnp.asarray(stick, jnp.float32), -1.0, 1.0) for stick in command)
+        )
         after = HiddenState(*(getattr(hidden, name) for name in HiddenState._fields))
         return after._replace(has_flown=jnp.bool_(True))
 

@@ -15,8 +15,9 @@ MOTIONS = ("handout", "semi_implicit", "fine")
 class Outside:
     """An effect outside the package's list.
 
-    kind: of ``flytrack_bench.hidden.laws``. depends_on: tags of what it is a function of. channel: what it
-    changes, of ``laws.SCALES``. amplitude: its largest size in that unit. shape: parameters of the kind.
+    kind: of ``flytrack_bench.hidden.laws``. depends_on: tags of what it is a function of. channel:
+    what it changes, of ``laws.SCALES``. amplitude: its largest size in that unit. shape: parameters
+    of the kind.
     """
 
     kind: str
@@ -30,7 +31,8 @@ class Outside:
 class Gust:
     """Gusts as a first-order random process per world axis, felt by the accelerometer.
 
-    std: m/s^2, specific force. time_constant: s. rate_std: rad/s, the same of body rates; 0 for none.
+    std: m/s^2, specific force. time_constant: s. rate_std: rad/s, the same of body rates; 0 for
+    none.
     """
 
     std: float
@@ -42,10 +44,11 @@ class Gust:
 class Truth:
     """A plant; the handout's if it has no effects.
 
-    tau: s. coeffs: N, of 1, u, u^2, u^3, V, u V. max_rate: deg/s. drain: V/min. mass: kg. gravity: m/s^2.
-    effects: name -> parameter -> value, of ``flytrack_bench.hidden.drone``, SI. onset_s: time in the log at
-    which all effects begin; None: before it. motion: of ``MOTIONS``, see ``flytrack_bench.hidden.drone``.
-    step_s: between rows of the log. mocap_late_s: by which position, velocity and attitude are logged late.
+    tau: s. coeffs: N, of 1, u, u^2, u^3, V, u V. max_rate: deg/s. drain: V/min. mass: kg. gravity:
+    m/s^2. effects: name -> parameter -> value, of ``flytrack_bench.hidden.drone``, SI. onset_s:
+    time in the log at which all effects begin; None: before it. motion: of ``MOTIONS``, see
+    ``flytrack_bench.hidden.drone``. step_s: between rows of the log. mocap_late_s: by which
+    position, velocity and attitude are logged late.
     """
 
     tau: tuple[float, ...]
@@ -65,7 +68,11 @@ class Truth:
     def thrust(self, stick: Number, battery_v: Number) -> Number:
         """Return thrust without effects, N, of an applied thrust stick at a voltage."""
         one, linear, square, cube, volt, both = self.coeffs
-        return one + stick * (linear + stick * (square + stick * cube)) + battery_v * (volt + stick * both)
+        return (
+            one
+            + stick * (linear + stick * (square + stick * cube))
+            + battery_v * (volt + stick * both)
+        )
 
     def text(self) -> str:
         """Return the hidden effects in one line."""

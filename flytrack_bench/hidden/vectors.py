@@ -1,7 +1,7 @@
 """Numbers, vectors and quaternions of hidden drones: tuples of Python floats, or of JAX scalars.
 
-Equations are written once for both: in floats, where a pilot closes the loop, which is much faster than with
-arrays of three numbers; and traced, where JAX flies many drones at once.
+Equations are written once for both: in floats, where a pilot closes the loop, which is much faster
+than with arrays of three numbers; and traced, where JAX flies many drones at once.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Effects beyond the minimal model: the one explicit, ordered list, and how a model uses it.
 
-The simulator folds them, the fit and the diagnosis free their parameters, domain randomisation draws
-them, the documentation lists them. A new effect is a file here and a line in ``EFFECTS``.
+The simulator folds them, the fit and the diagnosis free their parameters, domain randomisation
+draws them, the documentation lists them. A new effect is a file here and a line in ``EFFECTS``.
 """
 
 from typing import Any
@@ -44,9 +44,10 @@ from flytrack_env.effects.yaw_reaction import YAW_REACTION, YawReaction
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Drone
 
-# The order in which effects of one stage are folded, and that of a model's effects. Commands pass as in a
-# flight controller: the link, the stick's curve, its limit, the limit on acceleration. What adds to the rates
-# comes before the loop that remembers them; the latency comes before all that is wrong with its readings.
+# The order in which effects of one stage are folded, and that of a model's effects. Commands pass
+# as in a flight controller: the link, the stick's curve, its limit, the limit on acceleration. What
+# adds to the rates comes before the loop that remembers them; the latency comes before all that is
+# wrong with its readings.
 EFFECTS: tuple[Effect, ...] = (
     COMMAND_DELAY,
     ACTUAL_RATES,
@@ -82,7 +83,8 @@ EFFECTS: tuple[Effect, ...] = (
 # Last, what a log has shown beyond all of these.
 ORDER = (*EFFECTS, LEARNED_LAW)
 ROUNDING = 1e-5  # of float32 times
-# Delays that are drawn around those of a model are longer by this factor and so many seconds, at most.
+# Delays that are drawn around those of a model are longer by this factor and so many seconds, at
+# most.
 DRAWN_LONGER, DRAWN_LATER_S = 1.25, 0.02
 BY_NAME = {effect.name: effect for effect in ORDER}
 _BY_CLASS = {effect.parameters: effect for effect in ORDER}
@@ -139,7 +141,9 @@ def delay_steps_of(effects: tuple[Any, ...], dt: float) -> int:
     return int(np.clip(needed, USUAL_STEPS, MOST_STEPS))
 
 
-def start_memories(effects: tuple[Any, ...], drone: Drone, delay_steps: int = USUAL_STEPS) -> tuple[Any, ...]:
+def start_memories(
+    effects: tuple[Any, ...], drone: Drone, delay_steps: int = USUAL_STEPS
+) -> tuple[Any, ...]:
     """Return what the effects of a model remember when an episode begins; None for most.
 
     delay_steps: of delays; every step of an episode carries them, so that fewer are faster.
@@ -165,7 +169,11 @@ def acts(effects: tuple[Any, ...], stage: str) -> bool:
 
 
 def fold(
-    stage: str, effects: tuple[Any, ...], memories: tuple[Any, ...], value: Any, context: StepContext
+    stage: str,
+    effects: tuple[Any, ...],
+    memories: tuple[Any, ...],
+    value: Any,
+    context: StepContext,
 ) -> Any:
     """Return a stage's value after all effects of a model that act there, in order."""
     for parameters, memory in zip(effects, memories, strict=True):
@@ -202,7 +210,9 @@ def fold_rates(
     for place, (parameters, memory) in enumerate(zip(effects, memories, strict=True)):
         inputs.append(rates_b)
         first_b = first_inputs[place] if first_inputs else rates_b
-        rates_b = fold("rates", (parameters,), (memory,), rates_b, context._replace(first_input_b=first_b))
+        rates_b = fold(
+            "rates", (parameters,), (memory,), rates_b, context._replace(first_input_b=first_b)
+        )
     return rates_b, tuple(inputs)
 
 
@@ -215,7 +225,8 @@ def remember(
 ) -> tuple[Any, ...]:
     """Return what the effects of a model remember after a step.
 
-    first_inputs, inputs: what each was given at the stage rates, at the beginning and at the end of the step.
+    first_inputs, inputs: what each was given at the stage rates, at the beginning and at the end of
+    the step.
     """
     found = []
     for parameters, memory, *given in zip(effects, memories, first_inputs, inputs, strict=True):

@@ -1,9 +1,9 @@
 """What an effect is: something that the minimal model leaves out, in one file.
 
 A file of this folder has a ``NamedTuple`` of parameters (numbers in SI units unless its range has
-another unit, each with its **neutral** value as default) and one ``Effect`` that defines how they act. A
-model carries the parameters of the effects that it has; the simulator folds them, in the order of
-``flytrack_env.effects.EFFECTS``, at the stages of a step, and then of reading the sensors:
+another unit, each with its **neutral** value as default) and one ``Effect`` that defines how they
+act. A model carries the parameters of the effects that it has; the simulator folds them, in the
+order of ``flytrack_env.effects.EFFECTS``, at the stages of a step, and then of reading the sensors:
 
 =============  =====================  ====================================================  ========
 stage          value                  what it is                                            acts on
@@ -21,11 +21,12 @@ accelerometer  ``Vec3``, m/s^2, body  what the accelerometer says of the specifi
 pose           ``Pose``, world        position, velocity and attitude as they are reported  sensor
 =============  =====================  ====================================================  ========
 
-Readings do not change the flight. ``flytrack_env.dynamics.read_sensors`` and ``sensed`` compute them after
-the step, with the memories after it.
+Readings do not change the flight. ``flytrack_env.dynamics.read_sensors`` and ``sensed`` compute
+them after the step, with the memories after it.
 
-A hook takes the effect's parameters, its memory, the value so far and the ``StepContext``, and returns
-the value. At neutral parameters it returns the value bit for bit, so that neutral equals absent.
+A hook takes the effect's parameters, its memory, the value so far and the ``StepContext``, and
+returns the value. At neutral parameters it returns the value bit for bit, so that neutral equals
+absent.
 """
 
 from collections.abc import Callable, Mapping
@@ -65,22 +66,22 @@ class Pose(NamedTuple):
 class StepContext(NamedTuple):
     """What an effect may look at; a field is ``NOT_YET`` before the stage that fills it.
 
-    drone: before the step. command: as given, before any effect. dt: s. motion: of the model. acting: the
-    command after the stage command. full_stick_b: body rates of full sticks, rad/s.
-    thrust_coeffs: of the model's thrust map.
-    applied: the lagged action after the step. body_axes_w: the body's x, y, z axes before the step.
-    air_w: after the stage air, m/s. thrust_acc: collective thrust over mass, after the stage thrust, m/s^2.
-    rates_b: after the stage rates, rad/s. force_b: specific force of the step, thrust and all else but
-    gravity, in the body frame before it, after the stage force, m/s^2.
-    At the stages gyro and pose only dt, applied and rates_b are those of the step; drone is the one after it.
+    drone: before the step. command: as given, before any effect. dt: s. motion: of the model.
+    acting: the command after the stage command. full_stick_b: body rates of full sticks, rad/s.
+    thrust_coeffs: of the model's thrust map. applied: the lagged action after the step.
+    body_axes_w: the body's x, y, z axes before the step. air_w: after the stage air, m/s.
+    thrust_acc: collective thrust over mass, after the stage thrust, m/s^2. rates_b: after the stage
+    rates, rad/s. force_b: specific force of the step, thrust and all else but gravity, in the body
+    frame before it, after the stage force, m/s^2. At the stages gyro and pose only dt, applied and
+    rates_b are those of the step; drone is the one after it.
 
-    A step of continuous motion folds the stages at several moments; applied, rates_b and force_b are those
-    of the moment, and dt is the time since the beginning of the step at the stages rates and battery.
-    span: shares of the step between which the command acts; the value of the stage command is its mean there.
-    applied_slope: change of the applied action at the moment, 1/s. angular_acc_b: rad/s^2, at the end.
-    middle_rates_b, middle_force_b: as rates_b and force_b, in the middle of the step.
-    first_input_b, input_b: what the effect is given at the stage rates at the beginning of the step, and at
-    its end where it remembers the step, rad/s.
+    A step of continuous motion folds the stages at several moments; applied, rates_b and force_b
+    are those of the moment, and dt is the time since the beginning of the step at the stages rates
+    and battery. span: shares of the step between which the command acts; the value of the stage
+    command is its mean there. applied_slope: change of the applied action at the moment, 1/s.
+    angular_acc_b: rad/s^2, at the end. middle_rates_b, middle_force_b: as rates_b and force_b, in
+    the middle of the step. first_input_b, input_b: what the effect is given at the stage rates at
+    the beginning of the step, and at its end where it remembers the step, rad/s.
     """
 
     drone: Drone
@@ -113,7 +114,8 @@ class StepContext(NamedTuple):
 class Range(NamedTuple):
     """Where a parameter may lie, and its unit: a bound for files, fits and randomisation.
 
-    Both signs where the equation allows them, so that a fit can show the opposite of what physics expects.
+    Both signs where the equation allows them, so that a fit can show the opposite of what physics
+    expects.
     """
 
     low: float
@@ -149,13 +151,11 @@ def shifted(offsets: Any, memory: None, vector: Vec3, context: StepContext) -> V
 class Memory:
     """What an effect remembers from step to step.
 
-    Attributes:
-        start: (parameters, drone) -> memory at the beginning of an episode. An effect with
-            ``max_steps`` also takes the number of steps to remember.
-        remember: (parameters, memory, context) -> memory after a step.
-        observe: (parameters, memory, offset_b, dt) -> memory corrected by measured body rates, and
-            the part of the offset that it does not explain. offset_b: measured minus modelled rates,
-            rad/s. dt: time since the last measurement, s.
+    Attributes: start: (parameters, drone) -> memory at the beginning of an episode. An effect with
+            ``max_steps`` also takes the number of steps to remember. remember: (parameters, memory,
+            context) -> memory after a step. observe: (parameters, memory, offset_b, dt) -> memory
+            corrected by measured body rates, and the part of the offset that it does not explain.
+            offset_b: measured minus modelled rates, rad/s. dt: time since the last measurement, s.
     """
 
     start: Callable[..., Any]

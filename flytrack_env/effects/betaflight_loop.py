@@ -15,8 +15,8 @@ from flytrack_env.thrust import collective_thrust
 
 Array = Any  # of the axes, (3,), or the motors, (4,)
 NUM_SUBSTEPS = 10  # of a step: 1 ms at 100 Hz
-# What a stronger motor turns, in the firmware's order of motors: left rotors roll to the right, rear rotors
-# pitch down. An axis a row.
+# What a stronger motor turns, in the firmware's order of motors: left rotors roll to the right,
+# rear rotors pitch down. An axis a row.
 SIGNS = np.array([[-1.0, -1.0, 1.0, 1.0], [1.0, -1.0, 1.0, -1.0], [1.0, -1.0, -1.0, 1.0]])
 IS_YAW = np.array([False, False, True])
 PER_DEGREE = np.pi / 180.0
@@ -42,12 +42,13 @@ NONE_HZ = 1e5  # a filter that does nothing in a millisecond
 class BetaflightLoop(NamedTuple):
     """The craft, and its settings as the firmware's command line has them; without arms there is no loop.
 
-    roll_arm, pitch_arm, yaw_arm: angular acceleration for a newton of one motor, 1/(kg m). yaw_spin: change
-    of the yaw rate when one motor starts, rad/s. motor_s: lag of the motors. precession: (I_z - I_y) / I_x.
-    rear_right, front_right, rear_left, front_left: thrust of a motor as a share of what it should be.
-    center_x, center_y: where the centre of mass is ahead and left of the motors' middle, as a share of the
-    motors' own distance from it. gyro_late_s: lag of the gyro beyond that of its filters' settings.
-    sticks_hz, throttle_hz: cutoffs of the receiver's smoothing. A cutoff of 0 is no filter.
+    roll_arm, pitch_arm, yaw_arm: angular acceleration for a newton of one motor, 1/(kg m).
+    yaw_spin: change of the yaw rate when one motor starts, rad/s. motor_s: lag of the motors.
+    precession: (I_z - I_y) / I_x. rear_right, front_right, rear_left, front_left: thrust of a motor
+    as a share of what it should be. center_x, center_y: where the centre of mass is ahead and left
+    of the motors' middle, as a share of the motors' own distance from it. gyro_late_s: lag of the
+    gyro beyond that of its filters' settings. sticks_hz, throttle_hz: cutoffs of the receiver's
+    smoothing. A cutoff of 0 is no filter.
     """
 
     roll_arm: Scalar = 0.0
@@ -120,8 +121,8 @@ class BetaflightLoop(NamedTuple):
 class Frames(NamedTuple):
     """The receiver's frames: what the last one said, and what feedforward makes of those before; (3,) each.
 
-    setpoint, hold: deg/s, the latter follows slowly. speed: smoothed, deg/s^2; speed_change: of it, in a
-    frame. moved: by how much the stick did, us. was_still: 1 if it did not.
+    setpoint, hold: deg/s, the latter follows slowly. speed: smoothed, deg/s^2; speed_change: of it,
+    in a frame. moved: by how much the stick did, us. was_still: 1 if it did not.
     """
 
     stick: Array
@@ -199,7 +200,15 @@ def start(loop: BetaflightLoop, drone: Drone) -> Loop:
     zero, sticks = jnp.zeros_like(rates), jnp.stack(drone.applied[:3])
     frames = Frames(sticks, rates, zero, zero, zero, zero + 1.0, rates, zero)
     axes = Axes(
-        (rates,) * 3, (zero,) * 3, rates, (rates,) * 2, (zero,) * 2, (zero + 1.0,) * 2, rates, zero, zero
+        (rates,) * 3,
+        (zero,) * 3,
+        rates,
+        (rates,) * 2,
+        (zero,) * 2,
+        (zero + 1.0,) * 2,
+        rates,
+        zero,
+        zero,
     )
     level = 0.5 * (drone.applied.thrust + 1.0)
     throttle = Throttle((level,) * 3, level, (jnp.zeros_like(level),) * 2, level)
@@ -217,7 +226,9 @@ def _like(constants: np.ndarray, value: Array) -> Array:
     return jnp.asarray(constants, value.dtype)
 
 
-def _lowpass(stages: tuple[Scalar, ...], target: Scalar, cutoff_hz: Scalar, dt: Scalar) -> tuple[Scalar, ...]:
+def _lowpass(
+    stages: tuple[Scalar, ...], target: Scalar, cutoff_hz: Scalar, dt: Scalar
+) -> tuple[Scalar, ...]:
     """Return the stages of a low pass after a held target: exact; its cutoff is that of all stages."""
     correction = 1.0 / (2.0 ** (1.0 / len(stages)) - 1.0) ** 0.5
     cutoff_hz = jnp.where(cutoff_hz > 0.0, cutoff_hz * correction, NONE_HZ)
@@ -234,7 +245,9 @@ def _lowpass(stages: tuple[Scalar, ...], target: Scalar, cutoff_hz: Scalar, dt: 
     return tuple(found)
 
 
-def _received(loop: BetaflightLoop, frames: Frames, stick: Array, full: Array, dt: Scalar) -> Frames:
+def _received(
+    loop: BetaflightLoop, frames: Frames, stick: Array, full: Array, dt: Scalar
+) -> Frames:
     """Return the frames after another; full: rates at full stick, (3,) deg/s. dt: since the last, s."""
     setpoint, reach = stick * full, jnp.abs(full)
     change = setpoint - frames.setpoint
@@ -256,7 +269,9 @@ def _received(loop: BetaflightLoop, frames: Frames, stick: Array, full: Array, d
     limit = jnp.maximum(reach - jnp.abs(setpoint), 0.0) * FF_RATE_LIMIT
     boosted = jnp.where(boosted * setpoint > 0.0, jnp.clip(boosted, -limit, limit), boosted)
     feedforward = jnp.where(IS_YAW, speed * attenuation + YAW_HOLD * (setpoint - hold), boosted)
-    return Frames(stick, setpoint, speed, speed_change, moved, is_still.astype(hold.dtype), hold, feedforward)
+    return Frames(
+        stick, setpoint, speed, speed_change, moved, is_still.astype(hold.dtype), hold, feedforward
+    )
 
 
 def _throttled(
@@ -282,7 +297,9 @@ def _cutoff(low: Scalar, high: Scalar, level: Scalar) -> Scalar:
     return low + (high - low) * level * (1.0 + FILTER_EXPO * (1.0 - level))
 
 
-def _filtered_gyro(loop: BetaflightLoop, gyro: Array, rates: Array, level: Scalar, dt: Scalar) -> Array:
+def _filtered_gyro(
+    loop: BetaflightLoop, gyro: Array, rates: Array, level: Scalar, dt: Scalar
+) -> Array:
     """Return the gyro behind both filters, as one lag; half a substep of delay is in the substep."""
 
     def lag_s(cutoff_hz: Scalar) -> Scalar:
@@ -368,7 +385,8 @@ def _turned(state: Turn, given: Given, motors: Array) -> Array:
     """Return the body rates a substep later, deg/s, at whose end motors are as fast as given."""
     loop, both, signs = given.loop, (motors, state.motors), _like(SIGNS, motors)
     thrusts = sum(
-        collective_thrust(_action_of(speeds, loop), given.battery_v, given.thrust_coeffs) for speeds in both
+        collective_thrust(_action_of(speeds, loop), given.battery_v, given.thrust_coeffs)
+        for speeds in both
     )
     thrusts = 0.125 * loop.health * thrusts  # of a motor, the mean of the substep
     # Sum by sum: XLA makes a product of matrices of a reduction, which no kernel has.
@@ -376,7 +394,8 @@ def _turned(state: Turn, given: Given, motors: Array) -> Array:
     torques = sum(thrusts[motor] * (signs[:, motor] + levers) for motor in range(4))
     spun = loop.yaw_spin * sum((both[0] - both[1])[motor] * signs[2, motor] for motor in range(4))
     x, y, z = state.rates
-    # The midpoint rule turns roll and pitch by an angle; Euler's would feed a fast yaw until it overflows.
+    # The midpoint rule turns roll and pitch by an angle; Euler's would feed a fast yaw until it
+    # overflows.
     half = 0.5 * given.dt * loop.precession * PER_DEGREE * z
     turned = jnp.stack([x - half * (2.0 * y + half * x), y + half * (2.0 * x - half * y)]) / (
         1.0 + half * half
@@ -396,11 +415,17 @@ def _substep(state: Turn, given: Given) -> Turn:
     return Turn(_turned(state, given, motors), axes, throttle, motors)
 
 
-def _respond(loop: BetaflightLoop, memory: Loop, lagged: Action, context: StepContext) -> tuple[Action, Loop]:
+def _respond(
+    loop: BetaflightLoop, memory: Loop, lagged: Action, context: StepContext
+) -> tuple[Action, Loop]:
     """Return the applied action and the memory at the end of a span of the step, in which a command acts."""
     begin, end = context.span
     num_substeps = round(NUM_SUBSTEPS * (end - begin))
-    full, acting, frames = jnp.stack(context.full_stick_b) / PER_DEGREE, context.acting, memory.frames
+    full, acting, frames = (
+        jnp.stack(context.full_stick_b) / PER_DEGREE,
+        context.acting,
+        memory.frames,
+    )
     if begin == 0.0:  # a frame of the receiver comes with the step
         frames = _received(loop, frames, jnp.stack(acting[:3]), full, context.dt)
     given = Given(
@@ -436,7 +461,11 @@ def observe(loop: BetaflightLoop, memory: Loop, offset_b: Vec3, dt: Scalar) -> t
 
 CRAFT, MOTORS = BetaflightLoop._fields[:6], BetaflightLoop._fields[6:10]
 SETTINGS = BetaflightLoop._fields[BetaflightLoop._fields.index("p_roll") :]
-CENTER, GAINS, LATE = ("center_x", "center_y"), ("p_roll", "p_pitch", "d_roll", "d_pitch"), "gyro_late_s"
+CENTER, GAINS, LATE = (
+    ("center_x", "center_y"),
+    ("p_roll", "p_pitch", "d_roll", "d_pitch"),
+    "gyro_late_s",
+)
 NOTABLE = {
     **dict.fromkeys(CRAFT[:2], 5.0),
     **dict.fromkeys(MOTORS, 0.05),

@@ -10,7 +10,10 @@ from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action, Drone
 
 USUAL_STEPS, MOST_STEPS = 4, 12  # commands remembered, by default and at most
-LONGEST_S, LONGEST_STEPS = 0.06, 6  # of each parameter: all of them fit into the longest memory together
+LONGEST_S, LONGEST_STEPS = (
+    0.06,
+    6,
+)  # of each parameter: all of them fit into the longest memory together
 
 
 class CommandDelay(NamedTuple):
@@ -42,7 +45,9 @@ def dead_times(delay: CommandDelay) -> Action:
         together = delay.delay_s + extra_s
         return jnp.where(together < 0.0, 0.0, together)
 
-    return Action(delay.delay_s, delay.delay_s, later(delay.yaw_extra_s), later(delay.thrust_extra_s))
+    return Action(
+        delay.delay_s, delay.delay_s, later(delay.yaw_extra_s), later(delay.thrust_extra_s)
+    )
 
 
 def late(
@@ -50,9 +55,10 @@ def late(
 ) -> Scalar:
     """Return the mean over a step of a value that is ``delay_s`` late and was held over each step.
 
-    values: the present one, the one a step of ``dt`` s before, ... A delay of n + f steps is 1 - f parts of
-    the value n steps before and f parts of the one before that; longer delays than values are cut.
-    Differentiable, at 0 from above. span: shares of the step that the mean is over, if not all of it.
+    values: the present one, the one a step of ``dt`` s before, ... A delay of n + f steps is 1 - f
+    parts of the value n steps before and f parts of the one before that; longer delays than values
+    are cut. Differentiable, at 0 from above. span: shares of the step that the mean is over, if not
+    all of it.
     """
     steps = delay_s / dt
     mean = values[0]
@@ -62,7 +68,9 @@ def late(
     return mean
 
 
-def delayed(delay: CommandDelay, past: PastCommands, command: Action, context: StepContext) -> Action:
+def delayed(
+    delay: CommandDelay, past: PastCommands, command: Action, context: StepContext
+) -> Action:
     """Return the command that acts: the mean of what arrives during the span."""
     by_channel = zip(*(command, *past), strict=True)
     return Action(

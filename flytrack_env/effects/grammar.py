@@ -1,8 +1,9 @@
 """The grammar of laws that were learnt from a log: numbers and a fixed vocabulary, nothing is code.
 
-A law is a sum of terms, up to three on force and three on rate. A term is a vector in a frame times one or
-two factors; a factor is a shape of a quantity, ``bump(airspeed; 7, 1.2)``. Shapes and quantities are the
-tables below. A law is a static part of a model: what is compiled computes its terms only.
+A law is a sum of terms, up to three on force and three on rate. A term is a vector in a frame times
+one or two factors; a factor is a shape of a quantity, ``bump(airspeed; 7, 1.2)``. Shapes and
+quantities are the tables below. A law is a static part of a model: what is compiled computes its
+terms only.
 """
 
 import math
@@ -97,7 +98,10 @@ QUANTITIES: dict[str, Quantity] = {
     "airspeed_y": Quantity("m/s", -60.0, 60.0, lambda m: m.airspeed_b.y),
     "airspeed_z": Quantity("m/s", -60.0, 60.0, lambda m: m.airspeed_b.z),
     "edgewise": Quantity(
-        "m/s", 0.0, 60.0, lambda m: _root(m.airspeed_b.x * m.airspeed_b.x + m.airspeed_b.y * m.airspeed_b.y)
+        "m/s",
+        0.0,
+        60.0,
+        lambda m: _root(m.airspeed_b.x * m.airspeed_b.x + m.airspeed_b.y * m.airspeed_b.y),
     ),
     "thrust": Quantity("m/s^2", 0.0, 100.0, lambda m: jnp.maximum(m.thrust_acc, 0.0)),
     "rate_x": Quantity("rad/s", -40.0, 40.0, lambda m: m.rates_b.x),
@@ -145,8 +149,8 @@ def _place(moment: Moment, x: float, y: float, z: float, radius: float) -> Scala
 class Shape(NamedTuple):
     """A shape: the names of its numbers, the words of its formula, the quantities that have it, and itself.
 
-    positive: numbers that must be above 0. of_moment: it takes the moment in place of the quantity's value,
-    since its quantity is a direction or a place.
+    positive: numbers that must be above 0. of_moment: it takes the moment in place of the
+    quantity's value, since its quantity is a direction or a place.
     """
 
     numbers: tuple[str, ...]
@@ -178,7 +182,12 @@ SHAPES: dict[str, Shape] = {
         ("scale",),
     ),
     "wave": Shape(
-        ("order", "phase"), "cos({order} {q} + {phase})", ("heading",), _wave, ("order",), of_moment=True
+        ("order", "phase"),
+        "cos({order} {q} + {phase})",
+        ("heading",),
+        _wave,
+        ("order",),
+        of_moment=True,
     ),
     "place": Shape(
         ("x", "y", "z", "radius"),
@@ -208,9 +217,15 @@ class Factor:
     def text(self) -> str:
         """Return its formula."""
         shape = SHAPES[self.shape]
-        named = {name: f"{value:.4g}" for name, value in zip(shape.numbers, self.numbers, strict=True)}
+        named = {
+            name: f"{value:.4g}" for name, value in zip(shape.numbers, self.numbers, strict=True)
+        }
         if self.shape == "power":
-            base = self.quantity if self.numbers[1] == 0.0 else f"({self.quantity} + {named['offset']})"
+            base = (
+                self.quantity
+                if self.numbers[1] == 0.0
+                else f"({self.quantity} + {named['offset']})"
+            )
             return base if self.numbers[0] == 1.0 else f"{base}^{named['exponent']}"
         return shape.words.format(q=self.quantity, **named)
 
@@ -219,8 +234,8 @@ class Factor:
 class Term:
     """A vector times factors.
 
-    acts: "force", m/s^2 of specific force, or "rate", rad/s of body rates. frame: of the vector: body, world
-    or air: only the first component is used, along the velocity through the air.
+    acts: "force", m/s^2 of specific force, or "rate", rad/s of body rates. frame: of the vector:
+    body, world or air: only the first component is used, along the velocity through the air.
     coefficients, standard_errors: three each.
     """
 
@@ -247,7 +262,9 @@ class Term:
 
     def signal(self, moment: Moment) -> Scalar:
         """Return the product of its factors."""
-        return math.prod((factor.at(moment) for factor in self.factors[1:]), start=self.factors[0].at(moment))
+        return math.prod(
+            (factor.at(moment) for factor in self.factors[1:]), start=self.factors[0].at(moment)
+        )
 
     def at(self, moment: Moment, spread: Scalar) -> Vec3:
         """Return its vector, body frame; spread: by how many standard errors each coefficient is larger."""
@@ -303,9 +320,8 @@ class Law:
 def law_from_json(values: Any) -> Law:
     """Return the law in JSON values of ``Law.as_json``.
 
-    Raises:
-        ValueError: what is not in the grammar, numbers that are not finite, a pole within the envelope; the
-            message begins with the field.
+    Raises: ValueError: what is not in the grammar, numbers that are not finite, a pole within the
+            envelope; the message begins with the field.
     """
     kind = Annotated[tuple[_TermFields, ...], Meta(min_length=1, max_length=MOST_TERMS)]
     terms = convert("", values, kind, field="law")
@@ -331,7 +347,9 @@ class _TermFields(Fields):
 
 
 def _term(where: str, term: _TermFields) -> Term:
-    factors = (_factor(f"{where}.factors[{index}]", value) for index, value in enumerate(term.factors))
+    factors = (
+        _factor(f"{where}.factors[{index}]", value) for index, value in enumerate(term.factors)
+    )
     return Term(term.acts, term.frame, tuple(factors), term.coefficients, term.standard_errors)
 
 
@@ -339,7 +357,9 @@ def _factor(where: str, value: dict[str, Any]) -> Factor:
     name = choose(f"{where}.shape", value.get("shape"), SHAPES)
     shape = SHAPES[name]
     positive = Annotated[float, Meta(gt=0.0, le=LARGEST)]
-    numbers = [(number, positive if number in shape.positive else Number) for number in shape.numbers]
+    numbers = [
+        (number, positive if number in shape.positive else Number) for number in shape.numbers
+    ]
     kind = msgspec.defstruct(name, [("quantity", str), ("shape", str), *numbers], bases=(Fields,))
     fields = convert("", value, kind, field=where)
     quantity = choose(f"{where}.quantity", value["quantity"], shape.quantities)

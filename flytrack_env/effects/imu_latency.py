@@ -21,8 +21,9 @@ class ImuLatency(NamedTuple):
 class PastReadings(NamedTuple):
     """True body rates, rad/s, and specific forces, m/s^2, body; the present ones first, then the past.
 
-    rate_bends_b, force_bends_b: how far those in the middle of a continuous step are from the mean of its
-    ends, of the same steps; the last one is not used. is_fresh: no step was made yet, and no force is known.
+    rate_bends_b, force_bends_b: how far those in the middle of a continuous step are from the mean
+    of its ends, of the same steps; the last one is not used. is_fresh: no step was made yet, and no
+    force is known.
     """
 
     rates_b: tuple[Vec3, ...]
@@ -37,11 +38,17 @@ def start(latency: ImuLatency, drone: Drone, num_steps: int) -> PastReadings:
     still = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
     size = min(num_steps, USUAL_STEPS) + 1
     none = (still,) * size
-    return PastReadings((drone.rates_b,) * size, none, none, none, jnp.ones_like(drone.battery_v, bool))
+    return PastReadings(
+        (drone.rates_b,) * size, none, none, none, jnp.ones_like(drone.battery_v, bool)
+    )
 
 
 def _late(
-    latency: ImuLatency, present: Vec3, past: Sequence[Vec3], bends: Sequence[Vec3], context: StepContext
+    latency: ImuLatency,
+    present: Vec3,
+    past: Sequence[Vec3],
+    bends: Sequence[Vec3],
+    context: StepContext,
 ) -> Vec3:
     """Return the reading of the delayed time: on the parabola of its step, a line in a simulator.
 
@@ -60,7 +67,9 @@ def _gyro(latency: ImuLatency, past: PastReadings, rates_b: Vec3, context: StepC
     return _late(latency, rates_b, past.rates_b, past.rate_bends_b, context)
 
 
-def _accelerometer(latency: ImuLatency, past: PastReadings, force_b: Vec3, context: StepContext) -> Vec3:
+def _accelerometer(
+    latency: ImuLatency, past: PastReadings, force_b: Vec3, context: StepContext
+) -> Vec3:
     return _late(latency, force_b, past.forces_b, past.force_bends_b, context)
 
 

@@ -46,7 +46,9 @@ def _pose(latency: MocapLatency, past: PastPoses, pose: Pose, context: StepConte
     pos_w, vel_w, quat = (mean(*vectors) for vectors in zip(*poses, strict=True))
     is_late = jnp.asarray(latency.latency_s) > 0.0
     pairs = zip(Quaternion(*quat).normalize(), pose.quat, strict=True)
-    return Pose(Vec3(*pos_w), Vec3(*vel_w), Quaternion(*(jnp.where(is_late, *pair) for pair in pairs)))
+    return Pose(
+        Vec3(*pos_w), Vec3(*vel_w), Quaternion(*(jnp.where(is_late, *pair) for pair in pairs))
+    )
 
 
 def remember(latency: MocapLatency, past: PastPoses, context: StepContext) -> PastPoses:

@@ -15,7 +15,9 @@ class MotorImbalance(NamedTuple):
 
 def _rates(imbalance: MotorImbalance, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
     thrust_acc = context.thrust_acc
-    return Vec3(rates_b.x + imbalance.roll * thrust_acc, rates_b.y + imbalance.pitch * thrust_acc, rates_b.z)
+    return Vec3(
+        rates_b.x + imbalance.roll * thrust_acc, rates_b.y + imbalance.pitch * thrust_acc, rates_b.z
+    )
 
 
 MOTOR_IMBALANCE = Effect(

@@ -22,7 +22,9 @@ def _force(drag: QuadraticDrag, memory: None, force_b: Vec3, context: StepContex
     whole = drag.shared * airspeed_b.norm()
     own = 1.0 - drag.shared
     coefficients = zip((drag.k_x, drag.k_y, drag.k_z), airspeed_b, strict=True)
-    return force_b - Vec3(*(k * (whole + own * jnp.abs(speed)) * speed for k, speed in coefficients))
+    return force_b - Vec3(
+        *(k * (whole + own * jnp.abs(speed)) * speed for k, speed in coefficients)
+    )
 
 
 QUADRATIC_DRAG = Effect(

@@ -31,7 +31,9 @@ def _command(limit: RateSaturation, memory: None, sticks: Action, context: StepC
         share = corner + limit.softness * (gradual - corner)
         return jnp.where(lost > 0.0, stick * share, stick)  # sticks beyond full ones stay, too
 
-    roll, pitch, yaw = (limited(stick, lost) for stick, lost in zip(sticks[:3], limit[:3], strict=True))
+    roll, pitch, yaw = (
+        limited(stick, lost) for stick, lost in zip(sticks[:3], limit[:3], strict=True)
+    )
     return sticks._replace(roll=roll, pitch=pitch, yaw=yaw)
 
 

@@ -23,7 +23,9 @@ class RateSlewLimit(NamedTuple):
     yaw_s: Scalar = 0.0
 
 
-Setpoint = tuple[Scalar, Scalar, Scalar]  # the rate sticks that the loop follows at the end of a step
+Setpoint = tuple[
+    Scalar, Scalar, Scalar
+]  # the rate sticks that the loop follows at the end of a step
 
 
 def start(limit: RateSlewLimit, drone: Drone) -> Setpoint:
@@ -31,7 +33,9 @@ def start(limit: RateSlewLimit, drone: Drone) -> Setpoint:
     return drone.applied[:3]
 
 
-def _command(limit: RateSlewLimit, setpoint: Setpoint, sticks: Action, context: StepContext) -> Action:
+def _command(
+    limit: RateSlewLimit, setpoint: Setpoint, sticks: Action, context: StepContext
+) -> Action:
     """Return the sticks that a simulator's step ends with; of continuous motion their mean in the span."""
 
     def limited(stick: Scalar, before: Scalar, full_s: Scalar) -> Scalar:
@@ -87,6 +91,10 @@ RATE_SLEW_LIMIT = Effect(
     hooks={"command": _command},
     memory=Memory(start=start, remember=remember),
     search=Search(
-        probes={"roll_s": (0.03, 0.1, 0.3), "pitch_s": (0.03, 0.1, 0.3), "yaw_s": (0.015, 0.05, 0.15)}
+        probes={
+            "roll_s": (0.03, 0.1, 0.3),
+            "pitch_s": (0.03, 0.1, 0.3),
+            "yaw_s": (0.015, 0.05, 0.15),
+        }
     ),
 )

@@ -84,7 +84,9 @@ def _input(lag_s: Scalar, before: Scalar, now: Scalar, context: StepContext) -> 
     return _Input(before - lag_s * slope, now - lag_s * slope, slope)
 
 
-def _turned(loop: SecondOrderRates, memory: Turning, inputs_b: Vec3, context: StepContext) -> Turning:
+def _turned(
+    loop: SecondOrderRates, memory: Turning, inputs_b: Vec3, context: StepContext
+) -> Turning:
     """Return rates and slopes after the step, at whose end the loop is given these inputs."""
 
     def follow(
@@ -111,12 +113,17 @@ def remember(loop: SecondOrderRates, memory: Turning, context: StepContext) -> T
     return Turning(context.rates_b, _turned(loop, memory, context.input_b, context).slopes_b)
 
 
-def observe(loop: SecondOrderRates, memory: Turning, offset_b: Vec3, dt: Scalar) -> tuple[Turning, Vec3]:
+def observe(
+    loop: SecondOrderRates, memory: Turning, offset_b: Vec3, dt: Scalar
+) -> tuple[Turning, Vec3]:
     """Return the memory with the measured rates, and slopes nearer to theirs (an alpha-beta filter).
 
     Axes without a lag hold none of the offset.
     """
-    own = [jnp.where(lag_s > SHORTEST_S, offset, 0.0) for lag_s, offset in zip(loop, offset_b, strict=False)]
+    own = [
+        jnp.where(lag_s > SHORTEST_S, offset, 0.0)
+        for lag_s, offset in zip(loop, offset_b, strict=False)
+    ]
     held_b = Vec3(*own)
     seen = Turning(memory.rates_b + held_b, memory.slopes_b + held_b.scale(OBSERVED_SLOPE / dt))
     return seen, offset_b - held_b

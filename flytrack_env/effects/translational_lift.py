@@ -5,8 +5,8 @@ from typing import NamedTuple
 from flytrack_env.effects.base import Effect, Range, Search, StepContext
 from flytrack_env.quaternion import Scalar
 
-# m/s, airspeed at which half of the gain is there: about the velocity that a racing quadcopter's rotors
-# induce in hover. Not a parameter, because nothing depends on it while there is no gain.
+# m/s, airspeed at which half of the gain is there: about the velocity that a racing quadcopter's
+# rotors induce in hover. Not a parameter, because nothing depends on it while there is no gain.
 HALF_SPEED = 7.0
 
 
@@ -16,7 +16,9 @@ class TranslationalLift(NamedTuple):
     gain: Scalar = 0.0
 
 
-def _thrust(lift: TranslationalLift, memory: None, thrust_n: Scalar, context: StepContext) -> Scalar:
+def _thrust(
+    lift: TranslationalLift, memory: None, thrust_n: Scalar, context: StepContext
+) -> Scalar:
     airspeed_b = context.airspeed_b()
     squared = airspeed_b.x * airspeed_b.x + airspeed_b.y * airspeed_b.y
     return thrust_n * (1.0 + lift.gain * (squared / (squared + HALF_SPEED * HALF_SPEED)))

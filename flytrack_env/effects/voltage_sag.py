@@ -15,7 +15,8 @@ class VoltageSag(NamedTuple):
 def load_of(thrust_action: Scalar) -> Scalar:
     """Return the load of a thrust action in [-1, 1] as a share of the full load.
 
-    Assumption: the current goes with the square of the stick above idle, as thrust does at first order.
+    Assumption: the current goes with the square of the stick above idle, as thrust does at first
+    order.
     """
     stick = 0.5 * (1.0 + thrust_action)
     return stick * stick

@@ -1,7 +1,7 @@
 """The environments as Gymnasium environments, single and vectorised (docs/gymnasium.md).
 
-Importing this package registers nothing and compiles nothing; Gymnasium imports ``environments`` when the
-first one is made.
+Importing this package registers nothing and compiles nothing; Gymnasium imports ``environments``
+when the first one is made.
 """
 
 import gymnasium

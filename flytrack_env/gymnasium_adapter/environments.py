@@ -37,7 +37,11 @@ class _Adapter:
     _logs: dict[int, FlightLog]  # of pictures, by the environment's index
 
     def _set_up(
-        self, env_id: str, render_mode: str | None, params: EnvParams | None, overrides: dict[str, Any]
+        self,
+        env_id: str,
+        render_mode: str | None,
+        params: EnvParams | None,
+        overrides: dict[str, Any],
     ) -> tuple[Any, ...]:
         """Make the simulation and what draws it; return the spaces of an observation and an action."""
         render_modes = self.metadata["render_modes"]
@@ -46,9 +50,13 @@ class _Adapter:
             raise ValueError(f"render_mode: found {render_mode!r}, expected None, {expected}")
         self.render_mode, self._states, self._logs = render_mode, None, {}
         self._simulation = simulation = Simulation(env_id, params, overrides)
-        # The class announces every mode, so that asking for one that is missing says how to install it.
+        # The class announces every mode, so that asking for one that is missing says how to install
+        # it.
         modes = [mode for mode in render_modes if can_render(mode)]
-        self.metadata = self.metadata | {"render_modes": modes, "render_fps": round(1.0 / simulation.step_s)}
+        self.metadata = self.metadata | {
+            "render_modes": modes,
+            "render_fps": round(1.0 / simulation.step_s),
+        }
         self._open()
         spaces = simulation.env.observation_space(params), simulation.env.action_space(params)
         return tuple(map(gymnax_space_to_gym_space, spaces))
@@ -58,7 +66,9 @@ class _Adapter:
         self._renderer = None if self.render_mode is None else self._simulation.make_renderer()
         self._window = open_window(self._simulation.step_s) if self.render_mode == "human" else None
 
-    def _begin(self, options: dict[str, Any] | None, draw_words: Callable[[], np.ndarray]) -> np.ndarray:
+    def _begin(
+        self, options: dict[str, Any] | None, draw_words: Callable[[], np.ndarray]
+    ) -> np.ndarray:
         """Begin episodes as the options of a reset say; return their observations, (num_envs, size).
 
         draw_words: called for the words of their keys once the options are known to be good.
@@ -97,7 +107,9 @@ class _Adapter:
 
     def _check_begun(self, method: str) -> None:
         if self._states is None:
-            raise gymnasium.error.ResetNeeded(f"{method}: found no episode, expected a reset before it")
+            raise gymnasium.error.ResetNeeded(
+                f"{method}: found no episode, expected a reset before it"
+            )
 
     def _draw_pictures(self) -> tuple[np.ndarray, ...] | None:
         """Return a picture per environment in mode "rgb_array", else None."""
@@ -119,22 +131,27 @@ class _Adapter:
 class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
     """One environment of an id, stepped as one compiled function.
 
-    env_id: of ``flytrack_env.registration.ENVIRONMENTS``. render_mode: None, "rgb_array" or "human". params:
-    replace the default parameters. overrides: further arguments of ``flytrack_env.make``: track, model,
-    plant, missed_gate, reward.
+    env_id: of ``flytrack_env.registration.ENVIRONMENTS``. render_mode: None, "rgb_array" or
+    "human". params: replace the default parameters. overrides: further arguments of
+    ``flytrack_env.make``: track, model, plant, missed_gate, reward.
 
-    Raises:
-        ValueError, TypeError: what ``flytrack_env.make`` and ``check_params`` refuse, or a render mode.
-        ImportError: a render mode whose package is not installed.
+    Raises: ValueError, TypeError: what ``flytrack_env.make`` and ``check_params`` refuse, or a
+        render mode. ImportError: a render mode whose package is not installed.
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 100}  # noqa: RUF012  # as Gymnasium declares it
 
     def __init__(
-        self, env_id: str, render_mode: str | None = None, params: EnvParams | None = None, **overrides: Any
+        self,
+        env_id: str,
+        render_mode: str | None = None,
+        params: EnvParams | None = None,
+        **overrides: Any,
     ):
         check_keywords(overrides, ("render_mode", "params", *ARGUMENTS))
-        self.observation_space, self.action_space = self._set_up(env_id, render_mode, params, overrides)
+        self.observation_space, self.action_space = self._set_up(
+            env_id, render_mode, params, overrides
+        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -165,7 +182,10 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
             gymnasium.error.ResetNeeded: no episode has begun.
             ValueError: an action of another shape.
         """
-        action, simulation = self._check("action", action, self.action_space.shape), self._simulation
+        action, simulation = (
+            self._check("action", action, self.action_space.shape),
+            self._simulation,
+        )
         found = step(simulation.compiled, self._states, action[None], simulation.packed_params)
         self._states, observations, scenes, outcomes = found
         self._log(scenes, NONE_BEGAN)
@@ -201,11 +221,11 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
 class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """Environments of one id side by side, each reset by itself after its episode ended.
 
-    What ``gymnasium.vector.SyncVectorEnv`` returns in the same autoreset mode, in the same types: new,
-    writable arrays in every step.
+    What ``gymnasium.vector.SyncVectorEnv`` returns in the same autoreset mode, in the same types:
+    new, writable arrays in every step.
 
-    render_mode: None or "rgb_array". autoreset_mode: ``AutoresetMode.NEXT_STEP`` or ``SAME_STEP``, or its
-    value. Other arguments and errors are those of ``FlyTrackEnv``.
+    render_mode: None or "rgb_array". autoreset_mode: ``AutoresetMode.NEXT_STEP`` or ``SAME_STEP``,
+    or its value. Other arguments and errors are those of ``FlyTrackEnv``.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  # as Gymnasium declares it
@@ -223,7 +243,9 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **overrides: Any,
     ):
-        check_keywords(overrides, ("num_envs", "render_mode", "params", "autoreset_mode", *ARGUMENTS))
+        check_keywords(
+            overrides, ("num_envs", "render_mode", "params", "autoreset_mode", *ARGUMENTS)
+        )
         mode = getattr(autoreset_mode, "value", autoreset_mode)
         if mode not in AUTORESET_MODES:
             expected = " or ".join(map(repr, AUTORESET_MODES))
@@ -246,13 +268,12 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Return observations and an empty info of episodes that begin, in all environments.
 
-        seed: of the first environment, the others counting up; or one per environment. An environment's
-        start is that of a single environment with its seed. options: as for the single environment, the
-        same for all.
+        seed: of the first environment, the others counting up; or one per environment. An
+        environment's start is that of a single environment with its seed. options: as for the
+        single environment, the same for all.
 
-        Raises:
-            ValueError: an unknown option, a value that no episode can start with, or another number of
-                seeds.
+        Raises: ValueError: an unknown option, a value that no episode can start with, or another
+                number of seeds.
         """
         observations = self._begin(options, lambda: self._seed(seed))
         self._words, self._count = draw_key(self.np_random), 0
@@ -269,7 +290,9 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
         else:
             seeds = [one if one is None else int(one) for one in seed]
         if len(seeds) != self.num_envs:
-            raise ValueError(f"seed: found {len(seeds)} seeds, expected one per environment, {self.num_envs}")
+            raise ValueError(
+                f"seed: found {len(seeds)} seeds, expected one per environment, {self.num_envs}"
+            )
         words = np.stack([draw_key(seeding.np_random(one)[0]) for one in seeds])
         # The draws after this one depend on all seeds; Gymnasium's generator takes one integer.
         common = np.random.SeedSequence(words.ravel().tolist()).generate_state(SEED_WORDS)
@@ -281,10 +304,11 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Return observations, rewards, terminations, truncations and infos of a step.
 
-        actions: (num_envs, 4). With ``NEXT_STEP``, where an episode ended in the step before, the action is
-        ignored, and the observation is the first one of the next episode, with a reward of 0, no flag and no
-        info. With ``SAME_STEP``, where an episode ends, the observation is the first one of the next episode,
-        and infos has ``final_obs`` and ``final_info`` with their masks.
+        actions: (num_envs, 4). With ``NEXT_STEP``, where an episode ended in the step before, the
+        action is ignored, and the observation is the first one of the next episode, with a reward
+        of 0, no flag and no info. With ``SAME_STEP``, where an episode ends, the observation is the
+        first one of the next episode, and infos has ``final_obs`` and ``final_info`` with their
+        masks.
 
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
@@ -312,7 +336,9 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
         elif done.any():
             indices, infos = np.flatnonzero(done), {} if done.all() else infos
             final_obs = np.empty(self.num_envs, object)  # filled with None
-            for index, final in zip(indices.tolist(), np.asarray(final_observations)[indices], strict=True):
+            for index, final in zip(
+                indices.tolist(), np.asarray(final_observations)[indices], strict=True
+            ):
                 final_obs[index] = final
             infos.update(final_obs=final_obs, final_info=final_info, **final_masks)
         return np.array(observations), rewards, terminated, truncated, infos

@@ -1,7 +1,7 @@
 """Batches of pytrees packed as a few matrices, one per dtype.
 
-Handing an array to a compiled function and taking one from it costs about a microsecond; a state has some
-fifty leaves and the parameters as many again.
+Handing an array to a compiled function and taking one from it costs about a microsecond; a state
+has some fifty leaves and the parameters as many again.
 """
 
 import math
@@ -51,7 +51,10 @@ class Packed:
 
     def unpack(self) -> Any:
         """Return the batch that was packed, leaves (num_envs, ...)."""
-        rows = ((shape, self.matrices[matrix][first:end]) for shape, matrix, first, end in self.layout.places)
+        rows = (
+            (shape, self.matrices[matrix][first:end])
+            for shape, matrix, first, end in self.layout.places
+        )
         leaves = [part.T.reshape(-1, *shape) for shape, part in rows]
         return jax.tree.unflatten(self.layout.structure, leaves)
 

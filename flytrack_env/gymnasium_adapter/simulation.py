@@ -18,7 +18,11 @@ from flytrack_env.state import unpack
 from flytrack_env.tracks import Track, build_course, load_track
 
 KEY_WORDS = 2  # uint32 words of a random key
-NOT_INFO = ("terminated", "truncated", "final_observation")  # of step_batch's info; returned separately
+NOT_INFO = (
+    "terminated",
+    "truncated",
+    "final_observation",
+)  # of step_batch's info; returned separately
 
 
 def draw_key(generator: np.random.Generator, shape: tuple[int, ...] = ()) -> np.ndarray:
@@ -44,7 +48,8 @@ def begin(
 ) -> tuple[Packed, jax.Array, jax.Array]:
     """Return states, observations and scenes of episodes that begin.
 
-    words: of their keys, (num_envs, KEY_WORDS). start: as of ``options.read_start``, the same for all.
+    words: of their keys, (num_envs, KEY_WORDS). start: as of ``options.read_start``, the same for
+    all.
     """
     own = _params_of(params)
 
@@ -92,8 +97,8 @@ def step_batch(
     """Return states, observations, final observations, scenes, and what ``_group`` makes of the rest.
 
     The auto-resetting step of a batch. words: of one key for all; count: makes it this step's own.
-    has_ended: None to reset in this step, or (num_envs,) bool for those that ended in the step before.
-    Scenes, after the auto-reset, are None unless they are needed.
+    has_ended: None to reset in this step, or (num_envs,) bool for those that ended in the step
+    before. Scenes, after the auto-reset, are None unless they are needed.
     """
     key = jax.random.fold_in(_make_key(words), count)
     found = env.step_batch(key, states.unpack(), actions, _params_of(params), has_ended)
@@ -106,17 +111,24 @@ def step_batch(
 
 
 def _group(
-    reward: jax.Array, terminated: jax.Array, truncated: jax.Array, info: dict[str, Any], has_ended: Any
+    reward: jax.Array,
+    terminated: jax.Array,
+    truncated: jax.Array,
+    info: dict[str, Any],
+    has_ended: Any,
 ) -> Any:
     """Return what a vector environment gives of one environment's step, as ``SyncVectorEnv`` groups it.
 
-    Reward, flags, the infos of an episode that goes on, the final infos of one that ended, and the masks
-    of the latter. A mask says where the value of its name, less the underscore, is given; elsewhere it is 0.
-    has_ended: None; or whether this is the reset after an end, which has no infos, and then nothing is final.
+    Reward, flags, the infos of an episode that goes on, the final infos of one that ended, and the
+    masks of the latter. A mask says where the value of its name, less the underscore, is given;
+    elsewhere it is 0. has_ended: None; or whether this is the reset after an end, which has no
+    infos, and then nothing is final.
     """
 
     def masked(mask: jax.Array) -> dict[str, jax.Array]:
-        values = {name: jnp.where(mask, value, jnp.zeros_like(value)) for name, value in info.items()}
+        values = {
+            name: jnp.where(mask, value, jnp.zeros_like(value)) for name, value in info.items()
+        }
         return values | {f"_{name}": mask for name in info}
 
     if has_ended is not None:
@@ -126,8 +138,9 @@ def _group(
     return reward, terminated, truncated, masked(~done), masked(done), final_masks
 
 
-# By all that a compiled function depends on: id, missed gates, plant, the delay that the simulator of a model
-# remembers, and the layout of the parameters. An environment keeps its plant, and so the plant's id.
+# By all that a compiled function depends on: id, missed gates, plant, the delay that the simulator
+# of a model remembers, and the layout of the parameters. An environment keeps its plant, and so the
+# plant's id.
 _COMPILED: dict[Any, EpisodicEnvironment] = {}
 
 
@@ -136,9 +149,8 @@ class Simulation:
 
     env_id, overrides: what ``flytrack_env.make`` takes. params: replace the defaults if not None.
 
-    Raises:
-        ValueError: what ``flytrack_env.make`` and ``check_params`` refuse, and leaves of another shape.
-        TypeError: params of another type.
+    Raises: ValueError: what ``flytrack_env.make`` and ``check_params`` refuse, and leaves of
+        another shape. TypeError: params of another type.
     """
 
     def __init__(self, env_id: str, params: EnvParams | None, overrides: dict[str, Any]):

@@ -24,9 +24,9 @@ class Path(NamedTuple):
 def is_put_out(own: Path, other: Path, rules: RaceRules) -> jax.Array:
     """Return whether a collision in this step puts a drone out of the race, a bool scalar.
 
-    The spheres touch where the distance of the two, both moving evenly, falls below a diameter at any moment
-    of the step. Who approached the other the faster at that moment, along the line between the two, ran into
-    it; who approached equally fast, did too.
+    The spheres touch where the distance of the two, both moving evenly, falls below a diameter at
+    any moment of the step. Who approached the other the faster at that moment, along the line
+    between the two, ran into it; who approached equally fast, did too.
     """
     apart = compute_once(other.start_w - own.start_w)
     own_move, other_move = own.move(), other.move()

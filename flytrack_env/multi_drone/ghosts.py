@@ -50,10 +50,14 @@ def time_optimal_ghost(track: Track, delay_s: float = 0.0) -> Ghost:
         return race, (race.gates_passed, race.gate_index)
 
     way = (jax.tree.map(lambda leaf: leaf[:-1], pos_w), jax.tree.map(lambda leaf: leaf[1:], pos_w))
-    passed, index = jax.jit(lambda way: jax.lax.scan(fly, start_race(jnp.int32(0), course), way)[1])(way)
+    passed, index = jax.jit(
+        lambda way: jax.lax.scan(fly, start_race(jnp.int32(0), course), way)[1]
+    )(way)
     passed, index = (np.concatenate([[0], np.asarray(leaf)]) for leaf in (passed, index))
     centre, before = (
         jax.tree.map(lambda leaf, at=at: leaf[at], course.gates.centre) for at in (index, index - 1)
     )
     progress = progress_of(passed, pos_w, centre, (centre - before).norm())
-    return Ghost(pos_w, Vec3(*states[:, VELOCITY].T.astype(np.float32)), np.asarray(progress, np.float32))
+    return Ghost(
+        pos_w, Vec3(*states[:, VELOCITY].T.astype(np.float32)), np.asarray(progress, np.float32)
+    )

@@ -20,8 +20,8 @@ Observations = dict[str, jax.Array]
 class JaxMarlRace(MultiAgentEnv):
     """A race as a ``jaxmarl.environments.MultiAgentEnv``; agents are "drone_0" and so on.
 
-    Auto-reset is JaxMARL's own: once the race is over, ``dones["__all__"]``. An agent that is out stays done,
-    with a reward of 0. params: the race's default ones if None.
+    Auto-reset is JaxMARL's own: once the race is over, ``dones["__all__"]``. An agent that is out
+    stays done, with a reward of 0. params: the race's default ones if None.
     """
 
     def __init__(self, race: MultiDroneRace, params: RaceParams | None = None) -> None:
@@ -29,7 +29,9 @@ class JaxMarlRace(MultiAgentEnv):
         self.race, self.params = race, race.default_params if params is None else params
         self.agents = [f"drone_{place}" for place in range(race.num_drones)]
         seen, flown = race.observation_space(), race.action_space()
-        self.observation_spaces = {one: spaces.Box(seen.low, seen.high, seen.shape) for one in self.agents}
+        self.observation_spaces = {
+            one: spaces.Box(seen.low, seen.high, seen.shape) for one in self.agents
+        }
         self.action_spaces = {one: spaces.Box(-1.0, 1.0, flown.shape) for one in self.agents}
 
     @property

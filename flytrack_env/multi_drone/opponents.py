@@ -14,7 +14,13 @@ from flytrack_env.tracks import GateFrame
 MOST_SEEN = 3
 OPPONENT = (
     Entry(
-        "opponent_position", "position of a nearest opponent relative to the drone", 3, "gate", "m", 3.0, 10.0
+        "opponent_position",
+        "position of a nearest opponent relative to the drone",
+        3,
+        "gate",
+        "m",
+        3.0,
+        10.0,
     ),
     Entry("opponent_velocity", "its velocity relative to the drone's", 3, "gate", "m/s", 5.0, 12.0),
     Entry("opponent_lead", "how many gates it is ahead", 1, "-", "gates", 1.0, 10.0),
@@ -39,7 +45,9 @@ def opponent_table(num_drones: int) -> tuple[Entry, ...]:
     return OPPONENT * min(num_drones - 1, MOST_SEEN)
 
 
-def observe_opponents(own: Standing, others: Sequence[Standing], gate: GateFrame) -> list[jax.Array]:
+def observe_opponents(
+    own: Standing, others: Sequence[Standing], gate: GateFrame
+) -> list[jax.Array]:
     """Return the rows of ``opponent_table``, nearest first, in the flight frame of a drone's own gate.
 
     An opponent that is out of the race looks like one as far behind as an observation goes.
@@ -59,7 +67,9 @@ def _rows(own: Standing, other: Standing, frame: tuple[Vec3, ...]) -> list[jax.A
     ]
     quantities[0] = (*quantities[0][:2], -position.limit)
     return [
-        jnp.where(other.is_out, absent, jnp.clip(value * (1.0 / entry.scale), -entry.limit, entry.limit))
+        jnp.where(
+            other.is_out, absent, jnp.clip(value * (1.0 / entry.scale), -entry.limit, entry.limit)
+        )
         for entry, value, absent in quantities
     ]
 
@@ -67,8 +77,8 @@ def _rows(own: Standing, other: Standing, frame: tuple[Vec3, ...]) -> list[jax.A
 def _nearest(own: Standing, others: Sequence[Standing]) -> list[Standing]:
     """Return the three nearest opponents, nearest first, those still in the race before the others.
 
-    Of two that are equally near, as on a start grid, the one ahead comes first. By exchanging neighbours: a
-    handful of selects, where a sort could not be part of the step's kernel.
+    Of two that are equally near, as on a start grid, the one ahead comes first. By exchanging
+    neighbours: a handful of selects, where a sort could not be part of the step's kernel.
     """
     if len(others) < 2:
         return list(others)

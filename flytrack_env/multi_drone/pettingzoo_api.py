@@ -32,8 +32,12 @@ class ParallelRace(ParallelEnv[str, np.ndarray, np.ndarray]):
         self.possible_agents = [f"drone_{place}" for place in range(race.num_drones)]
         self.agents: list[str] = []
         seen, flown = race.observation_space(), race.action_space()
-        self.observation_spaces = {agent: gymnax_space_to_gym_space(seen) for agent in self.possible_agents}
-        self.action_spaces = {agent: gymnax_space_to_gym_space(flown) for agent in self.possible_agents}
+        self.observation_spaces = {
+            agent: gymnax_space_to_gym_space(seen) for agent in self.possible_agents
+        }
+        self.action_spaces = {
+            agent: gymnax_space_to_gym_space(flown) for agent in self.possible_agents
+        }
         self._rng = np.random.default_rng()
         self._states: Any = None
 
@@ -51,9 +55,8 @@ class ParallelRace(ParallelEnv[str, np.ndarray, np.ndarray]):
     def step(self, actions: dict[str, np.ndarray]) -> tuple[Any, ...]:
         """Return observations, rewards, terminations, truncations and infos of the agents that were racing.
 
-        Raises:
-            ValueError: actions of other agents than those that race, or of another shape. RuntimeError: no
-                race was begun.
+        Raises: ValueError: actions of other agents than those that race, or of another shape.
+                RuntimeError: no race was begun.
         """
         if self._states is None:
             raise RuntimeError("step: found no race, expected reset() before it")
@@ -66,7 +69,8 @@ class ParallelRace(ParallelEnv[str, np.ndarray, np.ndarray]):
         observations, self._states, *outcomes, info = flown
         del info["final_observation"]
         infos = {
-            agent: {name: value[place] for name, value in info.items()} for place, agent in self._racing()
+            agent: {name: value[place] for name, value in info.items()}
+            for place, agent in self._racing()
         }
         found = (
             self._by_agent(observations),
@@ -91,7 +95,9 @@ class ParallelRace(ParallelEnv[str, np.ndarray, np.ndarray]):
         """Do nothing; there is nothing to be closed."""
 
     def _racing(self) -> list[tuple[int, str]]:
-        return [(place, one) for place, one in enumerate(self.possible_agents) if one in self.agents]
+        return [
+            (place, one) for place, one in enumerate(self.possible_agents) if one in self.agents
+        ]
 
     def _by_agent(self, values: np.ndarray) -> dict[str, np.ndarray]:
         return {agent: values[place] for place, agent in self._racing()}

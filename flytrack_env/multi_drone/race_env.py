@@ -1,8 +1,8 @@
 """Several drones in one race: each flies an environment for one drone, and sees and meets the others.
 
-All drones of all races are stepped side by side in one flat vector, those of a race next to each other; what
-a drone needs of its opponents comes from shifts of the whole vector. Unrolled, the drones would be compiled
-one by one, and stacked, they would have to be transposed in every step.
+All drones of all races are stepped side by side in one flat vector, those of a race next to each
+other; what a drone needs of its opponents comes from shifts of the whole vector. Unrolled, the
+drones would be compiled one by one, and stacked, they would have to be transposed in every step.
 """
 
 from collections.abc import Mapping
@@ -48,8 +48,8 @@ PLACE_BITS = MOST_DRONES - 1  # of a random word: which drone of the race it is
 class EntrantState(NamedTuple):
     """One drone of a race.
 
-    inner: the state of its environment. leg_m: distance of its gate from the gate before. progress, is_out:
-    as in ``Standing``. gap: as ``gap_of``. step: since the race began.
+    inner: the state of its environment. leg_m: distance of its gate from the gate before. progress,
+    is_out: as in ``Standing``. gap: as ``gap_of``. step: since the race began.
     """
 
     inner: Any
@@ -75,17 +75,16 @@ class Flown(NamedTuple):
 class MultiDroneRace:
     """A race of 1 to 8 drones, as pure functions; drones of a race are the first axis of everything.
 
-    Each flies ``env``, with its own draws of whatever that environment draws. A drone that terminates or is
-    put out by a collision is out: it stands still, is neither seen nor met any more, and gets a reward of 0.
-    Observations are those of ``env``, and of the nearest opponents (``flytrack_env.multi_drone.opponents``).
+    Each flies ``env``, with its own draws of whatever that environment draws. A drone that
+    terminates or is put out by a collision is out: it stands still, is neither seen nor met any
+    more, and gets a reward of 0. Observations are those of ``env``, and of the nearest opponents
+    (``flytrack_env.multi_drone.opponents``).
 
-    Args:
-        env: the environment of one drone, wrapped or not.
-        num_drones: 1 to 8. One drone flies exactly as in ``env``.
-        over: when the race is over, and reset, before the time limit: once "all" drones are out, or "first",
-            once drone 0 is.
-        ghosts: by their place, from 1, drones that fly a given line (``flytrack_env.multi_drone.ghosts``).
-            With any, races begin at the start pose, and the others on a grid that leaves the line free.
+    Args: env: the environment of one drone, wrapped or not. num_drones: 1 to 8. One drone flies
+            exactly as in ``env``. over: when the race is over, and reset, before the time limit:
+            once "all" drones are out, or "first", once drone 0 is. ghosts: by their place, from 1,
+            drones that fly a given line (``flytrack_env.multi_drone.ghosts``). With any, races
+            begin at the start pose, and the others on a grid that leaves the line free.
 
     Raises:
         ValueError: another number of drones, value of ``over`` or place of a ghost.
@@ -100,11 +99,18 @@ class MultiDroneRace:
         ghosts: Mapping[int, Ghost] | None = None,
     ) -> None:
         if not isinstance(env, EpisodicEnvironment):
-            raise TypeError(f"env: found {type(env).__name__}, expected FlyTrack or a wrapper around it")
+            raise TypeError(
+                f"env: found {type(env).__name__}, expected FlyTrack or a wrapper around it"
+            )
         check_num_drones(num_drones)
         if over not in ("all", "first"):
             raise ValueError(f"over: found {over!r}, expected 'all' or 'first'")
-        self.env, self.num_drones, self.over, self.ghosts = env, num_drones, over, dict(ghosts or {})
+        self.env, self.num_drones, self.over, self.ghosts = (
+            env,
+            num_drones,
+            over,
+            dict(ghosts or {}),
+        )
         if not set(self.ghosts) <= set(range(1, num_drones)):
             raise ValueError(
                 f"ghosts: found places {sorted(self.ghosts)}, expected some of 1 to {num_drones - 1}"
@@ -148,12 +154,13 @@ class MultiDroneRace:
         self.env.check_params(params.flight)
         check_rules(params.rules, self.num_drones)
 
-    def reset(self, key: jax.Array, params: RaceParams | None = None) -> tuple[jax.Array, EntrantState]:
+    def reset(
+        self, key: jax.Array, params: RaceParams | None = None
+    ) -> tuple[jax.Array, EntrantState]:
         """Return observations, (num_drones, size) float32, and state of a race that begins on the start grid.
 
-        Raises:
-            TypeError: a key that is none. ValueError: parameters that no race can be flown with, where their
-                values are known.
+        Raises: TypeError: a key that is none. ValueError: parameters that no race can be flown
+                with, where their values are known.
         """
         check_key(key)
         params = self.default_params if params is None else params
@@ -179,7 +186,9 @@ class MultiDroneRace:
             ValueError: drones that start inside each other, where positions are known.
         """
         if not isinstance(drones.pos_w.x, jax.core.Tracer):
-            check_apart(np.stack([np.asarray(one, float) for one in drones.pos_w], -1), params.rules)
+            check_apart(
+                np.stack([np.asarray(one, float) for one in drones.pos_w], -1), params.rules
+            )
         words = self._words(jnp.asarray(seed, jnp.uint32)[None])
         states = jax.vmap(self._enter, (0, 0, None, 0))(drones, gate_indices, params, words)
         standings = self._standings(states)
@@ -195,24 +204,35 @@ class MultiDroneRace:
 
     @partial(jax.jit, static_argnames=("self",))
     def step(
-        self, key: jax.Array, states: EntrantState, actions: jax.Array, params: RaceParams | None = None
+        self,
+        key: jax.Array,
+        states: EntrantState,
+        actions: jax.Array,
+        params: RaceParams | None = None,
     ) -> Step:
         """Return observations, states, rewards, terminated, truncated and info, with auto-reset of the race.
 
-        actions: (num_drones, 4). Everything returned has num_drones in front. terminated: whether a drone is
-        out. truncated: whether the race is over for one that is not. info: that of ``env`` while a drone
-        flies, ``collision``, ``rank``, ``gap_gates``, ``race_over`` and ``final_observation``.
+        actions: (num_drones, 4). Everything returned has num_drones in front. terminated: whether a
+        drone is out. truncated: whether the race is over for one that is not. info: that of ``env``
+        while a drone flies, ``collision``, ``rank``, ``gap_gates``, ``race_over`` and
+        ``final_observation``.
         """
         return self._advance_flat(seed_of(key)[None], states, actions, params, resets=True)
 
     @partial(jax.jit, static_argnames=("self",))
-    def step_env(self, states: EntrantState, actions: jax.Array, params: RaceParams | None = None) -> Step:
+    def step_env(
+        self, states: EntrantState, actions: jax.Array, params: RaceParams | None = None
+    ) -> Step:
         """Return the same without auto-reset."""
         return self._advance_flat(jnp.zeros(1, jnp.uint32), states, actions, params, resets=False)
 
     @partial(jax.jit, static_argnames=("self",))
     def step_batch(
-        self, key: jax.Array, states: EntrantState, actions: jax.Array, params: RaceParams | None = None
+        self,
+        key: jax.Array,
+        states: EntrantState,
+        actions: jax.Array,
+        params: RaceParams | None = None,
     ) -> Step:
         """``step`` for a batch of races with one key, faster than ``vmap(step)``.
 
@@ -260,7 +280,9 @@ class MultiDroneRace:
         states, reward, info = flown.state, flown.reward, flown.info
         others: list[Standing] = []
         if self.num_drones > 1:
-            meetings = [self._shift((flown.standing.is_out, flown.path), k) for k in self._distances]
+            meetings = [
+                self._shift((flown.standing.is_out, flown.path), k) for k in self._distances
+            ]
             meet = jax.vmap(self._meet, (0, 0, None))
             states, collision, reward = meet(flown, meetings, params)
             standings = flown.standing._replace(is_out=states.is_out)
@@ -276,7 +298,9 @@ class MultiDroneRace:
         rows = final_rows
         if resets:
             ended = Ended(done, (final_rows, states), words)
-            rows, states = jax.vmap(partial(reset_if_ended, self._begin_from), (0, None))(ended, params)
+            rows, states = jax.vmap(partial(reset_if_ended, self._begin_from), (0, None))(
+                ended, params
+            )
         info = {**info, "terminated": terminated, "truncated": truncated, "race_over": done}
         return rows, final_rows, states, reward, terminated, truncated, info
 
@@ -286,7 +310,9 @@ class MultiDroneRace:
 
     # For one drone.
 
-    def _begin_from(self, word: jax.Array, params: RaceParams) -> tuple[list[jax.Array], EntrantState]:
+    def _begin_from(
+        self, word: jax.Array, params: RaceParams
+    ) -> tuple[list[jax.Array], EntrantState]:
         """Return observation, row by row, and state of a drone on the start grid, from its random word."""
         if self.num_drones == 1:
             drone, gate_index = self.env.sample_start(word, params.flight)
@@ -298,12 +324,16 @@ class MultiDroneRace:
         drawn = Draws(race_word).index("slot", self.num_drones)
         first = jnp.where(jnp.asarray(params.rules.first_slot) < 0, drawn, params.rules.first_slot)
         slots = [(place + first + k) % self.num_drones for k in range(self.num_drones)]
-        drone, *opponents = [place_on_grid(head, slot.astype(jnp.int32), params.rules) for slot in slots]
+        drone, *opponents = [
+            place_on_grid(head, slot.astype(jnp.int32), params.rules) for slot in slots
+        ]
         state = self._enter(drone, gate_index, params, word)
         gate = self.env.race(state.inner).gate
         own = self._standing(state)
         others = [
-            own._replace(pos_w=one.pos_w, progress=progress_of(0, one.pos_w, gate.centre, state.leg_m))
+            own._replace(
+                pos_w=one.pos_w, progress=progress_of(0, one.pos_w, gate.centre, state.leg_m)
+            )
             for one in opponents
         ]
         for ghost_place, ghost in self.ghosts.items():
@@ -314,7 +344,9 @@ class MultiDroneRace:
         state = state._replace(gap=gap_of(own, others))
         return self._observe(state, others, params), state
 
-    def _enter(self, drone: Drone, gate_index: Any, params: RaceParams, word: jax.Array) -> EntrantState:
+    def _enter(
+        self, drone: Drone, gate_index: Any, params: RaceParams, word: jax.Array
+    ) -> EntrantState:
         """Return the state of a drone that enters a race."""
         inner = self.env.begin(drone, gate_index, params.flight, word)
         course, gate = params.flight.course, self.env.race(inner).gate
@@ -322,13 +354,17 @@ class MultiDroneRace:
         before = course.gate(jnp.where(index == 0, course.num_gates - 1, index - 1))
         leg_m = compute_once(jnp.asarray((gate.centre - before.centre).norm()))
         progress = progress_of(0, drone.pos_w, gate.centre, leg_m)
-        return EntrantState(inner, leg_m, progress, jnp.asarray(False), jnp.float32(0.0), jnp.int32(0))
+        return EntrantState(
+            inner, leg_m, progress, jnp.asarray(False), jnp.float32(0.0), jnp.int32(0)
+        )
 
     def _standing(self, state: EntrantState) -> Standing:
         drone = self.env.drone(state.inner)
         return Standing(drone.pos_w, drone.vel_w, state.progress, state.is_out)
 
-    def _observe(self, state: EntrantState, others: list[Standing], params: RaceParams) -> list[jax.Array]:
+    def _observe(
+        self, state: EntrantState, others: list[Standing], params: RaceParams
+    ) -> list[jax.Array]:
         """Return a drone's observation, row by row."""
         rows = self.env.observe_drone(self.env.drone(state.inner), state.inner, params.flight)
         if not others:
@@ -351,7 +387,9 @@ class MultiDroneRace:
         new_leg_m = (race.gate.centre - old_gate.centre).norm()
         leg_m: jax.Array = compute_once(jnp.where(has_passed, new_leg_m, state.leg_m))
         progress = progress_of(race.gates_passed, drone.pos_w, race.gate.centre, leg_m)
-        state = EntrantState(inner, leg_m, progress, was_out | terminated, state.gap, state.step + 1)
+        state = EntrantState(
+            inner, leg_m, progress, was_out | terminated, state.gap, state.step + 1
+        )
         return Flown(
             state=state,
             standing=Standing(drone.pos_w, drone.vel_w, progress, was_out),
@@ -378,7 +416,12 @@ class MultiDroneRace:
         return flown.state._replace(is_out=flown.state.is_out | hit), hit, reward
 
     def _rank(
-        self, state: EntrantState, own: Standing, others: list[Standing], reward: jax.Array, rules: RaceRules
+        self,
+        state: EntrantState,
+        own: Standing,
+        others: list[Standing],
+        reward: jax.Array,
+        rules: RaceRules,
     ) -> tuple[EntrantState, jax.Array, dict[str, jax.Array]]:
         """Return a drone's state with its gap, its reward with what it gained on the others, and info."""
         gap = compute_once(gap_of(own, others))

@@ -15,10 +15,10 @@ BOTH_OUT, RAMMER_OUT = 0, 1
 class RaceRules(NamedTuple):
     """How drones start and collide; all of it may be batched, as parameters may.
 
-    collision_radius: of the sphere around each drone, m. blame: 0, both drones of a collision are out; 1, the
-    one that ran into the other is (``flytrack_env.multi_drone.collisions``). column_spacing, row_spacing: of
-    the start grid, m. first_slot: slot on the grid of drone 0, the others following; -1: drawn.
-    lead: reward for each gate gained on the best opponent.
+    collision_radius: of the sphere around each drone, m. blame: 0, both drones of a collision are
+    out; 1, the one that ran into the other is (``flytrack_env.multi_drone.collisions``).
+    column_spacing, row_spacing: of the start grid, m. first_slot: slot on the grid of drone 0, the
+    others following; -1: drawn. lead: reward for each gate gained on the best opponent.
     """
 
     collision_radius: Scalar = 0.15
@@ -51,7 +51,10 @@ def check_rules(rules: RaceRules, num_drones: int) -> None:
         "collision_radius": (diameter > 0.0, "more than 0 m"),
         "blame": (np.isin(rules.blame, (BOTH_OUT, RAMMER_OUT)), f"{BOTH_OUT} or {RAMMER_OUT}"),
         "column_spacing": (np.asarray(rules.column_spacing) > diameter, apart),
-        "row_spacing": (2.0 * np.asarray(rules.row_spacing) > diameter, apart.replace("twice ", "")),
+        "row_spacing": (
+            2.0 * np.asarray(rules.row_spacing) > diameter,
+            apart.replace("twice ", ""),
+        ),
         "first_slot": (np.isin(rules.first_slot, range(DRAWN_SLOT, num_drones)), slots),
         "lead": (np.isfinite(rules.lead), "a finite number"),
     }

@@ -16,8 +16,9 @@ from flytrack_env.multi_drone.rules import RaceParams
 class Opponent(NamedTuple):
     """A policy that does not learn.
 
-    act: (params, observations (..., observation_size)) -> actions (..., 4). observation_size: that of the
-    race, or that of its environment for one drone, for a policy that does not see others. params: a pytree.
+    act: (params, observations (..., observation_size)) -> actions (..., 4). observation_size: that
+    of the race, or that of its environment for one drone, for a policy that does not see others.
+    params: a pytree.
     """
 
     act: Callable[[Any, jax.Array], jax.Array]
@@ -57,9 +58,8 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
         race: with ``over="first"``.
         opponents: the policy of each other drone, in their order.
 
-    Raises:
-        ValueError: another number of opponents, one that observes something of another size, or a race that
-            goes on without drone 0.
+    Raises: ValueError: another number of opponents, one that observes something of another size, or
+            a race that goes on without drone 0.
     """
 
     def __init__(self, race: MultiDroneRace, opponents: Sequence[Opponent]) -> None:
@@ -115,7 +115,11 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
 
     @partial(jax.jit, static_argnames=("self",))
     def step(
-        self, key: jax.Array, state: VersusState, action: jax.Array, params: VersusParams | None = None
+        self,
+        key: jax.Array,
+        state: VersusState,
+        action: jax.Array,
+        params: VersusParams | None = None,
     ) -> Step:
         """Return the learner's observation, state, reward, flags and info of a step, with auto-reset."""
         params = self.default_params if params is None else params
@@ -130,7 +134,9 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
         actions = self._all_actions(states.observations, actions, params)
         return self._of_learner(self.race.step_batch(key, states.entrants, actions, params.race))
 
-    def _all_actions(self, observations: jax.Array, action: jax.Array, params: VersusParams) -> jax.Array:
+    def _all_actions(
+        self, observations: jax.Array, action: jax.Array, params: VersusParams
+    ) -> jax.Array:
         """Return the actions of all drones, (..., num_drones, 4)."""
         actions = [action]
         for place, (opponent, own) in enumerate(zip(self.opponents, params.opponents, strict=True)):

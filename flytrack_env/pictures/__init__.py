@@ -57,7 +57,9 @@ def write_pictures(flights: Sequence[Flight], folder: str | Path) -> list[Path]:
     from flytrack_env.pictures.figures import draw_comparison
 
     figures = {
-        f"{flight.name}_{name}": figure for flight in flights for name, figure in draw_flight(flight).items()
+        f"{flight.name}_{name}": figure
+        for flight in flights
+        for name, figure in draw_flight(flight).items()
     }
     if len(flights) > 1:
         figures["comparison_top"] = draw_comparison(flights)

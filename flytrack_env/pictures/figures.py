@@ -13,7 +13,15 @@ from matplotlib.patches import Rectangle
 from flytrack_env.flown_race import DRONE_RADIUS_M, STEP_S
 from flytrack_env.pictures import drawing
 from flytrack_env.pictures.flight import PASSED, Flight, Meeting
-from flytrack_env.scene import BLUE, GREEN, ORANGE, PAPER_COLOURS, PAPER_FRAME, PAPER_OPENING, gates_of
+from flytrack_env.scene import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PAPER_COLOURS,
+    PAPER_FRAME,
+    PAPER_OPENING,
+    gates_of,
+)
 from flytrack_env.state import APPLIED_ACTION, BATTERY, POSITION, Action
 from flytrack_env.tracks import Gate, Track, build_course
 
@@ -43,11 +51,24 @@ def draw_top(flight: Flight) -> Figure:
     points, speeds = flight.states[:, POSITION][:, :2], flight.speeds_m_s
     top = drawing.HEADROOM * max(float(speeds.max()), 1.0)
     lines = drawing.draw_path(axes, points, speeds[:-1], top, 2.2)
-    failures = np.reshape([one.pos_w[:2] for one in flight.meetings if one.outcome != PASSED], (-1, 2))
+    failures = np.reshape(
+        [one.pos_w[:2] for one in flight.meetings if one.outcome != PASSED], (-1, 2)
+    )
     axes.plot(*failures.T, "X", color="black", markersize=8, markeredgecolor="white", zorder=5)
-    marks = (("start", points[0], BLUE, "o"), (drawing.escape(flight.ended), points[-1], ORANGE, "X"))
+    marks = (
+        ("start", points[0], BLUE, "o"),
+        (drawing.escape(flight.ended), points[-1], ORANGE, "X"),
+    )
     for text, place, colour, marker in marks:
-        axes.plot(*place, marker, color=colour, markersize=9, markeredgecolor="white", label=text, zorder=6)
+        axes.plot(
+            *place,
+            marker,
+            color=colour,
+            markersize=9,
+            markeredgecolor="white",
+            label=text,
+            zorder=6,
+        )
     figure.legend(loc="outside lower center", ncols=2, frameon=False)
     axes.set_title(drawing.escape(f"{flight.title}\n{flight.laps_text}"), fontsize="medium")
     figure.colorbar(lines, ax=axes, label="speed (m/s)", shrink=0.8)
@@ -63,7 +84,9 @@ def draw_comparison(flights: Sequence[Flight]) -> Figure:
     tracks = sorted({flight.track.name for flight in flights})
     if len(tracks) != 1:
         raise ValueError(f"flights: found tracks {tracks}, expected flights on one")
-    texts = [drawing.escape(f"{flight.name}\n{flight.laps_text}\n{flight.ended}") for flight in flights]
+    texts = [
+        drawing.escape(f"{flight.name}\n{flight.laps_text}\n{flight.ended}") for flight in flights
+    ]
     longest = max(len(line) for text in texts for line in text.splitlines())
     figure, axes = _course(flights, BESIDE_IN + drawing.LETTER_IN * longest)
     styles = itertools.cycle(itertools.product(LINES, PAPER_COLOURS))
@@ -72,7 +95,9 @@ def draw_comparison(flights: Sequence[Flight]) -> Figure:
         axes.plot(*points.T, line, color=colour, linewidth=1.5, label=text)
         axes.plot(*points[0], "o", color=colour, markeredgecolor="white", zorder=6)
         axes.plot(*points[-1], "X", color=colour, markersize=9, markeredgecolor="white", zorder=6)
-    axes.set_title(drawing.escape(f"{len(flights)} flights on {flights[0].track.name}"), fontsize="medium")
+    axes.set_title(
+        drawing.escape(f"{len(flights)} flights on {flights[0].track.name}"), fontsize="medium"
+    )
     figure.legend(loc="outside right upper", frameon=False, fontsize="small", labelspacing=1.0)
     return figure
 
@@ -88,10 +113,18 @@ def _course(flights: Sequence[Flight], beside_in: float) -> tuple[Figure, Axes]:
     width, height = PANEL_IN * np.maximum((high - low) / (high - low).max(), NARROWEST)
     figure = drawing.new_figure(width + beside_in, height + TITLE_IN)
     axes = figure.add_subplot()
-    axes.add_patch(Rectangle(ends[0], *(ends[1] - ends[0]), fill=False, edgecolor="0.6", linestyle="--"))
+    axes.add_patch(
+        Rectangle(ends[0], *(ends[1] - ends[0]), fill=False, edgecolor="0.6", linestyle="--")
+    )
     drawing.draw_gates(axes, track, TOP_VIEW)
     drawing.label_from_above(axes, track)
-    axes.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x (m)", ylabel="y (m)")
+    axes.set(
+        aspect="equal",
+        xlim=(low[0], high[0]),
+        ylim=(low[1], high[1]),
+        xlabel="x (m)",
+        ylabel="y (m)",
+    )
     return figure, axes
 
 
@@ -136,7 +169,9 @@ def _draw_height(figure: SubFigure, flight: Flight, top: float) -> None:
 def _half_heights_m(track: Track) -> np.ndarray:
     """Return half the height of each gate's frame and opening, (num_gates, 2), m: less if it leans."""
     gates = gates_of(build_course(track))
-    return 0.5 * np.stack([np.ptp(corners[..., 2], axis=1) for corners in (gates.outer, gates.inner)], axis=1)
+    return 0.5 * np.stack(
+        [np.ptp(corners[..., 2], axis=1) for corners in (gates.outer, gates.inner)], axis=1
+    )
 
 
 def _draw_bar(axes: Axes, gate: Gate, meeting: Meeting, half_heights_m: np.ndarray) -> None:
@@ -150,7 +185,15 @@ def _draw_bar(axes: Axes, gate: Gate, meeting: Meeting, half_heights_m: np.ndarr
     ):
         axes.plot([x, x], [z - half, z + half], color=colour, linewidth=width, zorder=2)
     if meeting.outcome != PASSED:
-        axes.plot(x, meeting.pos_w[2], "X", color="black", markersize=10, markeredgecolor="white", zorder=6)
+        axes.plot(
+            x,
+            meeting.pos_w[2],
+            "X",
+            color="black",
+            markersize=10,
+            markeredgecolor="white",
+            zorder=6,
+        )
     text = str(gate.id) if meeting.outcome == PASSED else f"{meeting.outcome}\n{gate.id}"
     style: Any = {"color": PAPER_OPENING, "ha": "center", "weight": "bold", "fontsize": "small"}
     axes.annotate(text, (x, z + half_frame), (0, 3), textcoords="offset points", **style)
@@ -177,7 +220,9 @@ def _draw_front(panel: Axes, gate: Gate, meetings: list[Meeting], top: float) ->
     edges = ((gate.frame, "0.85", "-", PAPER_FRAME), (gate.opening, "white", "-", PAPER_OPENING))
     for edge, face, line, colour in (*edges, (free, "none", "--", PAPER_OPENING)):
         corner = (-0.5 * edge, -0.5 * edge)
-        panel.add_patch(Rectangle(corner, edge, edge, facecolor=face, edgecolor=colour, linestyle=line))
+        panel.add_patch(
+            Rectangle(corner, edge, edge, facecolor=face, edgecolor=colour, linestyle=line)
+        )
     for is_pass, marker, size in ((True, "o", 36), (False, "X", 110)):
         shown = [one for one in meetings if (one.outcome == PASSED) is is_pass]
         panel.scatter(
@@ -185,7 +230,9 @@ def _draw_front(panel: Axes, gate: Gate, meetings: list[Meeting], top: float) ->
             [one.speed_m_s for one in shown], marker=marker, edgecolors="black", linewidths=0.6,
             vmin=0.0, vmax=top,
         )  # fmt: skip
-    reach = AROUND * max([0.5 * gate.frame, *(max(abs(one.right_m), abs(one.up_m)) for one in meetings)])
+    reach = AROUND * max(
+        [0.5 * gate.frame, *(max(abs(one.right_m), abs(one.up_m)) for one in meetings)]
+    )
     num_passed = sum(one.outcome == PASSED for one in meetings)
     panel.set(aspect="equal", xlim=(-reach, reach), ylim=(-reach, reach))
     panel.set_title(f"gate {gate.id}: {num_passed} of {len(meetings)}", fontsize="small")
@@ -200,14 +247,18 @@ def draw_commands(flight: Flight) -> Figure:
     for stick, name in enumerate(Action._fields):
         # A command holds for a step, from its state on.
         command, applied = flight.commands[:, stick], flight.states[:, APPLIED_ACTION][:, stick]
-        panels[stick].plot(times_s, command, color=ORANGE, drawstyle="steps-post", label="commanded")
+        panels[stick].plot(
+            times_s, command, color=ORANGE, drawstyle="steps-post", label="commanded"
+        )
         panels[stick].plot(times_s, applied, color=BLUE, linewidth=1.6, label="applied")
         panels[stick].set_ylabel(f"{name} stick")
     panels[4].plot(times_s, flight.speeds_m_s, color=BLUE)
     panels[5].plot(times_s, flight.states[:, BATTERY], color=BLUE)
     panels[4].set_ylabel("speed (m/s)")
     panels[5].set(ylabel="battery (V)", xlabel="time (s)")
-    marks = [(one.time_s, "lap complete" if one.lap else "gate passed") for one in flight.race.passes]
+    marks = [
+        (one.time_s, "lap complete" if one.lap else "gate passed") for one in flight.race.passes
+    ]
     marks += [(one.time_s, "not passed") for one in flight.meetings if one.outcome != PASSED]
     for panel in panels:
         drawing.plain(panel)

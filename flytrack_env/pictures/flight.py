@@ -22,8 +22,8 @@ class Meeting(NamedTuple):
     """The drone in the plane of the gate to fly next.
 
     outcome: PASSED, TOUCHED or MISSED. gate: index in flying order. time_s: since the first state.
-    distance_m: flown until then. pos_w: where, (3,), world, m. right_m, up_m: off the gate's centre, as the
-    drone comes to it. speed_m_s: before it.
+    distance_m: flown until then. pos_w: where, (3,), world, m. right_m, up_m: off the gate's
+    centre, as the drone comes to it. speed_m_s: before it.
     """
 
     outcome: str
@@ -39,9 +39,9 @@ class Meeting(NamedTuple):
 class Flight(NamedTuple):
     """One recorded flight at 100 Hz.
 
-    name: of its pictures. states: (T, 21), whose applied roll, pitch and yaw may be NaN. commands: (T, 4).
-    race: gates and laps, followed through the positions. distances_m: flown until each state, (T,).
-    meetings: in order. ended: why the flight ended.
+    name: of its pictures. states: (T, 21), whose applied roll, pitch and yaw may be NaN. commands:
+    (T, 4). race: gates and laps, followed through the positions. distances_m: flown until each
+    state, (T,). meetings: in order. ended: why the flight ended.
     """
 
     name: str
@@ -92,10 +92,14 @@ def make_flight(name: str, states: np.ndarray, commands: np.ndarray, track: Trac
     steps_m = np.linalg.norm(np.diff(states[:, POSITION].astype(float), axis=0), axis=1)
     distances_m = np.concatenate([[0.0], np.cumsum(steps_m)])
     meetings = _meetings(states, distances_m, track, race)
-    return Flight(name, states, commands, track, race, distances_m, meetings, why_ended(states, track, race))
+    return Flight(
+        name, states, commands, track, race, distances_m, meetings, why_ended(states, track, race)
+    )
 
 
-def read_flights(paths: Sequence[str | Path], track: Track, allow_pickle: bool = False) -> tuple[Flight, ...]:
+def read_flights(
+    paths: Sequence[str | Path], track: Track, allow_pickle: bool = False
+) -> tuple[Flight, ...]:
     """Return the flights of rollout files, named after the files, and their folders where files are alike.
 
     Raises:
@@ -110,8 +114,8 @@ def _meetings(
 ) -> tuple[Meeting, ...]:
     """Return every crossing of the next gate's plane that passed, touched or missed it.
 
-    The last state is extrapolated for a step at its velocity, as in ``why_ended``: most flights that fail
-    meet their last gate in that step.
+    The last state is extrapolated for a step at its velocity, as in ``why_ended``: most flights
+    that fail meet their last gate in that step.
     """
     positions = states[:, POSITION]
     ends = np.concatenate([positions[1:], positions[-1:] + STEP_S * states[-1:, VELOCITY]])
@@ -123,7 +127,9 @@ def _meetings(
         for step in np.flatnonzero(is_met):
             fraction = float(met.fraction[step])
             where = positions[step] + fraction * (ends[step] - positions[step])
-            found.append((int(step), where, STEP_S * (int(step) + fraction), int(race.gate[step]), outcome))
+            found.append(
+                (int(step), where, STEP_S * (int(step) + fraction), int(race.gate[step]), outcome)
+            )
 
     def meeting(step: int, pos_w: np.ndarray, time_s: float, index: int, outcome: str) -> Meeting:
         gate = jax.tree.map(lambda leaf: float(leaf[index]), gates)

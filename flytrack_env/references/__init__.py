@@ -1,8 +1,8 @@
 """Time-optimal flights of a track with a model: their files, and the ghost to fly beside another flight.
 
-The folder has those of the shipped tracks; ``benchmarks.time_optimal`` found them.
-A file is an ``.npz`` of numbers and one JSON text: states and commands at 100 Hz, gate times, the model
-itself, and how the flight was found. It is read without unpickling.
+The folder has those of the shipped tracks; ``benchmarks.time_optimal`` found them. A file is an
+``.npz`` of numbers and one JSON text: states and commands at 100 Hz, gate times, the model itself,
+and how the flight was found. It is read without unpickling.
 """
 
 import dataclasses
@@ -57,13 +57,13 @@ class ReferenceFileError(ValueError):
 class Reference:
     """A time-optimal flight, sampled at the simulator's step.
 
-    track, model_name: names. track_sha256: digest of the track. kind: "flying", a lap from the last gate's
-    plane to itself, periodic except for the battery; or "standing", from rest at the start pose through
-    every gate once. model: that it is optimal for. dt_s: s. time_s: to the last gate's plane, s; for "flying"
-    the lap time.
-    states: (N + 1, 21) and commands: (N, 4), float64, laid out as in ``flytrack_env.state``; each command
-    is held over its step, and the last gate is passed in the last step. gate_times_s: (num_gates,), s from
-    the first state. found: how it was found, JSON values (solver, status, seconds, versions, command).
+    track, model_name: names. track_sha256: digest of the track. kind: "flying", a lap from the last
+    gate's plane to itself, periodic except for the battery; or "standing", from rest at the start
+    pose through every gate once. model: that it is optimal for. dt_s: s. time_s: to the last gate's
+    plane, s; for "flying" the lap time. states: (N + 1, 21) and commands: (N, 4), float64, laid out
+    as in ``flytrack_env.state``; each command is held over its step, and the last gate is passed in
+    the last step. gate_times_s: (num_gates,), s from the first state. found: how it was found, JSON
+    values (solver, status, seconds, versions, command).
     """
 
     track: str
@@ -174,7 +174,9 @@ def _check_notes(notes: dict[str, Any]) -> None:
     types = {**dict.fromkeys(TEXTS, str), "found": dict, "dt_s": float, "time_s": float}
     for name, expected in types.items():
         if not isinstance(notes[name], expected):
-            raise ValueError(f"{name}: found {quote_value(notes[name])}, expected a {expected.__name__}")
+            raise ValueError(
+                f"{name}: found {quote_value(notes[name])}, expected a {expected.__name__}"
+            )
     for name in ("dt_s", "time_s"):
         if not 0.0 < notes[name] < LONGEST_S:
             raise ValueError(f"{name}: found {notes[name]}, expected seconds above 0")
@@ -187,9 +189,9 @@ def _check_notes(notes: dict[str, Any]) -> None:
 def load_reference(path: str | Path) -> Reference:
     """Return the reference in a file.
 
-    Raises:
-        ReferenceFileError: missing or damaged file, pickled objects, another version, arrays that are no
-            flight, commands beyond [-1, 1], notes of wrong types, or a model of another digest.
+    Raises: ReferenceFileError: missing or damaged file, pickled objects, another version, arrays
+            that are no flight, commands beyond [-1, 1], notes of wrong types, or a model of another
+            digest.
     """
     path = Path(path)
     try:
@@ -210,7 +212,8 @@ def load_reference(path: str | Path) -> Reference:
     except KeyError as error:
         raise ReferenceFileError(f"{path}: {quote_name(error.args[0])}: missing") from error
     except (AttributeError, OSError, RecursionError, TypeError, ValueError) as error:
-        # ValueError: NpzError, no JSON, a check; AttributeError and TypeError: JSON of another structure.
+        # ValueError: NpzError, no JSON, a check; AttributeError and TypeError: JSON of another
+        # structure.
         raise ReferenceFileError(
             f"{path}: cannot be read: {error_text(error)}; expected a reference file"
         ) from error
@@ -222,7 +225,9 @@ def shipped_references(track: Track, model_names: tuple[str, ...]) -> References
     Raises:
         ReferenceFileError: none for this track; the message lists those that exist.
     """
-    names = [name for name in model_names if all(is_shipped(track.name, kind, name) for kind in KINDS)]
+    names = [
+        name for name in model_names if all(is_shipped(track.name, kind, name) for kind in KINDS)
+    ]
     name = names[0] if names else model_names[-1]
     references = {kind: shipped_reference(track.name, kind, name) for kind in KINDS}
     if any(reference.track_sha256 != track_digest(track) for reference in references.values()):
@@ -242,8 +247,9 @@ def is_model_of(track: str, model_name: str, model: ModelParameters) -> bool:
 def ghost_rollout(references: References, num_steps: int) -> tuple[np.ndarray, np.ndarray]:
     """Return states (num_steps, 21) and commands (num_steps, 4) of the optimum: start, then flying laps.
 
-    Row t is the sample that is nearest in time, at most half a step off: laps are no whole number of steps.
-    The ghost jumps where its start ends, because a standing start may pass its last gate anywhere.
+    Row t is the sample that is nearest in time, at most half a step off: laps are no whole number
+    of steps. The ghost jumps where its start ends, because a standing start may pass its last gate
+    anywhere.
     """
     standing, flying = references["standing"], references["flying"]
     times_s = standing.dt_s * np.arange(num_steps)

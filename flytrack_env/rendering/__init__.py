@@ -1,7 +1,8 @@
 """Pictures of a flight, without a display: a top view of the course beside a chase view.
 
-Needs the extra ``flytrack[render]``; importing this package does not. ``scene_row`` returns, inside a
-compiled step, the numbers of a picture; ``FlightLog`` collects such rows; ``make_renderer`` draws them.
+Needs the extra ``flytrack[render]``; importing this package does not. ``scene_row`` returns, inside
+a compiled step, the numbers of a picture; ``FlightLog`` collects such rows; ``make_renderer`` draws
+them.
 """
 
 from collections.abc import Sequence

@@ -19,7 +19,10 @@ MARGIN = 24
 HEADER = 44  # for the lap times
 STEPS_PER_FRAME = 6  # of 0.01 s; GIFs count in 10 ms
 LAST_FRAME_MS = 1500
-AZIMUTH_DEG, ELEVATION_DEG = 20.0, 36.0  # of the eye: from the course's broad side, and above the ground
+AZIMUTH_DEG, ELEVATION_DEG = (
+    20.0,
+    36.0,
+)  # of the eye: from the course's broad side, and above the ground
 DISTANCE = 1.1  # of the eye from the middle, in sizes of the course
 DRONE_ENLARGEMENT = 5.0
 GRID_M = 5.0
@@ -49,7 +52,13 @@ def make_gif(course: Course, gate_ids: Sequence[int], laps: Sequence[Lap]) -> by
     durations_ms = [10 * STEPS_PER_FRAME] * (len(rows) - 1) + [LAST_FRAME_MS]
     content = io.BytesIO()
     indexed[0].save(
-        content, "GIF", save_all=True, append_images=indexed[1:], duration=durations_ms, loop=0, optimize=True
+        content,
+        "GIF",
+        save_all=True,
+        append_images=indexed[1:],
+        duration=durations_ms,
+        loop=0,
+        optimize=True,
     )
     return content.getvalue()
 
@@ -108,7 +117,9 @@ class FixedView:
         for lap in laps:
             state = lap.states[min(row, len(lap.states) - 1)].astype(float)
             colours = (lap.colour, scene.blend(lap.colour, scene.TEXT, 0.6), lap.colour)
-            draw_drone(draw, self.camera, state[POSITION], state[QUATERNION], colours, DRONE_ENLARGEMENT)
+            draw_drone(
+                draw, self.camera, state[POSITION], state[QUATERNION], colours, DRONE_ENLARGEMENT
+            )
         picture = canvas.reduce(PIXEL)
         self._write(ImageDraw.Draw(picture), laps, row)
         return picture
@@ -124,5 +135,10 @@ class FixedView:
             text = f"{lap.time_s:.3f} s" if is_over else f"{0.01 * row:.2f} s"
             draw.text((left, 10), lap.label, lap.colour, font(TEXT_SIZE))
             indent = draw.textlength(lap.label, font(TEXT_SIZE)) + 10
-            draw.text((left + indent, 10), text, scene.TEXT if is_over else scene.FAINT_TEXT, font(TEXT_SIZE))
+            draw.text(
+                (left + indent, 10),
+                text,
+                scene.TEXT if is_over else scene.FAINT_TEXT,
+                font(TEXT_SIZE),
+            )
             left += WIDTH // 2

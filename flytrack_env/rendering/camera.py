@@ -16,10 +16,13 @@ def unit(vector: np.ndarray, fallback: np.ndarray) -> np.ndarray:
 class Camera:
     """A camera that stays upright.
 
-    eye_w, forward_w: (3,), world, m; forward of length 1. centre_px: (2,), pixels. focal_px: pixels.
+    eye_w, forward_w: (3,), world, m; forward of length 1. centre_px: (2,), pixels. focal_px:
+    pixels.
     """
 
-    def __init__(self, eye_w: np.ndarray, forward_w: np.ndarray, centre_px: np.ndarray, focal_px: float):
+    def __init__(
+        self, eye_w: np.ndarray, forward_w: np.ndarray, centre_px: np.ndarray, focal_px: float
+    ):
         right = unit(np.cross(forward_w, UP_W), np.array([0.0, -1.0, 0.0]))
         self.eye_w, self.forward_w = eye_w, forward_w
         self.centre_px, self.focal_px = centre_px, focal_px

@@ -1,7 +1,8 @@
 """What a picture shows: one row of numbers per step, and the log of an episode.
 
-A row is the drone's state, laid out as in ``flytrack_env.state``, and index of the gate to fly next, laps
-completed, time of the crossing that began the lap (s since the reset), last lap time (s, 0 if none).
+A row is the drone's state, laid out as in ``flytrack_env.state``, and index of the gate to fly
+next, laps completed, time of the crossing that began the lap (s since the reset), last lap time (s,
+0 if none).
 """
 
 import jax

@@ -14,7 +14,8 @@ from flytrack_env.scene import UP_W, Colour, Gates, gates_of, ground_grid, rotat
 from flytrack_env.state import BATTERY, POSITION, QUATERNION, VELOCITY
 from flytrack_env.tracks import Course
 
-# Pixels of the picture. All but text is drawn PIXEL times larger and averaged: Pillow's lines are jagged.
+# Pixels of the picture. All but text is drawn PIXEL times larger and averaged: Pillow's lines are
+# jagged.
 WIDTH, HEIGHT = 960, 540
 TOP_VIEW_WIDTH = 400  # the chase view has the rest
 PIXEL = 2
@@ -36,7 +37,8 @@ FIELD_OF_VIEW_DEG = 80.0
 BEHIND_M, ABOVE_M = 2.0, 0.65
 LOWEST_M = 0.25  # of the camera above the floor
 LOOK_AHEAD_M = 5.0
-AIM_BEYOND_M = 3.0  # beyond the gate's centre, so that the view does not swing round as a gate is passed
+# beyond the gate's centre, so that the view does not swing round as a gate is passed
+AIM_BEYOND_M = 3.0
 SWING_STEPS = 25.0  # time constant with which the camera follows its aim
 HEADING_STEPS = 8.0  # and the nose
 MEMORY_STEPS, TRAIL_STEPS = 100, 150
@@ -60,7 +62,9 @@ class TopView:
     width, height: pixels of its part of the canvas.
     """
 
-    def __init__(self, course: Course, gates: Gates, gate_ids: Sequence[int], width: int, height: int):
+    def __init__(
+        self, course: Course, gates: Gates, gate_ids: Sequence[int], width: int, height: int
+    ):
         self.gates = gates
         low, high = (np.array(corner, float) for corner in (course.bounds_low, course.bounds_high))
         self._fit(low[:2], high[:2], width, height)
@@ -78,7 +82,11 @@ class TopView:
         size = high - low
         is_turned = min(room / size[::-1]) > min(room / size)
         # Columns: what a metre along world x and along world y is on the picture, y downwards.
-        axes = np.array([(0.0, -1.0), (-1.0, 0.0)]) if is_turned else np.array([(1.0, 0.0), (0.0, -1.0)])
+        axes = (
+            np.array([(0.0, -1.0), (-1.0, 0.0)])
+            if is_turned
+            else np.array([(1.0, 0.0), (0.0, -1.0)])
+        )
         self.scale = float(min(room / (size[::-1] if is_turned else size)))
         self.axes = self.scale * axes
         self.offset = 0.5 * np.array([width, height]) - self.axes @ (0.5 * (low + high))
@@ -96,7 +104,9 @@ class TopView:
             draw.line(self._pairs(line), scene.GRID, PIXEL)
         corners = np.array([low[:2], (high[0], low[1]), high[:2], (low[0], high[1]), low[:2]])
         draw.line(self._pairs(corners), scene.BOUNDS, PIXEL)
-        for index, (centre, forward) in enumerate(zip(self.gates.centres, self.gates.forward, strict=True)):
+        for index, (centre, forward) in enumerate(
+            zip(self.gates.centres, self.gates.forward, strict=True)
+        ):
             self._draw_gate(draw, index, scene.GATE)
             left = np.array([-forward[1], forward[0]]) / max(np.hypot(forward[0], forward[1]), 1e-6)
             outwards = left if left @ (centre - 0.5 * (low + high))[:2] >= 0.0 else -left
@@ -111,7 +121,9 @@ class TopView:
             (self.gates.outer[index], colour, 4),
             (self.gates.inner[index], scene.BACKGROUND, 2),
         ):
-            draw.line(self._pairs(middle + self.enlargement * (corners - middle)), shade, width * PIXEL)
+            draw.line(
+                self._pairs(middle + self.enlargement * (corners - middle)), shade, width * PIXEL
+            )
         centre, arrow = middle[:2], ARROW * self.pixel_m * self.gates.forward[index, :2]
         base, across = centre + 0.6 * arrow, 0.25 * np.array([-arrow[1], arrow[0]])
         draw.line(self._pairs(np.array([centre, base])), colour, PIXEL)
@@ -170,13 +182,20 @@ class ChaseView:
         """
         recent = rows[-MEMORY_STEPS:].astype(float)
         index = recent[:, GATE_INDEX].astype(int)
-        to_aim_w = self.gates.centres[index] + AIM_BEYOND_M * self.gates.forward[index] - recent[:, POSITION]
+        to_aim_w = (
+            self.gates.centres[index]
+            + AIM_BEYOND_M * self.gates.forward[index]
+            - recent[:, POSITION]
+        )
         to_aim_w /= np.maximum(np.linalg.norm(to_aim_w, axis=1, keepdims=True), 1e-6)
         if follows_nose:
-            # The heading is the turn about the vertical before any tilt: rolls and loops leave it alone.
+            # The heading is the turn about the vertical before any tilt: rolls and loops leave it
+            # alone.
             w, _, _, z = recent[:, QUATERNION].T
             to_aim_w = np.stack([w * w - z * z, 2.0 * w * z, 0.0 * w], axis=-1)
-        weights = np.exp(np.arange(1 - len(to_aim_w), 1) / (HEADING_STEPS if follows_nose else SWING_STEPS))
+        weights = np.exp(
+            np.arange(1 - len(to_aim_w), 1) / (HEADING_STEPS if follows_nose else SWING_STEPS)
+        )
         direction = unit(weights @ to_aim_w, self.gates.forward[index[-1]])
         # Half the slope, so that the horizon stays in sight.
         direction = unit(direction * np.array([1.0, 1.0, 0.5]), np.array([1.0, 0.0, 0.0]))
@@ -187,7 +206,11 @@ class ChaseView:
         return Camera(eye_w, forward, self.centre_px, self.focal_px)
 
     def draw(
-        self, canvas: Image.Image, log: FlightLog, ghost: np.ndarray | None = None, follows_nose: bool = False
+        self,
+        canvas: Image.Image,
+        log: FlightLog,
+        ghost: np.ndarray | None = None,
+        follows_nose: bool = False,
     ) -> None:
         """Draw the view of the log's last row, and a ghost (21,) in it; ``camera`` describes the rest."""
         row = log.rows[-1].astype(float)
@@ -207,7 +230,9 @@ class ChaseView:
             draw_gate(draw, camera, corners_c[index], colours[index])
         self._draw_trail(draw, camera, log.rows)
         drones = [*([] if ghost is None else [(ghost, GHOST_COLOURS)]), (row, DRONE_COLOURS)]
-        for state, shades in sorted(drones, key=lambda one: -float(camera.look(one[0][POSITION])[2])):
+        for state, shades in sorted(
+            drones, key=lambda one: -float(camera.look(one[0][POSITION])[2])
+        ):
             draw_drone(draw, camera, state[POSITION], state[QUATERNION], shades)
         for index in order[~is_beyond[order]]:
             # An outline only, so that the drone is seen through it.
@@ -230,7 +255,9 @@ class ChaseView:
             draw.line(camera.polygon(points_c[start : start + 2]), colour, 2 * PIXEL)
 
 
-def draw_gate(draw: ImageDraw.ImageDraw, camera: Camera, corners_c: np.ndarray, colour: Colour) -> None:
+def draw_gate(
+    draw: ImageDraw.ImageDraw, camera: Camera, corners_c: np.ndarray, colour: Colour
+) -> None:
     """Draw a gate's frame as a solid ring; corners: (8, 3), outer four and inner four, camera's frame."""
     for a in range(4):
         b = (a + 1) % 4
@@ -240,7 +267,9 @@ def draw_gate(draw: ImageDraw.ImageDraw, camera: Camera, corners_c: np.ndarray, 
     draw_outlines(draw, camera, corners_c, scene.blend(colour, scene.BACKGROUND, 0.4))
 
 
-def draw_outlines(draw: ImageDraw.ImageDraw, camera: Camera, corners_c: np.ndarray, colour: Colour) -> None:
+def draw_outlines(
+    draw: ImageDraw.ImageDraw, camera: Camera, corners_c: np.ndarray, colour: Colour
+) -> None:
     """Draw the edges of a gate's frame and opening; corners as for ``draw_gate``."""
     for square_c in (corners_c[:4], corners_c[4:]):
         outline = camera.polygon(square_c)
@@ -262,9 +291,13 @@ def draw_drone(
     for line in camera.look(pos_w + scene.ARMS_B @ axes_w):
         draw.line(camera.polygon(line), colours[0], 4 * PIXEL)
     disc_w = scene.ROTOR_M * CIRCLE @ axes_w
-    body_w = pos_w + enlargement * BODY_M * (CIRCLE @ np.stack([camera.axes[0], camera.axes[1], UP_W]))
+    body_w = pos_w + enlargement * BODY_M * (
+        CIRCLE @ np.stack([camera.axes[0], camera.axes[1], UP_W])
+    )
     parts = [(motor_w + disc_w, colours[1 + place // 2]) for place, motor_w in enumerate(motors_w)]
-    looked = [(camera.look(points_w), colour) for points_w, colour in [*parts, (body_w, colours[0])]]
+    looked = [
+        (camera.look(points_w), colour) for points_w, colour in [*parts, (body_w, colours[0])]
+    ]
     for points_c, colour in sorted(looked, key=lambda part: -part[0][:, 2].mean()):
         rim = camera.polygon(points_c)
         if rim:
@@ -274,7 +307,8 @@ def draw_drone(
 class Renderer:
     """Draws pictures of any number of flights on one course, 960 x 540 pixels.
 
-    A flight that was drawn before costs only what was flown since: its trail is kept as long as its log.
+    A flight that was drawn before costs only what was flown since: its trail is kept as long as its
+    log.
     """
 
     def __init__(self, course: Course, gate_ids: Sequence[int]):
@@ -285,12 +319,17 @@ class Renderer:
         self.canvas = Image.new("RGB", (width, height))
 
     def draw(
-        self, log: FlightLog, ghost: np.ndarray | None = None, follows_nose: bool = False, notes: str = ""
+        self,
+        log: FlightLog,
+        ghost: np.ndarray | None = None,
+        follows_nose: bool = False,
+        notes: str = "",
     ) -> np.ndarray:
         """Return a picture of the log's last row and the way there, (540, 960, 3), uint8.
 
-        ghost: state (21,) of a second drone to show. follows_nose: whether the camera looks where the drone's
-        nose points, as a pilot needs it, and not to the next gate. notes: lines of text on the chase view.
+        ghost: state (21,) of a second drone to show. follows_nose: whether the camera looks where
+        the drone's nose points, as a pilot needs it, and not to the next gate. notes: lines of text
+        on the chase view.
 
         Raises:
             ValueError: an empty log.

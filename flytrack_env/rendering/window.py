@@ -42,7 +42,9 @@ class Window:
         if not is_visible:
             if must_be_seen:
                 raise OSError("display: found none, expected a screen (DISPLAY or WAYLAND_DISPLAY)")
-            LOGGER.warning("no display was found: the window uses SDL's dummy driver and is invisible")
+            LOGGER.warning(
+                "no display was found: the window uses SDL's dummy driver and is invisible"
+            )
             self.pygame.display.quit()
             os.environ[DRIVER] = "dummy"
             self.pygame.display.init()
@@ -51,8 +53,8 @@ class Window:
     def show(self, draw: Callable[[], np.ndarray], is_first: bool) -> None:
         """Wait until the next step is due, and draw and show a picture if one is due.
 
-        draw: returns a picture (height, width, 3), uint8. is_first: whether an episode begins, whose first
-        picture is always shown, at once.
+        draw: returns a picture (height, width, 3), uint8. is_first: whether an episode begins,
+        whose first picture is always shown, at once.
         """
         now_s = time.monotonic()
         self.step_due_s += self.step_s

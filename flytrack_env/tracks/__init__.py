@@ -12,7 +12,14 @@ from flytrack_env.tracks.course import (
 )
 from flytrack_env.tracks.feasibility import DEMANDS, Limits, Problem, find_problems
 from flytrack_env.tracks.random_track import random_track
-from flytrack_env.tracks.track import Gate, Track, TrackError, available_tracks, load_track, save_track
+from flytrack_env.tracks.track import (
+    Gate,
+    Track,
+    TrackError,
+    available_tracks,
+    load_track,
+    save_track,
+)
 
 __all__ = [
     "DEMANDS",

@@ -45,8 +45,8 @@ class GateFrame(NamedTuple):
 class Course(NamedTuple):
     """What the environment needs of a track; a pytree of arrays, so that courses can be batched.
 
-    gates: leaves (num_gates,), in flying order. start_pos_w: m. start_quat: body to world. bounds_low,
-    bounds_high: m.
+    gates: leaves (num_gates,), in flying order. start_pos_w: m. start_quat: body to world.
+    bounds_low, bounds_high: m.
     """
 
     gates: GateFrame
@@ -103,8 +103,8 @@ def cross_gate(gate: GateFrame, start_w: Vec3, end_w: Vec3, radius: Scalar) -> C
 
     The point of crossing is interpolated, so the answer does not depend on how a path is cut into
     segments. A point exactly on the plane counts as beyond it: the segment that ends there crosses,
-    the one that starts there does not. Backwards through the opening is no event; the frame is solid
-    from both sides.
+    the one that starts there does not. Backwards through the opening is no event; the frame is
+    solid from both sides.
     """
     start = gate.to_frame(start_w - gate.centre)
     end = gate.to_frame(end_w - gate.centre)
@@ -159,8 +159,8 @@ def build_course(track: Track) -> Course:
 def hermite_curve(start: Vec3, leave: Vec3, end: Vec3, meet: Vec3, s: Scalar) -> tuple[Vec3, Vec3]:
     """Return point and tangent, m, at ``s`` in [0, 1] of the cubic curve from ``start`` to ``end``.
 
-    It leaves with the tangent ``leave`` and meets the end with the tangent ``meet``, m. Cubic Hermite
-    interpolation; numpy arrays stay numpy arrays.
+    It leaves with the tangent ``leave`` and meets the end with the tangent ``meet``, m. Cubic
+    Hermite interpolation; numpy arrays stay numpy arrays.
     """
     chord = end - start
     point = (
@@ -180,9 +180,9 @@ def hermite_curve(start: Vec3, leave: Vec3, end: Vec3, meet: Vec3, s: Scalar) ->
 def sample_way(course: Course, num_samples: int) -> np.ndarray:
     """Return points of the way round a course, (num_gates, num_samples, 3), world, m, float64.
 
-    Row n leads from gate n to the gate after it, both ends included, on the curve along which episodes
-    start in flight (``flytrack_env.resets``): it leaves and meets the gates along their directions of
-    flight, with tangents as long as the gates are apart.
+    Row n leads from gate n to the gate after it, both ends included, on the curve along which
+    episodes start in flight (``flytrack_env.resets``): it leaves and meets the gates along their
+    directions of flight, with tangents as long as the gates are apart.
     """
     before = jax.tree.map(lambda leaf: np.asarray(leaf, float)[:, None], course.gates)
     gate = jax.tree.map(lambda leaf: np.roll(leaf, -1, axis=0), before)

@@ -21,15 +21,15 @@ ROUNDING_M = 1e-4  # of float32 positions some hundred metres from the origin
 class Limits(NamedTuple):
     """What a course must keep; lengths in m.
 
-    min_spacing, max_spacing: distance between the centres of consecutive gates. Nearer than that there is
-    no room to turn; observations clip at 90 m.
-    max_turn_deg: angle between a gate's direction of flight and the straight way from the gate before it
-    or to the gate behind it. At 90 deg the drone turns on the spot.
-    clearance: between the way and frames, floor, walls and ceiling, and between frames. The default is what
-    starts in flight lie off the way (0.5 m, ``ResetParams.course_offset``) and a drone's radius.
-    min_start_distance, max_start_turn_deg: as above, from the start to the first gate.
-    start_clearance: between the start and the walls; starts are drawn 0.3 m around it.
-    min_opening: inner edge of a gate. drone_radius: of the drone that must not touch frames.
+    min_spacing, max_spacing: distance between the centres of consecutive gates. Nearer than that
+    there is no room to turn; observations clip at 90 m. max_turn_deg: angle between a gate's
+    direction of flight and the straight way from the gate before it or to the gate behind it. At 90
+    deg the drone turns on the spot. clearance: between the way and frames, floor, walls and
+    ceiling, and between frames. The default is what starts in flight lie off the way (0.5 m,
+    ``ResetParams.course_offset``) and a drone's radius. min_start_distance, max_start_turn_deg: as
+    above, from the start to the first gate. start_clearance: between the start and the walls;
+    starts are drawn 0.3 m around it. min_opening: inner edge of a gate. drone_radius: of the drone
+    that must not touch frames.
     """
 
     min_spacing: float = 5.0
@@ -101,7 +101,8 @@ class Geometry(NamedTuple):
     def crossings(self, index: int, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return where a path (M, 3) crosses a gate's plane: how far off its centre, m, and if forwards.
 
-        Both (number of crossings,); the offset is the larger one of the gate's two axes, interpolated.
+        Both (number of crossings,); the offset is the larger one of the gate's two axes,
+        interpolated.
         """
         local = self.in_frame(index, path)
         is_beyond = local[:, 0] >= 0.0
@@ -208,7 +209,10 @@ def find_touching_frames(geometry: Geometry, limits: Limits) -> Iterator[str]:
             reach = math.sqrt(2.0) * (geometry.half_frames[i] + geometry.half_frames[j])
             if np.linalg.norm(geometry.centres[j] - geometry.centres[i]) > reach + limits.clearance:
                 continue
-            both = geometry.distance_to_gate(j, squares[i]), geometry.distance_to_gate(i, squares[j])
+            both = (
+                geometry.distance_to_gate(j, squares[i]),
+                geometry.distance_to_gate(i, squares[j]),
+            )
             if min(both) < limits.clearance:
                 yield (
                     f"gates {geometry.id(i)} and {geometry.id(j)}: frames {min(both):.2f} m apart, expected "
@@ -273,9 +277,12 @@ DEMANDS = tuple(CHECKS)
 def find_problems(track: Track, limits: Limits | None = None) -> tuple[Problem, ...]:
     """Return everything that keeps a course from being flown; empty if it is feasible.
 
-    Assumes straight flight from the start to the first gate, and the way of ``sample_way`` from there.
+    Assumes straight flight from the start to the first gate, and the way of ``sample_way`` from
+    there.
     """
     geometry, limits = Geometry.of(track), limits or Limits()
     return tuple(
-        Problem(demand, text) for demand, check in CHECKS.items() for text in check(geometry, limits)
+        Problem(demand, text)
+        for demand, check in CHECKS.items()
+        for text in check(geometry, limits)
     )

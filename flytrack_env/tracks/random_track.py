@@ -30,9 +30,9 @@ def random_track(
 ) -> Track:
     """Return a course that ``find_problems`` has nothing against, a function of the arguments alone.
 
-    The gates stand at random, at least ``limits.min_spacing`` apart as seen from above, are flown in the
-    order of a short round trip (half of the drawn ones with a stretch turned round, so that the way
-    crosses itself), and face about halfway between the ways to and from them.
+    The gates stand at random, at least ``limits.min_spacing`` apart as seen from above, are flown
+    in the order of a short round trip (half of the drawn ones with a stretch turned round, so that
+    the way crosses itself), and face about halfway between the ways to and from them.
 
     Args:
         key: one JAX key, typed or legacy; an int is the key ``jax.random.key(int)``. Concrete: not
@@ -42,14 +42,14 @@ def random_track(
         heights: lowest and highest centre of a gate, m.
         limits: what the course must keep, the spacing of the gates among it; ``Limits()`` if None.
 
-    Raises:
-        TrackError: arguments out of range, or no feasible course after many attempts; the message says which
-            demand failed most often.
+    Raises: TrackError: arguments out of range, or no feasible course after many attempts; the
+            message says which demand failed most often.
     """
     _check_arguments(num_gates, size, heights)
     limits = Limits() if limits is None else limits
     words = _words_of(key)
-    # numpy's, because JAX is slow at single numbers; only ``random`` is drawn, PCG64's plainest output.
+    # numpy's, because JAX is slow at single numbers; only ``random`` is drawn, PCG64's plainest
+    # output.
     generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
     name = "random_" + "_".join(f"{word:x}" for word in words)
     failed: Counter[str] = Counter()
@@ -71,14 +71,18 @@ def random_track(
     )
 
 
-def _check_arguments(num_gates: int, size: tuple[float, float], heights: tuple[float, float]) -> None:
+def _check_arguments(
+    num_gates: int, size: tuple[float, float], heights: tuple[float, float]
+) -> None:
     """Raise TrackError for arguments that no course can have."""
     if num_gates < 3:
         raise TrackError(f"num_gates: found {num_gates}, expected at least 3")
     if not all(2.0 * WALL_MARGIN_M < edge < math.inf for edge in size):
         raise TrackError(f"size: found {size}, expected more than {2.0 * WALL_MARGIN_M:g} m each")
     if not 0.5 * FRAME_M <= heights[0] <= heights[1] < math.inf:
-        raise TrackError(f"heights: found {heights}, expected a range from {0.5 * FRAME_M:g} m upwards")
+        raise TrackError(
+            f"heights: found {heights}, expected a range from {0.5 * FRAME_M:g} m upwards"
+        )
 
 
 def _words_of(key: jax.Array | int) -> list[int]:
@@ -91,7 +95,9 @@ def _words_of(key: jax.Array | int) -> list[int]:
         key = jax.random.key_data(key)
     words = np.asarray(key)
     if words.ndim != 1 or words.dtype != np.uint32:
-        raise TrackError(f"key: found {words.dtype} of shape {words.shape}, expected one key, not a batch")
+        raise TrackError(
+            f"key: found {words.dtype} of shape {words.shape}, expected one key, not a batch"
+        )
     return words.tolist()
 
 
@@ -144,7 +150,11 @@ def _order(generator: np.random.Generator, centres: np.ndarray) -> np.ndarray:
 
 
 def _track_through(
-    generator: np.random.Generator, name: str, centres: np.ndarray, size: tuple[float, float], top: float
+    generator: np.random.Generator,
+    name: str,
+    centres: np.ndarray,
+    size: tuple[float, float],
+    top: float,
 ) -> Track:
     """Return the course through centres (N, 3) in that order; starts on the ground before the first."""
     chord = np.roll(centres, -1, axis=0)[:, :2] - centres[:, :2]

@@ -34,8 +34,8 @@ class TrackError(ValueError):
 class Gate:
     """One square gate; position in m, quaternion (w, x, y, z) gate to world, edges in m.
 
-    id: a number for people, any below 2^53 but another gate's. direction: +1 if flown towards the gate's
-    local +y, -1 if towards -y. opening: inner edge. frame: outer edge.
+    id: a number for people, any below 2^53 but another gate's. direction: +1 if flown towards the
+    gate's local +y, -1 if towards -y. opening: inner edge. frame: outer edge.
     """
 
     id: int
@@ -50,8 +50,9 @@ class Gate:
 class Track:
     """A course: gates in flying order (laps repeat), start pose and bounds; SI units, world frame.
 
-    name: as in its file. start_position: m. start_quaternion: (w, x, y, z), body to world. bounds_low,
-    bounds_high: corners of the box that must not be left, m; the ground is the lower one's z.
+    name: as in its file. start_position: m. start_quaternion: (w, x, y, z), body to world.
+    bounds_low, bounds_high: corners of the box that must not be left, m; the ground is the lower
+    one's z.
     """
 
     name: str
@@ -95,10 +96,9 @@ def load_track(name_or_path: str | Path) -> Track:
 def save_track(path: str | Path, track: Track) -> None:
     """Write a track as a ``.toml`` file from which ``load_track`` returns an equal track.
 
-    Raises:
-        TrackError: a path without ``.toml``, or a track that would not come back as it is: values that no
-            track file may have, quaternions that are not units.
-        OSError: the file cannot be written.
+    Raises: TrackError: a path without ``.toml``, or a track that would not come back as it is:
+        values that no track file may have, quaternions that are not units. OSError: the file cannot
+        be written.
     """
     path = Path(path)
     if path.suffix != ".toml":
@@ -137,7 +137,9 @@ def _write(track: Track) -> str:
     ]
     for gate in track.gates:
         values = {**vars(gate), "direction": f'"{signs[gate.direction]}"'}
-        fields = (f"{field} = {list(x) if isinstance(x, tuple) else x}" for field, x in values.items())
+        fields = (
+            f"{field} = {list(x) if isinstance(x, tuple) else x}" for field, x in values.items()
+        )
         lines += ["", "[[gates]]", *fields]
     return "\n".join(lines) + "\n"
 
@@ -150,10 +152,19 @@ def _parse(path: Path, text: str) -> Track:
         raise TrackError(f"{path}: not a TOML file: {error_text(error)}") from error
     file = convert(str(path), data, _TrackFile, TrackError)
     gates = tuple(
-        Gate(gate.id, gate.position, gate.unit(), DIRECTIONS[gate.direction], gate.opening, gate.frame)
+        Gate(
+            gate.id,
+            gate.position,
+            gate.unit(),
+            DIRECTIONS[gate.direction],
+            gate.opening,
+            gate.frame,
+        )
         for gate in file.gates
     )
-    return Track(file.name, gates, file.start.position, file.start.unit(), file.bounds.low, file.bounds.high)
+    return Track(
+        file.name, gates, file.start.position, file.start.unit(), file.bounds.low, file.bounds.high
+    )
 
 
 Coordinate = Annotated[float, Meta(gt=-LARGEST, lt=LARGEST)]
@@ -173,7 +184,11 @@ class _Pose(Fields):
         """Return the quaternion, renormalised if its digits were rounded."""
         w, x, y, z = self.quaternion
         norm = math.sqrt(w * w + x * x + y * y + z * z)
-        return self.quaternion if abs(norm - 1.0) <= ROUNDING else (w / norm, x / norm, y / norm, z / norm)
+        return (
+            self.quaternion
+            if abs(norm - 1.0) <= ROUNDING
+            else (w / norm, x / norm, y / norm, z / norm)
+        )
 
 
 class _Bounds(Fields):
@@ -202,7 +217,9 @@ class _GateFields(_Pose):
     def __post_init__(self) -> None:
         _Pose.__post_init__(self)
         if self.frame <= self.opening:
-            raise ValueError(f"frame: found {self.frame}, expected more than the opening, {self.opening}")
+            raise ValueError(
+                f"frame: found {self.frame}, expected more than the opening, {self.opening}"
+            )
 
 
 class _TrackFile(Fields):
@@ -217,4 +234,6 @@ class _TrackFile(Fields):
         for index, gate in enumerate(self.gates):
             self.bounds.check(f"gates[{index}].position", gate.position)
             if gate.id in ids[:index]:
-                raise ValueError(f"gates[{index}].id: found {gate.id} twice, expected another number")
+                raise ValueError(
+                    f"gates[{index}].id: found {gate.id} twice, expected another number"
+                )

@@ -1,7 +1,8 @@
 """Flights as Rerun recordings; needs the extra ``flytrack[viz]``.
 
-``docs/recordings.md`` lists the entities. The first flight has those of the handout, others their own:
-``world/flights/NAME/drone`` and so on, ``plots/flights/NAME/speed`` and so on, ``events/flights/NAME``.
+``docs/recordings.md`` lists the entities. The first flight has those of the handout, others their
+own: ``world/flights/NAME/drone`` and so on, ``plots/flights/NAME/speed`` and so on,
+``events/flights/NAME``.
 """
 
 from flytrack_env.extras import check_installed

@@ -68,7 +68,10 @@ def log_course(recording: rr.RecordingStream, track: Track | None) -> None:
             rr.Mesh3D(vertex_positions=points, triangle_indices=triangles, vertex_colors=colours),
         )
         forward = DIRECTION_M * gates.forward
-        log("world/gates/direction", rr.Arrows3D(vectors=forward, origins=positions, radii=0.02, **style))
+        log(
+            "world/gates/direction",
+            rr.Arrows3D(vectors=forward, origins=positions, radii=0.02, **style),
+        )
     low, high = np.array(track.bounds_low), np.array(track.bounds_high)
     if np.isfinite(high - low).all():
         box = rr.Boxes3D(
@@ -108,8 +111,8 @@ def plots_of(trajectory: Trajectory, race: FlownRace | None) -> list[Plot]:
 class Writer:
     """Writes the entities of one flight.
 
-    The first flight has ``world/drone`` and so on, as in the handout; others ``world/flights/NAME/drone``.
-    colours: by the names of flights and models.
+    The first flight has ``world/drone`` and so on, as in the handout; others
+    ``world/flights/NAME/drone``. colours: by the names of flights and models.
     """
 
     def __init__(self, trajectory: Trajectory, is_first: bool, colours: dict[str, Colour]):
@@ -152,7 +155,9 @@ class Writer:
         rows = np.minimum(rows, self.all_rows[-1])
         indexes = [
             rr.TimeColumn("step", sequence=rows),
-            rr.TimeColumn("sim_time", duration=self.trajectory.time_ns[rows].astype("timedelta64[ns]")),
+            rr.TimeColumn(
+                "sim_time", duration=self.trajectory.time_ns[rows].astype("timedelta64[ns]")
+            ),
         ]
         self.recording.send_columns(entity, indexes, columns, strict=True)
 
@@ -182,7 +187,9 @@ class Writer:
         pose = rr.Transform3D.columns(translation=positions, quaternion=x_first)
         self._send(f"{self.world}/drone", self.all_rows, pose)
         # In the direction of flight; at rest, where the nose points.
-        ahead_w = np.nan_to_num(states[:, VELOCITY][:, :2]) + rotations(states[:, QUATERNION])[:, :2, 0]
+        ahead_w = (
+            np.nan_to_num(states[:, VELOCITY][:, :2]) + rotations(states[:, QUATERNION])[:, :2, 0]
+        )
         half_yaw = 0.5 * np.arctan2(ahead_w[:, 1], ahead_w[:, 0])
         level = np.zeros_like(half_yaw)
         quaternions = np.stack([level, level, np.sin(half_yaw), np.cos(half_yaw)], axis=1)
@@ -192,8 +199,9 @@ class Writer:
     def _send_path(self) -> None:
         """Send the path flown so far, for every step from 1 on.
 
-        The whole path in every row would grow with T^2. So ``flown`` holds it up to the last multiple
-        of ``block`` and changes once a block, and ``recent`` holds the rest; sqrt(T) balances the two.
+        The whole path in every row would grow with T^2. So ``flown`` holds it up to the last
+        multiple of ``block`` and changes once a block, and ``recent`` holds the rest; sqrt(T)
+        balances the two.
         """
         positions, restarts = self.trajectory.positions, self.trajectory.restarts
         breaks = np.zeros(0, int) if restarts is None else np.flatnonzero(restarts)

@@ -30,7 +30,8 @@ PLOTS = {
     "speed [m/s]": ("speed",),
     "angular speed [rad/s]": ("angular_speed",),
     **{
-        f"{stick} stick (dim: commanded)": (f"action/{stick}", f"applied/{stick}") for stick in Action._fields
+        f"{stick} stick (dim: commanded)": (f"action/{stick}", f"applied/{stick}")
+        for stick in Action._fields
     },
     "battery [V]": ("battery",),
     "distance to the next gate [m]": ("gate_distance",),
@@ -59,9 +60,13 @@ def visualize_state_action_sequence(
         states, actions = (np.array(part, float) for part in zip(*sequence, strict=True))
     except (TypeError, ValueError) as error:
         expected = f"(x ({STATE_SIZE},), u ({ACTION_SIZE},))"
-        raise ValueError(f"sequence: found no pairs of numbers ({error}), expected {expected}") from error
+        raise ValueError(
+            f"sequence: found no pairs of numbers ({error}), expected {expected}"
+        ) from error
     trajectory = checked(Trajectory("sequence", states, actions))
-    write_recording(recording_path, [trajectory], track_of_gates(gates, trajectory.positions), app_id)
+    write_recording(
+        recording_path, [trajectory], track_of_gates(gates, trajectory.positions), app_id
+    )
 
 
 def write_recording(
@@ -69,8 +74,8 @@ def write_recording(
 ) -> None:
     """Write flights on one time line as a Rerun recording, under a temporary name that is then renamed.
 
-    flights: at least one, of different names; the first has the entities of the handout, others their own
-    below ``flights/NAME``. track: None shows no gates.
+    flights: at least one, of different names; the first has the entities of the handout, others
+    their own below ``flights/NAME``. track: None shows no gates.
 
     Raises:
         ValueError: no flights, two of one name, a flight that cannot be shown (as for
@@ -96,7 +101,9 @@ def _record(flights: Sequence[Trajectory], track: Track | None, app_id: str) -> 
         raise ValueError("environment variable RERUN: found it turned off, expected on or unset")
     models = [model for flight in flights for model in flight.residuals_w]
     names = dict.fromkeys([*(flight.name for flight in flights), *models])
-    colours = {name: FLIGHT_COLOURS[place % len(FLIGHT_COLOURS)] for place, name in enumerate(names)}
+    colours = {
+        name: FLIGHT_COLOURS[place % len(FLIGHT_COLOURS)] for place, name in enumerate(names)
+    }
     writers = [Writer(flight, place == 0, colours) for place, flight in enumerate(flights)]
     races = [flight.race(track) for flight in flights]
     plots = [plots_of(flight, race) for flight, race in zip(flights, races, strict=True)]
@@ -105,7 +112,9 @@ def _record(flights: Sequence[Trajectory], track: Track | None, app_id: str) -> 
     ends = [flight.reason_ended(track, race) for flight, race in zip(flights, races, strict=True)]
     memory = recording.memory_recording()
     recording.send_blueprint(
-        make_blueprint(writers, {plot.path for own in plots for plot in own}, centres_of(track), len(colours))
+        make_blueprint(
+            writers, {plot.path for own in plots for plot in own}, centres_of(track), len(colours)
+        )
     )
     log_course(recording, track)
     places = [(0.0, float(place)) for place in range(len(colours))]
@@ -135,7 +144,9 @@ def _events(
     return [*events, (len(flight.states) - 1, f"{flight.name}: ended, {ended}")]
 
 
-def _describe(flights: Sequence[Trajectory], races: Sequence[FlownRace | None], ends: Sequence[str]) -> str:
+def _describe(
+    flights: Sequence[Trajectory], races: Sequence[FlownRace | None], ends: Sequence[str]
+) -> str:
     """Return a table of the flights, Markdown."""
     lines = ["| flight | laps (s) | time (s) | gates | ended |", "|---|---|---|---|---|"]
     for flight, race, ended in zip(flights, races, ends, strict=True):
@@ -146,7 +157,9 @@ def _describe(flights: Sequence[Trajectory], races: Sequence[FlownRace | None], 
     return "\n".join(lines)
 
 
-def _view(name: str, origin: str, position: Sequence[float], target: Sequence[float]) -> rrb.Spatial3DView:
+def _view(
+    name: str, origin: str, position: Sequence[float], target: Sequence[float]
+) -> rrb.Spatial3DView:
     """Return a view of the world in the frame of an entity, from a position and towards a target in it."""
     eye = rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=position, look_target=target)
     contents = ["+ /world/**", "- /world/bounds"]  # around a course, the bounds are mostly empty
@@ -168,7 +181,9 @@ def make_blueprint(
     (num_gates, 3), world, m. num_colours: rows of the key.
     """
     has_line = {
-        title: any(path.startswith(tuple(line.removesuffix("**") for line in lines)) for path in paths)
+        title: any(
+            path.startswith(tuple(line.removesuffix("**") for line in lines)) for path in paths
+        )
         for title, lines in PLOTS.items()
     }
     plots = [_plot(title, lines, writers) for title, lines in PLOTS.items() if has_line[title]]
@@ -178,10 +193,14 @@ def make_blueprint(
     low, high = positions.min(axis=0), positions.max(axis=0)
     middle, size = 0.5 * (low + high), max(float(np.linalg.norm(high - low)), SMALLEST_M)
     # From the broad side.
-    beside = [BESIDE, ALONG] if np.ptp(positions[:, 1]) > np.ptp(positions[:, 0]) else [ALONG, -BESIDE]
+    beside = (
+        [BESIDE, ALONG] if np.ptp(positions[:, 1]) > np.ptp(positions[:, 0]) else [ALONG, -BESIDE]
+    )
     eye_w = middle + size * np.array([*beside, ABOVE])
     chases = [
-        _view(f"follow {writer.trajectory.name}", f"/{writer.world}/chase", BEHIND_M, (0.0, 0.0, 0.0))
+        _view(
+            f"follow {writer.trajectory.name}", f"/{writer.world}/chase", BEHIND_M, (0.0, 0.0, 0.0)
+        )
         for writer in writers
     ]
     left = rrb.Vertical(
@@ -197,8 +216,12 @@ def make_blueprint(
     rows = rrb.VisualBounds2D(x_range=[-1.0, 1.0], y_range=[-1.0, num_colours])
     key = rrb.Spatial2DView(origin=f"/{KEY}", name="colours", visual_bounds=rows)
     return rrb.Blueprint(
-        rrb.Horizontal(left, rrb.Grid(*plots, angles, key, grid_columns=2), column_shares=[1.0, 1.0]),
-        rrb.TimePanel(state="collapsed", timeline="sim_time", play_state="playing", loop_mode="all"),
+        rrb.Horizontal(
+            left, rrb.Grid(*plots, angles, key, grid_columns=2), column_shares=[1.0, 1.0]
+        ),
+        rrb.TimePanel(
+            state="collapsed", timeline="sim_time", play_state="playing", loop_mode="all"
+        ),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
     )

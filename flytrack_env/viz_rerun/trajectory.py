@@ -20,10 +20,10 @@ LARGEST_M = 1e30  # Rerun stores float32, where larger numbers are infinite
 class Trajectory:
     """A flight to record; outside the pose, a number that is not finite is a gap in its plot.
 
-    name: of its plots and paths. states: (T, 21). actions: (T, 4), commanded. time_s: (T,), s, growing;
-    None: a step of 0.01 s from 0 on. ended: why the flight ended; None: derived from its last state.
-    restarts: (T,) bool, rows at which the path begins anew; None: none. residuals_w: by the name of a
-    model, (T, 3), the specific force that it does not explain, world frame, m/s^2.
+    name: of its plots and paths. states: (T, 21). actions: (T, 4), commanded. time_s: (T,), s,
+    growing; None: a step of 0.01 s from 0 on. ended: why the flight ended; None: derived from its
+    last state. restarts: (T,) bool, rows at which the path begins anew; None: none. residuals_w: by
+    the name of a model, (T, 3), the specific force that it does not explain, world frame, m/s^2.
     """
 
     name: str
@@ -56,7 +56,11 @@ class Trajectory:
         """Return why the flight ended."""
         if self.ended is not None:
             return self.ended
-        return "all steps flown" if race is None or track is None else why_ended(self.states, track, race)
+        return (
+            "all steps flown"
+            if race is None or track is None
+            else why_ended(self.states, track, race)
+        )
 
 
 def checked(trajectory: Trajectory) -> Trajectory:
@@ -75,14 +79,21 @@ def checked(trajectory: Trajectory) -> Trajectory:
         ("actions", actions, (count, ACTION_SIZE)),
         ("time_s", trajectory.time_s, (count,)),
         ("restarts", trajectory.restarts, (count,)),
-        *((f"residuals_w {name}", force, (count, 3)) for name, force in trajectory.residuals_w.items()),
+        *(
+            (f"residuals_w {name}", force, (count, 3))
+            for name, force in trajectory.residuals_w.items()
+        ),
     ]
     for name, array, shape in shapes:
         if array is not None and np.shape(array) != shape:
-            raise ValueError(f"{trajectory.name}: {name}: found shape {np.shape(array)}, expected {shape}")
+            raise ValueError(
+                f"{trajectory.name}: {name}: found shape {np.shape(array)}, expected {shape}"
+            )
     time_s = trajectory.time_s
     if time_s is not None and not (np.diff(time_s, prepend=-np.inf) > 0.0).all():
-        raise ValueError(f"{trajectory.name}: time_s: found times that do not grow, expected growing ones")
+        raise ValueError(
+            f"{trajectory.name}: time_s: found times that do not grow, expected growing ones"
+        )
     _normalise_poses(f"{trajectory.name}: states", states, POSITION, QUATERNION)
     return dataclasses.replace(trajectory, states=states, actions=actions)
 
@@ -90,8 +101,8 @@ def checked(trajectory: Trajectory) -> Trajectory:
 def track_of_gates(gates: np.ndarray, positions: np.ndarray) -> Track:
     """Return gates as a track without bounds, of the handout's size, flown as the flight first passes them.
 
-    gates: (N, >=8) with id, x, y, z, qw, qx, qy, qz (to world). positions: (T, 3), of the flight. A gate that
-    it does not pass is flown towards its local +y.
+    gates: (N, >=8) with id, x, y, z, qw, qx, qy, qz (to world). positions: (T, 3), of the flight. A
+    gate that it does not pass is flown towards its local +y.
 
     Raises:
         ValueError: another shape, or a pose that is not finite or no rotation.
@@ -115,7 +126,12 @@ def track_of_gates(gates: np.ndarray, positions: np.ndarray) -> Track:
             for row, direction in zip(rows, directions.tolist(), strict=True)
         ]
         return Track(
-            "gates", tuple(made), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (-np.inf,) * 3, (np.inf,) * 3
+            "gates",
+            tuple(made),
+            (0.0, 0.0, 0.0),
+            (1.0, 0.0, 0.0, 0.0),
+            (-np.inf,) * 3,
+            (np.inf,) * 3,
         )
 
     forwards = np.ones(len(rows))
@@ -142,5 +158,7 @@ def _normalise_poses(name: str, rows: np.ndarray, position: slice, quaternion: s
     if not is_unit.all():
         row = int(np.argmin(is_unit))
         expected = f"1 within {UNIT_NORM_TOLERANCE:g}"
-        raise ValueError(f"{name}[{row}]: found quaternion norm {norms[row]:.6g}, expected {expected}")
+        raise ValueError(
+            f"{name}[{row}]: found quaternion norm {norms[row]:.6g}, expected {expected}"
+        )
     rows[:, quaternion] /= norms[:, None]

@@ -23,8 +23,8 @@ class ActionDelayState(NamedTuple):
 class ActionDelay(Wrapper):
     """Delay every action by ``params.wrappers["action_delay"].delay_s``.
 
-    The parameters are those of the effect ``command_delay``, which does the same inside the simulator's
-    model; this wrapper does it for any plant.
+    The parameters are those of the effect ``command_delay``, which does the same inside the
+    simulator's model; this wrapper does it for any plant.
 
     Raises:
         ValueError: a delay outside the effect's range.
@@ -53,7 +53,9 @@ class ActionDelay(Wrapper):
         super().check_params(params)
         check_parameters(self.own_params(params), params.dt)
 
-    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> ActionDelayState:
+    def begin(
+        self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0
+    ) -> ActionDelayState:
         """Return the state of an episode that begins, its applied action taken for all past commands."""
         inner = self.env.begin(drone, gate_index, params, seed)
         return ActionDelayState(inner, command_delay.start(self.own_params(params), drone))
@@ -67,7 +69,9 @@ class ActionDelay(Wrapper):
         """
         delay = self.own_params(params)
         is_nan = jnp.isnan(sum(command))
-        context = StepContext(drone=self.env.drone(state.inner), command=without_nan(command), dt=params.dt)
+        context = StepContext(
+            drone=self.env.drone(state.inner), command=without_nan(command), dt=params.dt
+        )
         arriving = command_delay.delayed(delay, state.past, context.command, context)
         arriving = Action(*(jnp.where(is_nan, jnp.nan, value) for value in arriving))
         inner, reward, terminated, info = self.env.advance(state.inner, arriving, params)

@@ -24,8 +24,8 @@ class ActionHistoryState(NamedTuple):
 class ActionHistory(Wrapper):
     """Append the last ``length`` actions to the observation, the latest first.
 
-    kind: "commanded" (clipped, as the policy gave them) or "applied" (lagged). When an episode begins,
-    all of them are the applied action that the drone begins with.
+    kind: "commanded" (clipped, as the policy gave them) or "applied" (lagged). When an episode
+    begins, all of them are the applied action that the drone begins with.
 
     Raises:
         ValueError: a length below 1, another kind.
@@ -60,7 +60,9 @@ class ActionHistory(Wrapper):
         )
         return (*self.env.observation_table, *rows)
 
-    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> ActionHistoryState:
+    def begin(
+        self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0
+    ) -> ActionHistoryState:
         """Return the state of an episode that begins, the drone's applied action for all of history."""
         inner = self.env.begin(drone, gate_index, params, seed)
         return ActionHistoryState(inner, (drone.applied,) * self.length)
@@ -73,7 +75,9 @@ class ActionHistory(Wrapper):
         latest = without_nan(command) if self.kind == "commanded" else self.env.drone(inner).applied
         return ActionHistoryState(inner, (latest, *state.actions[:-1])), reward, terminated, info
 
-    def observe_drone(self, drone: Drone, state: ActionHistoryState, params: EnvParams) -> list[jax.Array]:
+    def observe_drone(
+        self, drone: Drone, state: ActionHistoryState, params: EnvParams
+    ) -> list[jax.Array]:
         """Return the inner observation with the actions behind it."""
         values = [jnp.asarray(value) for action in state.actions for value in action]
         return [*self.env.observe_drone(drone, state.inner, params), *values]

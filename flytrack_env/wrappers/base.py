@@ -1,9 +1,9 @@
 """The base of wrappers: an environment around an environment, inside auto-reset.
 
-gymnax's own wrappers go around a step that has already reset itself, so that their state leaks into the
-next episode. Ours change the hooks of ``flytrack_env.episodes.EpisodicEnvironment`` instead:
-each has one state of its own around the inner state, created when an episode begins. They compose in any
-order that makes sense; any other is refused.
+gymnax's own wrappers go around a step that has already reset itself, so that their state leaks into
+the next episode. Ours change the hooks of ``flytrack_env.episodes.EpisodicEnvironment`` instead:
+each has one state of its own around the inner state, created when an episode begins. They compose
+in any order that makes sense; any other is refused.
 """
 
 from typing import Any
@@ -25,8 +25,9 @@ class WrapperError(ValueError):
 class Wrapper(EpisodicEnvironment):
     """Delegates every hook; a wrapper overrides those that it changes.
 
-    Its state is a NamedTuple whose field ``inner`` holds the wrapped environment's state. key: its name,
-    and that of its parameters in ``EnvParams.wrappers``; no two wrappers of an environment share one.
+    Its state is a NamedTuple whose field ``inner`` holds the wrapped environment's state. key: its
+    name, and that of its parameters in ``EnvParams.wrappers``; no two wrappers of an environment
+    share one.
 
     Raises:
         WrapperError: anything but FlyTrack or a wrapper of ours, the same wrapper twice, or one
@@ -78,7 +79,9 @@ class Wrapper(EpisodicEnvironment):
         """The inner environment's, with this wrapper's own."""
         params = self.env.default_params
         own = self.own_defaults()
-        return params if own is None else params.replace(wrappers={**params.wrappers, self.key: own})
+        return (
+            params if own is None else params.replace(wrappers={**params.wrappers, self.key: own})
+        )
 
     @property
     def observation_table(self) -> tuple[Entry, ...]:

@@ -31,12 +31,12 @@ LEFT_ALONE: Any = None  # in the place of a parameter's bound: not drawn
 class RandomizationParams(NamedTuple):
     """Ranges of uniform draws, once per episode.
 
-    mass_factor_*: of the model's mass; forces per mass (drag, a wind's push) stay, so that it acts like
-    1 / thrust_scale. lag_factor_*: of each of its four time constants. low, high: parameters of effects
-    (``flytrack_env.effects``), the same effects in both; None leaves a parameter alone.
-    effect_factor_*: of what the model itself has of these effects. An effect that was identified is known:
-    its departure from neutral is scaled, instead of drawn from low to high; but what was learnt, of which
-    ``spread`` is drawn, in standard errors.
+    mass_factor_*: of the model's mass; forces per mass (drag, a wind's push) stay, so that it acts
+    like 1 / thrust_scale. lag_factor_*: of each of its four time constants. low, high: parameters
+    of effects (``flytrack_env.effects``), the same effects in both; None leaves a parameter alone.
+    effect_factor_*: of what the model itself has of these effects. An effect that was identified is
+    known: its departure from neutral is scaled, instead of drawn from low to high; but what was
+    learnt, of which ``spread`` is drawn, in standard errors.
     """
 
     mass_factor_low: Scalar = 0.8
@@ -66,7 +66,9 @@ class RandomizedState(NamedTuple):
     word: jax.Array
 
 
-def sample_model(word: jax.Array, model: ModelParameters, ranges: RandomizationParams) -> ModelParameters:
+def sample_model(
+    word: jax.Array, model: ModelParameters, ranges: RandomizationParams
+) -> ModelParameters:
     """Return the model of an episode, from a uint32 word; the same word gives the same model.
 
     Drawn again wherever it is needed: cheaper than to carry some twenty numbers through every step.
@@ -86,7 +88,9 @@ def sample_model(word: jax.Array, model: ModelParameters, ranges: RandomizationP
     return model._replace(m=model.m * mass_factor, tau=tau).with_effects(*drawn)
 
 
-def _draw(draws: Draws, model: ModelParameters, low: Any, high: Any, factors: tuple[Scalar, Scalar]) -> Any:
+def _draw(
+    draws: Draws, model: ModelParameters, low: Any, high: Any, factors: tuple[Scalar, Scalar]
+) -> Any:
     """Return the parameters of one effect: around the model's, or from the range if it has none."""
     effect, present = effect_of(low), [type(parameters) for parameters in model.effects]
     known, neutral = model.effect(effect.name), effect.parameters()
@@ -108,8 +112,8 @@ def _draw(draws: Draws, model: ModelParameters, low: Any, high: Any, factors: tu
 class DomainRandomization(Wrapper):
     """Fly every episode with a model drawn around the given one.
 
-    The ranges are ``params.wrappers["domain_randomization"]``, a ``RandomizationParams``. The policy does
-    not see the draw; ``env.model(state, params)`` returns it.
+    The ranges are ``params.wrappers["domain_randomization"]``, a ``RandomizationParams``. The
+    policy does not see the draw; ``env.model(state, params)`` returns it.
 
     Raises:
         WrapperError: as ``Wrapper``, or a plant that has its parameters baked in.
@@ -131,13 +135,16 @@ class DomainRandomization(Wrapper):
     def check_params(self, params: EnvParams) -> None:
         """Raise ValueError for ranges that hold no model, and what the inner check refuses.
 
-        The effects of the ranges may be others than the default's, but the same in ``low`` and ``high``.
+        The effects of the ranges may be others than the default's, but the same in ``low`` and
+        ``high``.
         """
         self.env.check_params(params)
         ranges = params.wrappers.get(self.key)
         if not isinstance(ranges, RandomizationParams):
             expected = "RandomizationParams, as in this environment's default_params"
-            raise ValueError(f"params.wrappers[{self.key!r}]: found {ranges!r}, expected {expected}")
+            raise ValueError(
+                f"params.wrappers[{self.key!r}]: found {ranges!r}, expected {expected}"
+            )
         _check_ranges(ranges, params, self.env.plant.delay_steps)
 
     def model(self, state: RandomizedState, params: EnvParams) -> ModelParameters:
@@ -156,12 +163,18 @@ class DomainRandomization(Wrapper):
     def _word(self, seed: Any) -> jax.Array:
         return Draws(seed).word(self.key)
 
-    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> RandomizedState:
+    def begin(
+        self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0
+    ) -> RandomizedState:
         """Return the state of an episode that begins, its model decided by the seed."""
         word = self._word(seed)
-        return RandomizedState(self.env.begin(drone, gate_index, self._drawn(word, params), seed), word)
+        return RandomizedState(
+            self.env.begin(drone, gate_index, self._drawn(word, params), seed), word
+        )
 
-    def observe_drone(self, drone: Drone, state: RandomizedState, params: EnvParams) -> list[jax.Array]:
+    def observe_drone(
+        self, drone: Drone, state: RandomizedState, params: EnvParams
+    ) -> list[jax.Array]:
         """Return the inner environment's observation, with this episode's model."""
         return self.env.observe_drone(drone, state.inner, self._drawn(state.word, params))
 
@@ -178,7 +191,8 @@ class DomainRandomization(Wrapper):
 def _check_ranges(ranges: RandomizationParams, params: EnvParams, delay_steps: int) -> None:
     """Raise ValueError for an empty range, one beyond what can be flown, or effects that do not match."""
     classes = [
-        [effect_of(parameters).parameters for parameters in side] for side in (ranges.low, ranges.high)
+        [effect_of(parameters).parameters for parameters in side]
+        for side in (ranges.low, ranges.high)
     ]
     if classes[0] != classes[1]:
         names = [[parameters.__name__ for parameters in side] for side in classes]
@@ -192,7 +206,9 @@ def _check_ranges(ranges: RandomizationParams, params: EnvParams, delay_steps: i
     ]
     for low, high in zip(ranges.low, ranges.high, strict=True):
         effect = effect_of(low)
-        known = {name: getattr(high, name) for name in effect.ranges if getattr(high, name) is not None}
+        known = {
+            name: getattr(high, name) for name in effect.ranges if getattr(high, name) is not None
+        }
         check_parameters(effect.parameters()._replace(**known), params.dt, delay_steps)
         for name, bounds in effect.ranges.items():
             pair = getattr(low, name), getattr(high, name)

@@ -21,7 +21,8 @@ class EpisodeStatisticsState(NamedTuple):
 class EpisodeStatistics(Wrapper):
     """Add ``episode_return`` and ``episode_length`` to info, this step included.
 
-    Of a whole episode where it is ``terminated`` or ``truncated``; nothing is carried into the next one.
+    Of a whole episode where it is ``terminated`` or ``truncated``; nothing is carried into the next
+    one.
     """
 
     key = "episode_statistics"
@@ -38,6 +39,11 @@ class EpisodeStatistics(Wrapper):
     ) -> tuple[EpisodeStatisticsState, jax.Array, jax.Array, dict[str, Any]]:
         """Return the outcome of the inner environment, counted."""
         inner, reward, terminated, info = self.env.advance(state.inner, command, params)
-        counted = EpisodeStatisticsState(inner, state.episode_return + reward, state.episode_length + 1)
-        statistics = {"episode_return": counted.episode_return, "episode_length": counted.episode_length}
+        counted = EpisodeStatisticsState(
+            inner, state.episode_return + reward, state.episode_length + 1
+        )
+        statistics = {
+            "episode_return": counted.episode_return,
+            "episode_length": counted.episode_length,
+        }
         return counted, reward, terminated, {**info, **statistics}

@@ -21,7 +21,9 @@ class LegacyStep:
 
     def __init__(self, env: Any):
         if isinstance(env, LegacyStep):
-            raise WrapperError("LegacyStep around LegacyStep: the step inside has five values already")
+            raise WrapperError(
+                "LegacyStep around LegacyStep: the step inside has five values already"
+            )
         self._env = env
 
     def __getattr__(self, name: str) -> Any:

@@ -19,8 +19,9 @@ from flytrack_env.wrappers.base import Wrapper
 class NoiseParams(NamedTuple):
     """Standard deviations of white noise on the drone that the policy sees, per component.
 
-    position_m, velocity_m_per_s: world. attitude_deg: a turn about each body axis. rates_rad_per_s: body.
-    The defaults are those of a good motion capture or visual-inertial estimate and a filtered gyro.
+    position_m, velocity_m_per_s: world. attitude_deg: a turn about each body axis. rates_rad_per_s:
+    body. The defaults are those of a good motion capture or visual-inertial estimate and a filtered
+    gyro.
     """
 
     position_m: Scalar = 0.02
@@ -47,9 +48,9 @@ class NoisyState(NamedTuple):
 class ObservationNoise(Wrapper):
     """Add white noise to what the sensors report of position, velocity, attitude and body rates.
 
-    The standard deviations are ``params.wrappers["observation_noise"]``, a ``NoiseParams``. Independent in
-    every step and episode; the observation of a state is always the same, so that ``final_observation`` is
-    what the policy would have seen.
+    The standard deviations are ``params.wrappers["observation_noise"]``, a ``NoiseParams``.
+    Independent in every step and episode; the observation of a state is always the same, so that
+    ``final_observation`` is what the policy would have seen.
     """
 
     key = "observation_noise"
@@ -65,7 +66,9 @@ class ObservationNoise(Wrapper):
             bounds = RANGES[name]
             if not np.all((np.asarray(value) >= bounds.low) & (np.asarray(value) <= bounds.high)):
                 expected = f"finite and >= 0, at most {bounds.high:g} {bounds.unit}"
-                raise ValueError(f"params.wrappers[{self.key!r}].{name}: found {value}, expected {expected}")
+                raise ValueError(
+                    f"params.wrappers[{self.key!r}].{name}: found {value}, expected {expected}"
+                )
 
     def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> NoisyState:
         """Return the state of an episode that begins, with noise of its own."""
@@ -82,8 +85,9 @@ class ObservationNoise(Wrapper):
     def observe_drone(self, drone: Drone, state: NoisyState, params: EnvParams) -> list[jax.Array]:
         """Return the inner observation of a drone as noisy sensors report it.
 
-        Attitude is disturbed before the observation is made of it. What is a vector is disturbed after:
-        white noise of equal deviation along all axes is the same in every frame, and this is cheaper.
+        Attitude is disturbed before the observation is made of it. What is a vector is disturbed
+        after: white noise of equal deviation along all axes is the same in every frame, and this is
+        cheaper.
         """
         noise, draws = self.own_params(params), Draws(state.word)
         turned = compute_once(_turn(drone.quat, draws, noise.attitude_deg))
@@ -107,8 +111,8 @@ class ObservationNoise(Wrapper):
 def _turn(quat: Quaternion, draws: Draws, deviation_deg: Scalar) -> Quaternion:
     """Return an attitude turned by a random angle about each body axis.
 
-    The rotation of a vector t is (1 - t^2, 2 t) / (1 + t^2), about 4 t for small ones: a unit quaternion for
-    any t without a normalisation, so that no noise changes no bit.
+    The rotation of a vector t is (1 - t^2, 2 t) / (1 + t^2), about 4 t for small ones: a unit
+    quaternion for any t without a normalisation, so that no noise changes no bit.
     """
     normals = Vec3(*(draws.normal(f"attitude_{axis}") for axis in "xyz"))
     quarter_turn = compute_once(normals.scale(0.25 * jnp.deg2rad(deviation_deg)))

@@ -4,7 +4,13 @@ from flytrack_sysid.diagnosis.before import diagnose_change
 from flytrack_sysid.diagnosis.diagnose import DiagnosisError, diagnose, joined
 from flytrack_sysid.diagnosis.motion_choice import motion_of
 from flytrack_sysid.diagnosis.report import text_of, write_diagnosis
-from flytrack_sysid.diagnosis.result import Cause, Diagnosis, Estimated, NotIdentifiable, Unexplained
+from flytrack_sysid.diagnosis.result import (
+    Cause,
+    Diagnosis,
+    Estimated,
+    NotIdentifiable,
+    Unexplained,
+)
 
 __all__ = [
     "Cause",

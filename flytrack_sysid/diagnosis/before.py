@@ -1,9 +1,10 @@
 """Before and after: of all that a model lacks, only what has changed since an earlier log is named.
 
-No model of a real drone is complete. What it lacks is in the log before and in the log after alike, and
-laws that stand in for it are found in both. So each law is fitted to either log, beside the same others, and
-names a change where the estimates differ by more than both are uncertain, and by a size that matters.
-Uncertainty is judged from how much seconds of a log disagree, which counts what the model lacks.
+No model of a real drone is complete. What it lacks is in the log before and in the log after alike,
+and laws that stand in for it are found in both. So each law is fitted to either log, beside the
+same others, and names a change where the estimates differ by more than both are uncertain, and by a
+size that matters. Uncertainty is judged from how much seconds of a log disagree, which counts what
+the model lacks.
 """
 
 from collections.abc import Callable, Sequence
@@ -47,8 +48,8 @@ from flytrack_sysid.log_motion import check_same_origin
 from flytrack_sysid.parameters import THRUST_COEFFS
 
 MOST_EFFECTS = 4
-# Sticks that are farther from where they were lately, in sum; the time constant of lately, and for how long
-# what follows does not count.
+# Sticks that are farther from where they were lately, in sum; the time constant of lately, and for
+# how long what follows does not count.
 JUMP, JUMP_S, AFTERMATH_S = 0.5, 0.05, 0.2
 WORSE = 1.5  # times what was left unexplained before: so much more is new
 Logs = FlightLog | Sequence[FlightLog]
@@ -81,7 +82,9 @@ class Estimate(NamedTuple):
         state = search.SearchState.start(parts.log, problem)
         base = state.fitted((), problem.start)
         state, linearization = state.linearized(base.vector)
-        state = state.with_noise(noises.fit_noise(problem.lanes, search.saturated_residuals(linearization)))
+        state = state.with_noise(
+            noises.fit_noise(problem.lanes, search.saturated_residuals(linearization))
+        )
         base = state.fitted((), base.vector)
         state, linearization = state.linearized(base.vector)
         return cls(state, base, base, linearization)
@@ -100,9 +103,12 @@ class Estimate(NamedTuple):
     def step(self, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """Return to first order the step along columns beside the model, and its covariance.
 
-        The covariance is as much larger than the information's inverse as seconds disagree after the step.
+        The covariance is as much larger than the information's inverse as seconds disagree after
+        the step.
         """
-        gain = self.linearization.freed(list(columns), self.linearization.columns_at(self.model.places))
+        gain = self.linearization.freed(
+            list(columns), self.linearization.columns_at(self.model.places)
+        )
         return gain.step, gain.inflation * solve(gain.information, np.eye(len(columns)))
 
 
@@ -116,9 +122,10 @@ def diagnose_change(
 ) -> Diagnosis:
     """Return the diagnosis of a log, in which causes are what changed since a log before.
 
-    before: of the same craft, as the model knows it. The rest as in ``diagnose``. Values of causes are those
-    of the model, changed as the estimates changed. What the model lacks in both logs is in the extended
-    model's other parameters, and is no cause; unexplained is only what was not so before.
+    before: of the same craft, as the model knows it. The rest as in ``diagnose``. Values of causes
+    are those of the model, changed as the estimates changed. What the model lacks in both logs is
+    in the extended model's other parameters, and is no cause; unexplained is only what was not so
+    before.
 
     Raises:
         DiagnosisError: as ``diagnose``, of either log.
@@ -143,7 +150,8 @@ def diagnose_change(
         test = held_out_under(selection, parts.test)
         judged = refined_within_range(Judged(selection, {}), test, parts)
         found = summarize(judged, parts._replace(test=test))
-        # A change is named by its steps and size; the extended model has it only if flights gain by it.
+        # A change is named by its steps and size; the extended model has it only if flights gain by
+        # it.
         effects = effect_causes(selection, test, later.linearization)
         base = [one for one in found.causes if one.effect not in later.model.effects]
         named = [*effects, *base]
@@ -157,14 +165,18 @@ def diagnose_change(
         nominal=model._replace(motion=found.extended.motion),
         verdict=verdict_of(causes, found.unexplained),
         causes=causes,
-        warnings=(*found.warnings, *(f"{name}: as in the log before, so no change" for name in sorted(same))),
+        warnings=(
+            *found.warnings,
+            *(f"{name}: as in the log before, so no change" for name in sorted(same)),
+        ),
     )
 
 
 def calm(parts: Split) -> Split:
     """Return a split in which only rows count before which the sticks did not jump.
 
-    Where they do, motors end, and how a controller shares what there is among the axes only a loop says.
+    Where they do, motors end, and how a controller shares what there is among the axes only a loop
+    says.
     """
     if acts(parts.train.like.effects, "respond"):
         return parts
@@ -201,7 +213,9 @@ def next_change(later: Estimate, earlier: Estimate) -> tuple[Refit, tuple[str, .
     """
     promise = {one: promise_of(one, later, earlier) for one in candidates_for(later.state.problem)}
     ways: dict[tuple[str, ...], Candidate] = {}
-    for one in sorted((one for one in promise if promise[one] > 0.0), key=lambda one: -promise[one]):
+    for one in sorted(
+        (one for one in promise if promise[one] > 0.0), key=lambda one: -promise[one]
+    ):
         ways.setdefault(one.fields, one)
     refitted = [(one, later.with_effect(one)) for one in [*ways.values()][: search.MOST_REFITTED]]
     worth = {
@@ -211,7 +225,9 @@ def next_change(later: Estimate, earlier: Estimate) -> tuple[Refit, tuple[str, .
     found: list[Refit] = []
     for one, more in sorted(refitted, key=lambda pair: -worth[pair[0]]):
         best = max((own.merit for own in found), default=0.0)
-        if worth[one] <= max(best - EQUIVALENT, 0.0):  # what the log before gains only takes from it
+        if worth[one] <= max(
+            best - EQUIVALENT, 0.0
+        ):  # what the log before gains only takes from it
             break
         less = earlier.with_effect(one)
         merit = worth[one] - (earlier.model.cost - less.model.cost)
@@ -230,27 +246,43 @@ def promise_of(candidate: Candidate, later: Estimate, earlier: Estimate) -> floa
     A change shows between the logs, and in the log after against the model.
     """
     both = later, earlier
-    if candidate.effect in later.state.unobservable or not all(one.model.lacks(candidate) for one in both):
+    if candidate.effect in later.state.unobservable or not all(
+        one.model.lacks(candidate) for one in both
+    ):
         return 0.0
     ways = [one.linearization.columns_of(candidate) for one in both]
-    if any(len(one.linearization.acting(way)) < len(way) for one, way in zip(both, ways, strict=True)):
+    if any(
+        len(one.linearization.acting(way)) < len(way) for one, way in zip(both, ways, strict=True)
+    ):
         return 0.0
-    (step, covariance), (step_before, covariance_before) = later.step(ways[0]), earlier.step(ways[1])
+    (step, covariance), (step_before, covariance_before) = (
+        later.step(ways[0]),
+        earlier.step(ways[1]),
+    )
     change = step - step_before
     # What the model does not have at all cannot become less.
-    if any(probe.is_one_way and share <= 0.0 for probe, share in zip(candidate.probes, step, strict=False)):
+    if any(
+        probe.is_one_way and share <= 0.0
+        for probe, share in zip(candidate.probes, step, strict=False)
+    ):
         return 0.0
-    chi2 = min(change @ solve(covariance + covariance_before, change), step @ solve(covariance, step))
+    chi2 = min(
+        change @ solve(covariance + covariance_before, change), step @ solve(covariance, step)
+    )
     if chi2 < search.PROMISING * threshold(len(change)) or not is_large(candidate, change, later):
         return 0.0
-    gain = later.linearization.gain_of(candidate, later.linearization.columns_at(later.model.places))
+    gain = later.linearization.gain_of(
+        candidate, later.linearization.columns_at(later.model.places)
+    )
     return gain.chi2 if gain is not None else 0.0
 
 
 def is_large(candidate: Candidate, change: np.ndarray, later: Estimate) -> bool:
     """Return whether a change, of shares of the ways to probes and of other parameters, is notable."""
     problem = later.state.problem
-    ways = [probe.value - problem.start[problem.index([probe.field])[0]] for probe in candidate.probes]
+    ways = [
+        probe.value - problem.start[problem.index([probe.field])[0]] for probe in candidate.probes
+    ]
     sizes = np.concatenate([np.array(ways), np.ones(len(candidate.other_fields))]) * change
     fields = [*(probe.field for probe in candidate.probes), *candidate.other_fields]
     notable = BY_NAME[candidate.effect].notable
@@ -261,10 +293,13 @@ def is_large(candidate: Candidate, change: np.ndarray, later: Estimate) -> bool:
 def selection_of(later: Estimate, earlier: Estimate) -> Selection:
     """Return the model of the log after as selected; unexplained: what was not, or much less, before."""
     state, model = later.state, later.model
-    ablations = {name: ablate(state, model, later.linearization, name) for name in sorted(model.effects)}
+    ablations = {
+        name: ablate(state, model, later.linearization, name) for name in sorted(model.effects)
+    }
     ablations = {one.effect: ablations[one.effect] for one in model.candidates}
     rest, past = (
-        find_unexplained(one.state.problem, one.model, one.base.vector)[0].shares for one in (later, earlier)
+        find_unexplained(one.state.problem, one.model, one.base.vector)[0].shares
+        for one in (later, earlier)
     )
     most = max(past.values(), default=0.0)
     shares = {name: size for name, size in rest.items() if size > WORSE * past.get(name, most)}

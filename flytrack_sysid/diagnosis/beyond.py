@@ -22,7 +22,8 @@ LAST = ("thrust", "throttle", "airspeed")  # say least of a product
 class Learned:
     """A law that was learnt beyond the list.
 
-    gains, held_out_gains: of minus twice the log likelihood, by side. rivals: of the law's terms, by side.
+    gains, held_out_gains: of minus twice the log likelihood, by side. rivals: of the law's terms,
+    by side.
     """
 
     law: Law
@@ -43,8 +44,12 @@ class Learned:
         """Return which residual to draw over which regressor, names as in ``traces``."""
         found = []
         for term in self.law.terms:
-            axis = "xyz"[max(range(len(term.coefficients)), key=lambda place: abs(term.coefficients[place]))]
-            found.append((_column(term.acts, term.frame, axis), _least(one.quantity for one in term.factors)))
+            axis = "xyz"[
+                max(range(len(term.coefficients)), key=lambda place: abs(term.coefficients[place]))
+            ]
+            found.append(
+                (_column(term.acts, term.frame, axis), _least(one.quantity for one in term.factors))
+            )
         return list(dict.fromkeys((column, DRAWN_AS.get(name, "time")) for column, name in found))
 
     def text(self) -> str:

@@ -18,7 +18,13 @@ from flytrack_sysid.diagnosis.late_poses import with_late_poses
 from flytrack_sysid.diagnosis.lateness import read_poses
 from flytrack_sysid.diagnosis.learned import find_learned
 from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves, likelier_motion, problem_of
-from flytrack_sysid.diagnosis.onset import at_end, first_row_as_at_end, notes_of, spans_of, with_changes
+from flytrack_sysid.diagnosis.onset import (
+    at_end,
+    first_row_as_at_end,
+    notes_of,
+    spans_of,
+    with_changes,
+)
 from flytrack_sysid.diagnosis.outliers import outlier_notes, outliers_of
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Refined, reduced, refine
@@ -49,8 +55,8 @@ class DiagnosisError(ValueError):
 class Split(NamedTuple):
     """A log, its rows held out, (num_rows,) bool, and the problems of learning from and judging by it.
 
-    log: with all clocks together. logged: as it was, maybe more rows. as_logged: the lanes of both problems
-    with poses as logged; empty where these were in time. moves: how late they were.
+    log: with all clocks together. logged: as it was, maybe more rows. as_logged: the lanes of both
+    problems with poses as logged; empty where these were in time. moves: how late they were.
     """
 
     logged: FlightLog
@@ -72,10 +78,11 @@ def diagnose(
 ) -> Diagnosis:
     """Return what is wrong with a model, from a log: causes, what is unexplained or not identifiable, errors.
 
-    log: one or several, taken together. model: the simulator's nominal one if None; causes are differences
-    from it. held_out: (num_rows,) bool, rows to judge by and not to learn from; the last of every four blocks
-    of at most 5 s if None. report: called with stages done and to do. motion: how the log moves within a
-    step, whatever the model says; if None, continuously where the log is measured, else by likelihood.
+    log: one or several, taken together. model: the simulator's nominal one if None; causes are
+    differences from it. held_out: (num_rows,) bool, rows to judge by and not to learn from; the
+    last of every four blocks of at most 5 s if None. report: called with stages done and to do.
+    motion: how the log moves within a step, whatever the model says; if None, continuously where
+    the log is measured, else by likelihood.
 
     Raises:
         DiagnosisError: a log with neither gyro nor attitude; ``held_out`` of another shape.
@@ -83,9 +90,13 @@ def diagnose(
     with jax.enable_x64(True):
         parts = split(log, model, held_out, motion)
         selection = select_model(parts)
-        # Drones, and who is late, are told by their clocks; two simulator's steps only by what they leave.
-        # A measured log is continuous, and never gets here.
-        if motion is None and not parts.moves.late_s and parts.moves.motion is not Motion.CONTINUOUS:
+        # Drones, and who is late, are told by their clocks; two simulator's steps only by what they
+        # leave. A measured log is continuous, and never gets here.
+        if (
+            motion is None
+            and not parts.moves.late_s
+            and parts.moves.motion is not Motion.CONTINUOUS
+        ):
             likelier = likelier_motion(selection.state.problem, selection.model.vector)
             if likelier is not parts.moves.motion:
                 parts = split(log, model, held_out, likelier)
@@ -99,7 +110,9 @@ def diagnose(
         found = summarize(judged, parts._replace(test=test))
         nominal = nominal_parameters() if model is None else model
         found = replace(found, nominal=nominal._replace(motion=found.extended.motion))
-        found = with_late_poses(found, parts.moves, (selection.state.problem, test), parts.as_logged)
+        found = with_late_poses(
+            found, parts.moves, (selection.state.problem, test), parts.as_logged
+        )
         report(4, len(STAGES))
     return found
 
@@ -145,9 +158,12 @@ def split(
     every, judged_by = (lanes_of(corrected, rows, model) for rows in (~out, out))
     warnings += thinning_warning(every, thinned(every))
     same_rows = log.select(is_known)
-    as_logged = tuple(thinned(lanes_of(same_rows, rows, model)) for rows in (~out, out) if with_motion.late_s)
+    as_logged = tuple(
+        thinned(lanes_of(same_rows, rows, model)) for rows in (~out, out) if with_motion.late_s
+    )
     train, test = (
-        problem_of(thinned(lanes), corrected, log, model, with_motion.late_s) for lanes in (every, judged_by)
+        problem_of(thinned(lanes), corrected, log, model, with_motion.late_s)
+        for lanes in (every, judged_by)
     )
     return Split(logged, with_motion, corrected, out, train, test, as_logged, tuple(warnings))
 
@@ -173,7 +189,8 @@ class Judged(NamedTuple):
 def judged_in_time(selection: Selection, parts: Split) -> Judged:
     """Return a selection with its changes within the log, after its vetoes.
 
-    A change may hide behind an effect that held-out rows contradict, so it is looked for again without that.
+    A change may hide behind an effect that held-out rows contradict, so it is looked for again
+    without that.
     """
     selection = with_changes(selection, parts.test, parts.log)
     selection, rejected = apply_vetoes(selection, held_out_under(selection, parts.test))
@@ -181,7 +198,9 @@ def judged_in_time(selection: Selection, parts: Split) -> Judged:
         later = with_changes(selection, parts.test, parts.log)
         if later is not selection:
             selection, again = apply_vetoes(later, held_out_under(later, parts.test))
-            rejected = {name: one for name, one in rejected.items() if one is not contradicted_on_held_out}
+            rejected = {
+                name: one for name, one in rejected.items() if one is not contradicted_on_held_out
+            }
             rejected |= again
     return Judged(selection, rejected)
 
@@ -189,7 +208,8 @@ def judged_in_time(selection: Selection, parts: Split) -> Judged:
 def refined_within_range(judged: Judged, test: Problem, parts: Split) -> Judged:
     """Return a selection and its refinement, without effects that end where the search does.
 
-    A law that fits best beyond anything known stands in for another one, and bends the values of the rest.
+    A law that fits best beyond anything known stands in for another one, and bends the values of
+    the rest.
     """
     while True:
         selection = judged.selection
@@ -198,19 +218,23 @@ def refined_within_range(judged: Judged, test: Problem, parts: Split) -> Judged:
         if not stuck:
             return judged._replace(refined=refined)
         selection, rejected = apply_vetoes(reject(selection, [one.effect for one in stuck]), test)
-        judged = Judged(selection, {**judged.rejected, **rejected}, refused=(*judged.refused, *stuck))
+        judged = Judged(
+            selection, {**judged.rejected, **rejected}, refused=(*judged.refused, *stuck)
+        )
 
 
 def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
     """Return which effects of a selected model predict held-out flights better than its base does.
 
-    Flights are of the part of the log in which the effects act that do so at its end. Those that ended before
-    are kept.
+    Flights are of the part of the log in which the effects act that do so at its end. Those that
+    ended before are kept.
     """
     model, last = selection.model, at_end(selection, selection.model)
     since = np.arange(len(parts.log)) >= first_row_as_at_end(selection, parts.test)
     log, is_explained = parts.log.select(since), not selection.unexplained.flagged
-    refined = refine(selection.state, selection.base, last, log, parts.held_out[since], is_explained)
+    refined = refine(
+        selection.state, selection.base, last, log, parts.held_out[since], is_explained
+    )
     kept = (one for one in model.candidates if one in refined.kept or one not in last.candidates)
     return refined._replace(kept=tuple(kept))
 
@@ -224,7 +248,9 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
     state, linearization = selection.state.linearized(model.vector)
     effects = summary.effect_causes(selection, test, linearization)
     in_base, lost_in_base = summary.base_causes(selection, test, linearization, effects)
-    contradicted = [name for name, veto in judged.rejected.items() if veto is contradicted_on_held_out]
+    contradicted = [
+        name for name, veto in judged.rejected.items() if veto is contradicted_on_held_out
+    ]
     lost = [*contradicted, *lost_in_base]
     extended = model if refined.fit is None else model._replace(vector=refined.fit.vector)
     found = summary.with_refined_values([*effects, *in_base], refined, extended.vector)
@@ -236,20 +262,32 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
             return summary.vector_without(cause, selection, linearization)
         return refined.vector_without(cause.effect)
 
-    found, negligible = split_by_size(found, problem, extended.vector, refined.flight_errors, without)
+    found, negligible = split_by_size(
+        found, problem, extended.vector, refined.flight_errors, without
+    )
     causes = tuple(one for one in found if not one.beyond)
     beyond = (*judged.refused, *(one for one in found if one.beyond))
-    vectors = {"nominal": problem.start, "refitted_base": selection.base.vector, "extended": extended.vector}
+    vectors = {
+        "nominal": problem.start,
+        "refitted_base": selection.base.vector,
+        "extended": extended.vector,
+    }
     outliers = outliers_of((problem, test), extended.vector)
     extended = at_end(selection, extended)
     flying = {**vectors, "extended": extended.vector}
     learned, judged_by = None, (test, refined)
-    # A law that acts for a part of the log is not looked for beside an effect that does, nor one beside
-    # another that the given model has.
+    # A law that acts for a part of the log is not looked for beside an effect that does, nor one
+    # beside another that the given model has.
     others = (one.effect for one in problem.windows)
-    if selection.unexplained.shares and extended.effects.isdisjoint(others) and not problem.has_given_law:
+    if (
+        selection.unexplained.shares
+        and extended.effects.isdisjoint(others)
+        and not problem.has_given_law
+    ):
         always, always_held = (replace(one, windows=()) for one in (problem, test))
-        learned, vector = find_learned(always, always_held, extended, selection.base.vector, refined.judge)
+        learned, vector = find_learned(
+            always, always_held, extended, selection.base.vector, refined.judge
+        )
     if learned is not None:
         change = vector - extended.vector
         vectors, flying = (with_and_without(learned, one, change) for one in (vectors, flying))
@@ -323,7 +361,9 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
         )
     names = set.intersection(*(set(log.channels) for log in logs))
     first = np.cumsum([0, *(len(np.unique(log.segment)) for log in logs)])
-    segments = [np.cumsum(log.is_start()) - 1 + start for log, start in zip(logs, first, strict=False)]
+    segments = [
+        np.cumsum(log.is_start()) - 1 + start for log, start in zip(logs, first, strict=False)
+    ]
     channels = {name: np.concatenate([log[name] for log in logs]) for name in sorted(names)}
     return FlightLog(
         time=np.concatenate([log.time for log in logs]),
@@ -338,9 +378,13 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
 def unused_channels(logs: Sequence[FlightLog]) -> list[str]:
     """Return a warning for each channel that some logs have and others lack."""
     every = sorted({name for log in logs for name in log.channels})
-    lacking = {name: [Path(log.source).name for log in logs if name not in log.channels] for name in every}
+    lacking = {
+        name: [Path(log.source).name for log in logs if name not in log.channels] for name in every
+    }
     return [
-        f"channel {name} is not used: {', '.join(files)} has none" for name, files in lacking.items() if files
+        f"channel {name} is not used: {', '.join(files)} has none"
+        for name, files in lacking.items()
+        if files
     ]
 
 

@@ -24,11 +24,16 @@ FEWEST_SHOWN = 50  # rows
 NO_DATA = "not in the log, or too little of it"
 NUM_BINS = 15
 SHOWN_PERCENTILES = (0.5, 99.5)  # of the regressor: single rows far out would squeeze all others
-FEWEST_ROWS, FEWEST_PIECES, LEAST_ROWS = 20, 5, 2  # of a bin: wanted, and without which there is no scatter
+FEWEST_ROWS, FEWEST_PIECES, LEAST_ROWS = (
+    20,
+    5,
+    2,
+)  # of a bin: wanted, and without which there is no scatter
 BLOCK_S = 1.0  # rows further apart than this count as independent
 FEWEST_BLOCKS = 10  # fewer say too little of their own scatter
 TWO_SIDED_95 = 1.959964  # standard deviations
-# Attitude and velocity are noisy in each row: their change over a piece is known as well as over a step.
+# Attitude and velocity are noisy in each row: their change over a piece is known as well as over a
+# step.
 PIECE_S = 0.2
 _TURN_AXES = {"x": "roll", "y": "pitch", "z": "yaw"}
 
@@ -54,7 +59,11 @@ def _read_evidence() -> dict[str, Evidence]:
     found = {}
     for name, own in parse_toml(read_text(Path(__file__).with_suffix(".toml"))).items():
         rows[name] = row = rows.get(own.get("like", ""), {}) | own
-        plots = [plot.replace("*", axis) for plot in row["plots"] for axis in ("xyz" if "*" in plot else "x")]
+        plots = [
+            plot.replace("*", axis)
+            for plot in row["plots"]
+            for axis in ("xyz" if "*" in plot else "x")
+        ]
         panels = tuple(Panel(*plot.split(" over ")) for plot in plots)
         found[name] = Evidence(row["words"], panels, row["reading"])
     return found
@@ -114,12 +123,14 @@ def bin_edges(regressor: np.ndarray, fewest: int = FEWEST_ROWS) -> np.ndarray:
     return even[[0, -1]] if len(edges) == 1 else np.array([*edges[:-1], even[-1]])
 
 
-def binned_means(regressor: np.ndarray, values: np.ndarray, block: np.ndarray, edges: np.ndarray) -> Binned:
+def binned_means(
+    regressor: np.ndarray, values: np.ndarray, block: np.ndarray, edges: np.ndarray
+) -> Binned:
     """Return means of values by bins of a regressor; all (num_rows,), edges (num_bins + 1,).
 
-    block: (num_rows,) int, from 0; rows of one block may be correlated. The interval is from the scatter of
-    sums over blocks (K.-Y. Liang, S. Zeger, 1986); where a bin has few blocks, it is at least that of
-    independent rows.
+    block: (num_rows,) int, from 0; rows of one block may be correlated. The interval is from the
+    scatter of sums over blocks (K.-Y. Liang, S. Zeger, 1986); where a bin has few blocks, it is at
+    least that of independent rows.
     """
     num_bins = len(edges) - 1
     number = np.searchsorted(edges, regressor, side="right") - 1
@@ -149,7 +160,11 @@ def _blocks(traces: Traces, length_s: float) -> np.ndarray:
 
 def _in_degrees(unit: str) -> tuple[str, float]:
     """Return the unit in which one is shown, and the factor to it: turns are shown in degrees."""
-    return (unit.replace("rad/", "deg/"), float(np.rad2deg(1.0))) if unit.startswith("rad/") else (unit, 1.0)
+    return (
+        (unit.replace("rad/", "deg/"), float(np.rad2deg(1.0)))
+        if unit.startswith("rad/")
+        else (unit, 1.0)
+    )
 
 
 def _label(residual: str) -> str:
@@ -169,12 +184,15 @@ def _label(residual: str) -> str:
 
 def _draw_panel(axes: Any, traces: Traces, panel: Panel, without: str) -> None:
     channel = panel.residual.split("_")[0]
-    (left, counts), (rest, _) = (traces.column(name, panel.residual) for name in (without, EXTENDED))
+    (left, counts), (rest, _) = (
+        traces.column(name, panel.residual) for name in (without, EXTENDED)
+    )
     label, unit = REGRESSORS[panel.regressor]
     unit, factor = _in_degrees(unit)
     scale = _in_degrees(UNITS[channel])[1]
     columns = [
-        values[counts] for values in (factor * traces.regressors[panel.regressor], scale * left, scale * rest)
+        values[counts]
+        for values in (factor * traces.regressors[panel.regressor], scale * left, scale * rest)
     ]
     block, fewest = _blocks(traces, BLOCK_S)[counts], FEWEST_ROWS
     if channel in ("attitude", "velocity"):
@@ -184,27 +202,42 @@ def _draw_panel(axes: Any, traces: Traces, panel: Panel, without: str) -> None:
     regressor, left, rest = columns
     edges = bin_edges(regressor, fewest=fewest)
     before, explained, after = (
-        binned_means(regressor, values, block.astype(int), edges) for values in (left, left - rest, rest)
+        binned_means(regressor, values, block.astype(int), edges)
+        for values in (left, left - rest, rest)
     )
     axes.axhline(0.0, color=GREY, linewidth=0.8)
-    style: dict[str, Any] = {"markersize": 4, "elinewidth": 1.2, "linestyle": "none", "color": ORANGE}
+    style: dict[str, Any] = {
+        "markersize": 4,
+        "elinewidth": 1.2,
+        "linestyle": "none",
+        "color": ORANGE,
+    }
     dots = "left without the cause, 95 % interval"
     axes.errorbar(before.at, before.means, before.ends95, fmt="o", label=dots, zorder=2, **style)
-    axes.plot(before.at, explained.means, "k-", linewidth=1.6, label="explained by the cause", zorder=3)
+    axes.plot(
+        before.at, explained.means, "k-", linewidth=1.6, label="explained by the cause", zorder=3
+    )
     rings: dict[str, Any] = {"mfc": "white", "mec": BLUE, "markersize": 4, "zorder": 4}
     axes.plot(before.at, after.means, "o", label="left with the cause", **rings)
     axes.set_xlabel(label if unit == "1" else f"{label} ({unit})", fontsize="small")
 
 
-def draw_cause(cause: str, panels: Sequence[Panel], traces: Traces, without: str, when: str = "") -> Figure:
+def draw_cause(
+    cause: str, panels: Sequence[Panel], traces: Traces, without: str, when: str = ""
+) -> Figure:
     """Draw the panels of a cause.
 
-    without: of the models in ``traces``, the extended one without the cause. The curve is the difference
-    between the predictions of it and of the one with the cause. when: for the title, when the cause acts.
+    without: of the models in ``traces``, the extended one without the cause. The curve is the
+    difference between the predictions of it and of the one with the cause. when: for the title,
+    when the cause acts.
     """
     # Without a sensor, its panel and that of its replacement are the same.
-    panels = list(dict.fromkeys(panel._replace(residual=traces.used(panel.residual)) for panel in panels))
-    columns = min(len(panels), MOST_COLUMNS) if len(panels) % MOST_COLUMNS != 1 else min(len(panels), 2)
+    panels = list(
+        dict.fromkeys(panel._replace(residual=traces.used(panel.residual)) for panel in panels)
+    )
+    columns = (
+        min(len(panels), MOST_COLUMNS) if len(panels) % MOST_COLUMNS != 1 else min(len(panels), 2)
+    )
     rows = -(-len(panels) // columns)
     figure = new_figure(WIDTH_IN, LEGEND_IN + ROW_IN * rows)
     title = words_of(cause)
@@ -221,6 +254,8 @@ def draw_cause(cause: str, panels: Sequence[Panel], traces: Traces, without: str
         axes.set_title(label, fontsize="small", loc="left")
     for axes in grid[:, 0]:
         axes.set_ylabel("measured minus modelled", fontsize="small")
-    entries = max((axes.get_legend_handles_labels() for axes in figure.axes), key=lambda own: len(own[1]))
+    entries = max(
+        (axes.get_legend_handles_labels() for axes in figure.axes), key=lambda own: len(own[1])
+    )
     figure.legend(*entries, loc="outside lower center", ncols=3, frameon=False, fontsize="small")
     return figure

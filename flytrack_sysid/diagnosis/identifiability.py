@@ -1,7 +1,7 @@
 """What a log could not have shown or told apart, and what to fly to settle it.
 
-All manoeuvres are flown by the fitted model and seen by the log's sensors with their noise. The Fisher
-information that each would add to the log's decides which one to advise.
+All manoeuvres are flown by the fitted model and seen by the log's sensors with their noise. The
+Fisher information that each would add to the log's decides which one to advise.
 """
 
 import copy
@@ -61,12 +61,17 @@ def _typical_candidate(effect: str) -> Candidate:
 class Question:
     """How well a log shows an effect, also beside effects that look alike.
 
-    linearization: the log's, at the fitted model, along everything (``SearchState.linearized``). fields: the
-    effect's parameters, columns: theirs in the linearization, sizes: notable ones, in steps along these.
+    linearization: the log's, at the fitted model, along everything (``SearchState.linearized``).
+    fields: the effect's parameters, columns: theirs in the linearization, sizes: notable ones, in
+    steps along these.
     """
 
     def __init__(
-        self, linearization: Linearization, model: FittedModel, effect: str, alike: Iterable[str] = ()
+        self,
+        linearization: Linearization,
+        model: FittedModel,
+        effect: str,
+        alike: Iterable[str] = (),
     ):
         self.linearization, self.effect = linearization, effect
         self.given = linearization.columns_at(model.places)
@@ -74,7 +79,10 @@ class Question:
         notable = BY_NAME[effect].notable
         fields = [field for field in way.other_fields if field.split(".")[1] not in shapes]
         # The columns of probes come first, in shares of the way to them.
-        self.columns = [*map(linearization.probe_column, way.probes), *map(linearization.column, fields)]
+        self.columns = [
+            *map(linearization.probe_column, way.probes),
+            *map(linearization.column, fields),
+        ]
         self.fields = [*(one.field for one in way.probes), *fields]
         ways = np.array([*(one.value for one in way.probes), *np.ones(len(fields))])
         self.sizes = np.array([notable[field.split(".")[1]] for field in self.fields]) / ways
@@ -100,8 +108,8 @@ class Question:
     def shares(self, information: np.ndarray | float = 0.0) -> np.ndarray:
         """Return how well the effect would show at its notable size, the worst first; from 1 on it does.
 
-        Noncentrality of each of its parameters over DETECTED, and beside each look-alike over SEPARATE.
-        information: added to the log's.
+        Noncentrality of each of its parameters over DETECTED, and beside each look-alike over
+        SEPARATE. information: added to the log's.
         """
         beside = [self.noncentralities(columns, information) / SEPARATE for columns in self.alike]
         return np.sort(np.concatenate([self.noncentralities((), information) / DETECTED, *beside]))
@@ -147,14 +155,18 @@ def _look_alikes(state: SearchState, model: FittedModel, question: Question) -> 
     for other in SEARCHED:
         if other.name in (question.effect, *BASE_ONLY, *state.unobservable):
             continue
-        beside = question.noncentralities(Question(question.linearization, model, other.name).columns)
+        beside = question.noncentralities(
+            Question(question.linearization, model, other.name).columns
+        )
         if np.any((beside < SEPARATE) & (beside < LOOKS_ALIKE * sizes)):
             result.append(other.name)
     return tuple(result)
 
 
 @jax.jit
-def _flown(vector: jax.Array, like: ModelParameters, starts: jax.Array, commands: jax.Array) -> jax.Array:
+def _flown(
+    vector: jax.Array, like: ModelParameters, starts: jax.Array, commands: jax.Array
+) -> jax.Array:
     """Return the states of flights, (flights, steps, 21), each before its command."""
     fly = partial(states_flown, Simulator(MOST_STEPS), from_vector(vector, like))
     return jax.vmap(fly)(starts, commands)[:, :-1]
@@ -162,7 +174,11 @@ def _flown(vector: jax.Array, like: ModelParameters, starts: jax.Array, commands
 
 def _absent_channels(lanes: Lanes) -> list[str]:
     """Return the channels of states that the log of these lanes did not have."""
-    record, turned, moved = lanes.record, lanes.counts[..., 0, 1].any(), lanes.counts[..., 3, 1].any()
+    record, turned, moved = (
+        lanes.record,
+        lanes.counts[..., 0, 1].any(),
+        lanes.counts[..., 3, 1].any(),
+    )
     present = {
         "w": "w" in lanes.measured,
         "a": "f" in lanes.measured,
@@ -242,23 +258,30 @@ def information_of_manoeuvres(
 def _best_manoeuvre(shares: Mapping[str, np.ndarray]) -> str:
     """Return the easiest manoeuvre whose shares are plenty, or about as large as those of the best.
 
-    The best has the largest worst share; where the worst shows in no manoeuvre, the next one decides.
+    The best has the largest worst share; where the worst shows in no manoeuvre, the next one
+    decides.
     """
     floored = {name: np.where(own < PRIOR_SHARE, 0.0, own) for name, own in shares.items()}
     best = max(floored.values(), key=lambda own: own.tolist())
     return next(
-        name for name, own in floored.items() if np.all(own >= np.minimum(NEARLY_BEST * best, PLENTY))
+        name
+        for name, own in floored.items()
+        if np.all(own >= np.minimum(NEARLY_BEST * best, PLENTY))
     )
 
 
 def advise(
-    problem: Problem, model: FittedModel, linearization: Linearization, wanted: Mapping[str, Sequence[str]]
+    problem: Problem,
+    model: FittedModel,
+    linearization: Linearization,
+    wanted: Mapping[str, Sequence[str]],
 ) -> dict[str, str]:
     """Return for each wanted effect the manoeuvre that would show it best, of ``MANOEUVRES``.
 
     problem: the log's, with its noise. linearization: of the model, along everything
-    (``SearchState.linearized``). wanted: effect -> effects that look alike in this log, maybe none. The best
-    is returned even where it would not do (``Question.shares`` below 1). Inside ``jax.enable_x64(True)``.
+    (``SearchState.linearized``). wanted: effect -> effects that look alike in this log, maybe none.
+    The best is returned even where it would not do (``Question.shares`` below 1). Inside
+    ``jax.enable_x64(True)``.
     """
     if not wanted:
         return {}
@@ -267,7 +290,9 @@ def advise(
     columns = [column for group in groups for column in group]
     added = information_of_manoeuvres(problem, model, linearization, columns)
     return {
-        question.effect: _best_manoeuvre({name: question.shares(one) for name, one in added.items()})
+        question.effect: _best_manoeuvre(
+            {name: question.shares(one) for name, one in added.items()}
+        )
         for question in questions
     }
 
@@ -293,7 +318,9 @@ def _reasons(path: Path, content: Any) -> dict[str, tuple[str, ...]]:
         raise ScriptError(f"{path}: schema: found {found!r}, expected {SCHEMA}")
     listed = content.get("not_identifiable")
     if not isinstance(listed, list):
-        raise ScriptError(f"{path}: not_identifiable: found {type(listed).__name__}, expected a list")
+        raise ScriptError(
+            f"{path}: not_identifiable: found {type(listed).__name__}, expected a list"
+        )
     wanted: dict[str, list[str]] = {name: [] for name in MANOEUVRES}
     for number, one in enumerate(listed):
         effect, fly = (one.get(key) if isinstance(one, dict) else None for key in ("effect", "fly"))
@@ -303,7 +330,9 @@ def _reasons(path: Path, content: Any) -> dict[str, tuple[str, ...]]:
         if isinstance(fly, str) and fly.startswith(TO_LOG):
             continue  # a sensor settles it, no flight
         if not isinstance(fly, str) or fly not in MANOEUVRES:
-            raise ScriptError(f"{place}: fly: found {fly!r}, expected one of {', '.join(MANOEUVRES)}")
+            raise ScriptError(
+                f"{place}: fly: found {fly!r}, expected one of {', '.join(MANOEUVRES)}"
+            )
         wanted[fly].append(effect)
     return {name: tuple(effects) for name, effects in wanted.items() if effects}
 
@@ -318,9 +347,15 @@ def _voltages(path: Path, content: dict[str, Any], model: ModelParameters) -> tu
     found = data.get("voltages") if isinstance(data, dict) else None
     if found is None:
         return _battery_range(model)
-    numbers = found if isinstance(found, list) and all(isinstance(one, int | float) for one in found) else []
+    numbers = (
+        found
+        if isinstance(found, list) and all(isinstance(one, int | float) for one in found)
+        else []
+    )
     if len(numbers) != 2 or not 0.0 < numbers[0] <= numbers[1] < np.inf:
-        raise ScriptError(f"{path}: data: voltages: found {found!r}, expected the lowest and the highest, V")
+        raise ScriptError(
+            f"{path}: data: voltages: found {found!r}, expected the lowest and the highest, V"
+        )
     return float(numbers[0]), float(numbers[1])
 
 
@@ -337,7 +372,9 @@ def next_flight(path: str | Path, model: ModelParameters, seed: int = 0) -> Next
         raise ScriptError(f"{path}: cannot be read: {error}") from error
     reasons = _reasons(path, content)
     if not reasons:
-        raise ScriptError(f"{path}: not_identifiable: found nothing that another flight would settle")
+        raise ScriptError(
+            f"{path}: not_identifiable: found nothing that another flight would settle"
+        )
     voltages = _voltages(path, content, model)
     hover = hover_action(model, voltages)
     return NextFlight(script_of(flights_of(reasons, hover, seed, voltages)), reasons)

@@ -1,8 +1,9 @@
 """A log cut into lanes of equal length, which are replayed in parallel.
 
-What a step needs of earlier steps (applied action, rates, memories) follows from the commands and is
-forgotten within a second. So the judged part of the log is cut into lanes of five seconds, each with a
-lead-in of the second before it, and all lanes are replayed at once: many times fewer steps in sequence.
+What a step needs of earlier steps (applied action, rates, memories) follows from the commands and
+is forgotten within a second. So the judged part of the log is cut into lanes of five seconds, each
+with a lead-in of the second before it, and all lanes are replayed at once: many times fewer steps
+in sequence.
 """
 
 from typing import NamedTuple
@@ -18,10 +19,11 @@ from flytrack_sysid.record import Record, is_applied_certain, make_record, measu
 LEAD_IN_S, LANE_S = 1, 5
 PIECES = LEAD_IN_S + LANE_S  # of a second each, the lead-in first
 FEWEST_ROWS_PER_S = 20
-MOST_ROWS = 30_000  # replayed without lead-ins: all of their slopes are in memory at once, some 50 kB a row
+# replayed without lead-ins: all of their slopes are in memory at once, some 50 kB a row
+MOST_ROWS = 30_000
 LANES_PADDED_TO = 2  # logs of about the same length share one compiled program
-# Axes of a residual: rotation x, y, z, force x, y, z (all world), battery. Channels of an axis: a direct one,
-# and a level, whose rate of change the direct one measures.
+# Axes of a residual: rotation x, y, z, force x, y, z (all world), battery. Channels of an axis: a
+# direct one, and a level, whose rate of change the direct one measures.
 DIRECT, LEVEL = ("w", "f", None), ("q", "v", "v_bat")
 SIZES = (3, 3, 1)
 AXES = (slice(0, 3), slice(3, 6), slice(6, 7))  # of each side: rotation, force, battery
@@ -31,11 +33,11 @@ NUM_AXES = sum(SIZES)
 class Lanes(NamedTuple):
     """A log in lanes; (rows, lanes, ...), where row k is followed by row k + 1 after ``step_s``.
 
-    record: as in ``flytrack_sysid.record``. measured: by channel: w rad/s, f m/s^2 (body); others are in the
-    record. counts: (rows, lanes, NUM_AXES, 2) bool, what is judged; never the lead-in.
-    is_joined: (rows, lanes) bool, the row follows the one before it in flight. is_known: (rows, lanes,
-    NUM_AXES) bool, and no lost command still acts there. row: (rows, lanes)
-    int, of the record, -1 where there is none. quanta: (2, NUM_AXES), the last digit of each channel.
+    record: as in ``flytrack_sysid.record``. measured: by channel: w rad/s, f m/s^2 (body); others
+    are in the record. counts: (rows, lanes, NUM_AXES, 2) bool, what is judged; never the lead-in.
+    is_joined: (rows, lanes) bool, the row follows the one before it in flight. is_known: (rows,
+    lanes, NUM_AXES) bool, and no lost command still acts there. row: (rows, lanes) int, of the
+    record, -1 where there is none. quanta: (2, NUM_AXES), the last digit of each channel.
     """
 
     record: Record
@@ -65,8 +67,8 @@ def lead_in_of(rows: int) -> int:
 def _index(exists: np.ndarray, rate: int) -> np.ndarray:
     """Return the record's row at each place of the lanes, (rows, lanes); -1 where there is none.
 
-    exists: (num_rows,) bool, rows that count; lanes hold all of them. One follows the other, but where
-    nothing counts for longer than a lead-in.
+    exists: (num_rows,) bool, rows that count; lanes hold all of them. One follows the other, but
+    where nothing counts for longer than a lead-in.
     """
     long, lead_in = LANE_S * rate, LEAD_IN_S * rate
     starts: list[int] = []
@@ -90,7 +92,9 @@ def _quanta(found: dict[str, np.ndarray]) -> np.ndarray:
         steps = np.diff(np.unique(found[name]))
         return float(steps.min()) if len(steps) else 0.0
 
-    return np.array([np.repeat([smallest(name) for name in names], SIZES) for names in (DIRECT, LEVEL)])
+    return np.array(
+        [np.repeat([smallest(name) for name in names], SIZES) for names in (DIRECT, LEVEL)]
+    )
 
 
 def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: float) -> Lanes:
@@ -123,7 +127,9 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
     )
     counts = np.repeat(np.stack([side[index] for side in sides], axis=-1), SIZES, axis=-2)
     counts &= is_real[..., None, None]
-    sensed: dict[str, np.ndarray] = {name: found[name][index] for name in ("w", "f") if name in found}
+    sensed: dict[str, np.ndarray] = {
+        name: found[name][index] for name in ("w", "f") if name in found
+    }
     record = Record(*(leaf[index] for leaf in record))
     begins = record.begins | (np.arange(len(index)) == 0)[:, None] | (index < 0)
     certain = np.stack([turns, lifts, np.ones_like(turns)], axis=-1)
@@ -135,7 +141,9 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
 
 def lanes_of(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Lanes:
     """Return the lanes of a log of which some rows, (num_rows,) bool, count, with the lags of a model."""
-    return make_lanes(with_voltage(log, model), judged, np.asarray(model.tau, float), float(model.g))
+    return make_lanes(
+        with_voltage(log, model), judged, np.asarray(model.tau, float), float(model.g)
+    )
 
 
 def voltages_of(lanes: Lanes) -> tuple[float, float] | None:
@@ -147,7 +155,9 @@ def voltages_of(lanes: Lanes) -> tuple[float, float] | None:
 def thinned(lanes: Lanes, most: int | None = None) -> Lanes:
     """Return lanes evenly spread, of MOST_ROWS or so many lanes at most, in place of those of a long log."""
     rows, number = lanes.row.shape
-    most = most or max(MOST_ROWS // (rows - lead_in_of(rows)) // LANES_PADDED_TO, 1) * LANES_PADDED_TO
+    most = (
+        most or max(MOST_ROWS // (rows - lead_in_of(rows)) // LANES_PADDED_TO, 1) * LANES_PADDED_TO
+    )
     if number <= most:
         return lanes
     return lanes.selected(np.linspace(0, number - 1, most).round().astype(int))

@@ -35,7 +35,11 @@ def with_late_poses(
 
     problems: learnt from and judged by; logged: the lanes of each as logged.
     """
-    before_s, late_s, sigma_s = latency_of(found.nominal), min(moves.late_s, BOUNDS.high), moves.sigma_s
+    before_s, late_s, sigma_s = (
+        latency_of(found.nominal),
+        min(moves.late_s, BOUNDS.high),
+        moves.sigma_s,
+    )
     if not late_s and not before_s:
         return found
     base = found.base.with_effects(MocapLatency(np.float32(before_s)))

@@ -1,14 +1,14 @@
 """Poses that are late against the gyro, in the residuals: position, velocity and attitude on another clock.
 
-The replay is fed with corrected poses, interpolated at the time of each row. What is judged are the poses as
-they were logged: interpolation smooths noise, which would change the likelihood by more than one motion
-differs from another. So the modelled changes of a level are delayed as the sensor delays them, and what
-interpolation changed is added as a constant:
+The replay is fed with corrected poses, interpolated at the time of each row. What is judged are the
+poses as they were logged: interpolation smooths noise, which would change the likelihood by more
+than one motion differs from another. So the modelled changes of a level are delayed as the sensor
+delays them, and what interpolation changed is added as a constant:
 
     residual = change as logged - delay(change as corrected - residual as corrected)
 
-The delay is linear between rows where a simulator moves, as that of the effect ``mocap_latency`` is, and
-cubic where a drone does.
+The delay is linear between rows where a simulator moves, as that of the effect ``mocap_latency``
+is, and cubic where a drone does.
 """
 
 from typing import NamedTuple
@@ -32,7 +32,8 @@ SAME = 1e-6  # of a step
 class Late(NamedTuple):
     """How level residuals of corrected lanes become those of what was logged.
 
-    weights: (rows, lanes, taps) of the modelled changes. constant: (rows, lanes, NUM_AXES), rad and m/s.
+    weights: (rows, lanes, taps) of the modelled changes. constant: (rows, lanes, NUM_AXES), rad and
+    m/s.
     """
 
     weights: np.ndarray
@@ -59,7 +60,9 @@ def read_poses(log: FlightLog, late_s: float) -> tuple[FlightLog, np.ndarray]:
 
 def _delayed(changes: np.ndarray, weights: np.ndarray, axis: int) -> np.ndarray:
     """Return the sum of changes in nearby rows, (..., axes), with weights (rows, ..., taps)."""
-    return sum(np.roll(changes, -tap, axis) * weights[..., [place]] for place, tap in enumerate(TAPS))
+    return sum(
+        np.roll(changes, -tap, axis) * weights[..., [place]] for place, tap in enumerate(TAPS)
+    )
 
 
 def _weights(share: np.ndarray, motion: Motion) -> np.ndarray:

@@ -1,9 +1,10 @@
 """A law for what no effect of the list explains: sparse regression over terms that make physical sense.
 
-Every candidate is a term of ``flytrack_env.effects.grammar``: a product of shapes of quantities times a free
-vector. All are scored beside what the model may change (as the diagnosis scores effects: whitened, robust,
-by blocks of a second), the best are refined in the numbers of their shapes, and the one that gains most
-per number is added, up to three. A term has to gain on held-out rows, too.
+Every candidate is a term of ``flytrack_env.effects.grammar``: a product of shapes of quantities
+times a free vector. All are scored beside what the model may change (as the diagnosis scores
+effects: whitened, robust, by blocks of a second), the best are refined in the numbers of their
+shapes, and the one that gains most per number is added, up to three. A term has to gain on held-out
+rows, too.
 """
 
 import math
@@ -42,7 +43,8 @@ MOST_REFINED, REFINEMENTS = 5, 60  # terms a round whose shapes are refined, and
 MOST_TERMS = 3  # of one side
 MOST_STARTS = 3  # first terms from which a law is searched
 LEAST_SHARE = 0.04  # of what the terms before gain: the least of one more
-LEAST_OWN = 0.01  # of a column's information: what is not within the reach of the model's free numbers
+# of a column's information: what is not within the reach of the model's free numbers
+LEAST_OWN = 0.01
 TINY = 1e-3  # of numbers that are positive
 LEAST_SIGMAS = 3.0  # of a coefficient that stays
 HELD_OUT_SHARE = 0.6  # of the gain on held-out rows that a law would have there if it were right
@@ -81,7 +83,10 @@ def moment_of_flight(problem: Problem, vector: np.ndarray, flight: Flown) -> Mom
 
 def directions_of(term: Term, moment: Moment, rotation: np.ndarray) -> np.ndarray:
     """Return where unit coefficients of a term point, world frame, (coefficients, rows, lanes, 3)."""
-    body = [np.stack(np.broadcast_arrays(*unit, moment.time_s)[:-1], axis=-1) for unit in term.basis(moment)]
+    body = [
+        np.stack(np.broadcast_arrays(*unit, moment.time_s)[:-1], axis=-1)
+        for unit in term.basis(moment)
+    ]
     return np.einsum("rlij,crlj->crli", rotation, np.stack(body))
 
 
@@ -148,7 +153,9 @@ def _local(side: Side, quantity: str, shapes: Sequence[str], number: int) -> Ite
     for middle in np.linspace(low, high, number + 2)[1:-1]:
         for shape in shapes:
             for share in (0.5, 1.2):
-                yield Factor(quantity, shape, (float(middle), float(share * (high - low) / (number + 1))))
+                yield Factor(
+                    quantity, shape, (float(middle), float(share * (high - low) / (number + 1)))
+                )
 
 
 def factors_of(side: Side) -> Iterator[tuple[str, tuple[Factor, ...]]]:
@@ -181,12 +188,20 @@ def factors_of(side: Side) -> Iterator[tuple[str, tuple[Factor, ...]]]:
     frames = ("body", "world") if side.name == "force" else ("body",)
     for order in (1.0, 2.0, 3.0, 4.0):
         for phase in np.linspace(0.0, math.pi, 4, endpoint=False):
-            yield from ((frame, (Factor("heading", "wave", (order, float(phase))),)) for frame in frames)
+            yield from (
+                (frame, (Factor("heading", "wave", (order, float(phase))),)) for frame in frames
+            )
     if side.name == "force":
-        for one in (power("airspeed", 2.0), power("airspeed", 3.0), *_local(side, "airspeed", ("bump",), 8)):
+        for one in (
+            power("airspeed", 2.0),
+            power("airspeed", 3.0),
+            *_local(side, "airspeed", ("bump",), 8),
+        ):
             yield "air", (one,)
         where = side.flight.pos_w[side.flight.is_counted]
-        for place in where[np.linspace(0, len(where) - 1, 2 * BUMP_PLACES + 1).astype(int)[1::2]].tolist():
+        for place in where[
+            np.linspace(0, len(where) - 1, 2 * BUMP_PLACES + 1).astype(int)[1::2]
+        ].tolist():
             for width in BUMP_WIDTHS_M:
                 yield "world", (Factor("position", "place", (*place, width)),)
 
@@ -235,7 +250,8 @@ def refine_shapes(side: Side, test: SideTest, start: Trial) -> Trial:
     numbers = np.concatenate([one.numbers for one in start.term.factors])
     is_free = np.array(
         [
-            one.shape != "power" and (one.shape, place) != ("wave", 0)  # a wave's order, which is whole
+            one.shape != "power"
+            and (one.shape, place) != ("wave", 0)  # a wave's order, which is whole
             for one in start.term.factors
             for place in range(len(one.numbers))
         ]
@@ -287,9 +303,9 @@ def _with_numbers(term: Term, values: np.ndarray) -> Term | None:
 class Found(NamedTuple):
     """A law of one side, and what it is worth.
 
-    vector: of the model with what the law changes in its free numbers. gain: on rows that were learnt from,
-    held_out_gain on others, of minus twice the log likelihood; expected: there, if it were right. rivals:
-    other terms that alone gain within 10 of the best one, as formulas.
+    vector: of the model with what the law changes in its free numbers. gain: on rows that were
+    learnt from, held_out_gain on others, of minus twice the log likelihood; expected: there, if it
+    were right. rivals: other terms that alone gain within 10 of the best one, as formulas.
     """
 
     terms: tuple[Term, ...]
@@ -318,7 +334,9 @@ def fit_terms(side: Side, terms: Sequence[Term]) -> tuple[tuple[Term, ...], Side
     for term, own in zip(terms, np.split(numbers, np.cumsum(sizes)[:-1], axis=1), strict=True):
         coefficients, errors = np.pad(own, ((0, 0), (0, XYZ - own.shape[1]))).tolist()
         if any(coefficients):
-            result.append(replace(term, coefficients=tuple(coefficients), standard_errors=tuple(errors)))
+            result.append(
+                replace(term, coefficients=tuple(coefficients), standard_errors=tuple(errors))
+            )
     return tuple(result), fit
 
 
@@ -353,7 +371,9 @@ def cross_validate(side: Side, terms: Sequence[Term]) -> tuple[float, float]:
 def judge_law(side: Side, held: Side, terms: tuple[Term, ...], fit: SideFit) -> Found:
     """Return terms that were fitted as a law, with what it gains on held-out rows."""
     vector, white = side.vector_beside(fit.given), [held.white(term) for term in terms]
-    coefficients = [np.array(term.coefficients[: len(own)]) for term, own in zip(terms, white, strict=True)]
+    coefficients = [
+        np.array(term.coefficients[: len(own)]) for term, own in zip(terms, white, strict=True)
+    ]
     learnt = np.tensordot(np.concatenate(coefficients), np.concatenate(white), axes=1)
     return Found(terms, vector, fit.chi2, *held_out(side, held, learnt, vector))
 
@@ -369,8 +389,8 @@ def is_confirmed(side: Side, law: Found) -> bool:
 def drop_weak_terms(side: Side, held: Side, law: Found, number: int) -> Found | None:
     """Return a law of terms that each gain, beside all others, what one more has to; the best term first.
 
-    A first term may only have stood in for later ones. None where held-out rows do not confirm the rest.
-    number: of terms among which they were chosen.
+    A first term may only have stood in for later ones. None where held-out rows do not confirm the
+    rest. number: of terms among which they were chosen.
     """
     terms = law.terms
     while True:
@@ -392,7 +412,8 @@ def drop_weak_terms(side: Side, held: Side, law: Found, number: int) -> Found | 
 def find_law(side: Side, held: Side) -> Found | None:
     """Return the law of a side that rows learnt from and held-out rows agree on; None without one.
 
-    The search starts from the best terms of several quantities: each wave of a sum may gain less than a bump.
+    The search starts from the best terms of several quantities: each wave of a sum may gain less
+    than a bump.
     """
     pool = [bare_term(side, *one) for one in factors_of(side)]
     firsts, ranked = best_of(side, side.test, pool)
@@ -406,7 +427,9 @@ def find_law(side: Side, held: Side) -> Found | None:
     grown = [grow_law(side, held, one, ranked, len(pool)) for one in starts]
     laws = [drop_weak_terms(side, held, one, len(pool)) for one in grown if one is not None]
     found = [one._replace(rivals=rivals) for one in laws if one is not None]
-    return max(found, key=lambda one: one.gain - sum(price_of(term) for term in one.terms), default=None)
+    return max(
+        found, key=lambda one: one.gain - sum(price_of(term) for term in one.terms), default=None
+    )
 
 
 def best_of(side: Side, test: SideTest, pool: Sequence[Term]) -> tuple[list[Trial], list[Term]]:
@@ -416,7 +439,9 @@ def best_of(side: Side, test: SideTest, pool: Sequence[Term]) -> tuple[list[Tria
     return sorted(best, key=lambda one: -one.merit), [one.term for one in trials]
 
 
-def grow_law(side: Side, held: Side, first: Trial, pool: Sequence[Term], number: int) -> Found | None:
+def grow_law(
+    side: Side, held: Side, first: Trial, pool: Sequence[Term], number: int
+) -> Found | None:
     """Return the law that begins with a term, to which others of a pool are added while they gain.
 
     number: of terms among which they are chosen.
@@ -427,11 +452,14 @@ def grow_law(side: Side, held: Side, first: Trial, pool: Sequence[Term], number:
     def uses_time(term: Term) -> bool:
         return any(one.quantity == "time" for one in term.factors)
 
-    # What happens once would pass for the remainder of another law: all terms look at the time, or none.
+    # What happens once would pass for the remainder of another law: all terms look at the time, or
+    # none.
     pool = [term for term in pool if uses_time(term) == uses_time(first.term)][:MOST_TRIED_AGAIN]
     while True:
         now, fit = fit_terms(side, refine_jointly(side, [*terms, first.term], range(len(terms))))
-        if len(now) <= len(terms) or (best is not None and fit.chi2 < (1.0 + LEAST_SHARE) * best.gain):
+        if len(now) <= len(terms) or (
+            best is not None and fit.chi2 < (1.0 + LEAST_SHARE) * best.gain
+        ):
             break
         one = judge_law(side, held, now, fit)
         if best is not None and one.held_out_gain < best.held_out_gain:
@@ -458,7 +486,11 @@ def _of_different_kinds(trials: Sequence[Trial]) -> list[Trial]:
     found: dict[tuple[str, tuple[tuple[str, ...], ...]], Trial] = {}
     for one in trials:
         exponents = tuple(
-            (each.quantity, each.shape, str(each.numbers[0]) if each.shape in ("power", "wave") else "")
+            (
+                each.quantity,
+                each.shape,
+                str(each.numbers[0]) if each.shape in ("power", "wave") else "",
+            )
             for each in one.term.factors
         )
         found.setdefault((one.term.frame, exponents), one)

@@ -1,8 +1,8 @@
 """Beyond the list: where a diagnosis leaves something unexplained, a law for it.
 
-Of each side (rate, force) that depends on something, a law is searched; it is proposed where it explains
-nearly all that smooth functions of everything would. It has to predict held-out flights better in all, and
-no worse at any horizon where these tell anything.
+Of each side (rate, force) that depends on something, a law is searched; it is proposed where it
+explains nearly all that smooth functions of everything would. It has to predict held-out flights
+better in all, and no worse at any horizon where these tell anything.
 """
 
 from dataclasses import replace
@@ -14,13 +14,26 @@ from flytrack_sysid.diagnosis.beyond import Learned
 from flytrack_sysid.diagnosis.lanes import thinned
 from flytrack_sysid.diagnosis.law_search import LEAST_EXPECTED, Found, Side, find_law
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.refinement import LIKELY, LIKELY_WORSE, WORSE_ANYWHERE, Judge, Tested, errors_at
+from flytrack_sysid.diagnosis.refinement import (
+    LIKELY,
+    LIKELY_WORSE,
+    WORSE_ANYWHERE,
+    Judge,
+    Tested,
+    errors_at,
+)
 from flytrack_sysid.diagnosis.search import FittedModel
-from flytrack_sysid.diagnosis.unexplained import find_dependences, find_lines, stochastic_shares, waves_of
+from flytrack_sysid.diagnosis.unexplained import (
+    find_dependences,
+    find_lines,
+    stochastic_shares,
+    waves_of,
+)
 
 MOST_ROWS = 12_000  # with their lead-ins: two minutes at 100 Hz
 LEAST_SHARE = 0.08  # of the sensor's noise, rms: less is not learnt
-LEAST_OFF = 0.02  # of squared errors of held-out flights, over all horizons: what takes less off is nothing
+# of squared errors of held-out flights, over all horizons: what takes less off is nothing
+LEAST_OFF = 0.02
 LAW_SHARE = 0.75  # of what smooth functions of everything explain: the least that a law explains
 
 
@@ -29,8 +42,8 @@ def find_learned(
 ) -> tuple[Learned | None, np.ndarray]:
     """Return the law of what a model leaves, None without one, and the model's vector beside it.
 
-    problem, test: of rows to learn from and of others. base: vector of the refitted model without effects.
-    judge: of free flights on held-out rows; None without any.
+    problem, test: of rows to learn from and of others. base: vector of the refitted model without
+    effects. judge: of free flights on held-out rows; None without any.
     """
     problem, test = thinned_problem(problem), thinned_problem(test)
     waves = waves_of(problem, model, find_lines(problem, model))
@@ -80,8 +93,8 @@ def _predicts(
 ) -> bool:
     """Return whether held-out flights are predicted no worse with what was learnt, and better in all.
 
-    before, after: what was learnt, and the model's vector beside it. acts_there: whether it acts in them
-    enough to be judged.
+    before, after: what was learnt, and the model's vector beside it. acts_there: whether it acts in
+    them enough to be judged.
     """
     if judge is None:
         return True
@@ -90,7 +103,9 @@ def _predicts(
     return improves_flights(ratio[judge.is_known], lost[judge.is_known], acts_there)
 
 
-def _flight_errors(problem: Problem, judge: Judge, learned: Learned | None, vector: np.ndarray) -> Tested:
+def _flight_errors(
+    problem: Problem, judge: Judge, learned: Learned | None, vector: np.ndarray
+) -> Tested:
     """Return the errors of held-out flights with what was learnt, if anything."""
     if learned is None:
         return errors_at(problem, vector[None], judge.windows)
@@ -100,8 +115,8 @@ def _flight_errors(problem: Problem, judge: Judge, learned: Learned | None, vect
 def improves_flights(ratio: np.ndarray, lost: np.ndarray, acts_there: bool) -> bool:
     """Return whether flights are predicted no worse anywhere and, if it acts in them, better in all.
 
-    ratio: of errors with what was learnt over those without, by horizon and quantity. lost: by how many
-    standard errors each is larger.
+    ratio: of errors with what was learnt over those without, by horizon and quantity. lost: by how
+    many standard errors each is larger.
     """
     is_better = float(np.mean(ratio**2)) < 1.0 - LEAST_OFF
     # What makes flights in all no better has to be as good at every horizon.

@@ -31,10 +31,12 @@ from flytrack_sysid.diagnosis.search import (
 from flytrack_sysid.parameters import TAUS, THRUST_COEFFS
 
 EQUIVALENT = 10.0  # of chi2: a rival that explains so nearly as much cannot be told apart
-EQUIVALENT_BY_CHANCE = 30.0  # of chi2: where less than EQUIVALENT is expected, it hardly ever is as much
+# of chi2: where less than EQUIVALENT is expected, it hardly ever is as much
+EQUIVALENT_BY_CHANCE = 30.0
 MOST_RIVALS = 3
-# Rivals are refitted where first order says that they come within so much chi2, or within a share of the
-# gain: first order is less exact for large changes, and least for effects that are looked for at probes.
+# Rivals are refitted where first order says that they come within so much chi2, or within a share
+# of the gain: first order is less exact for large changes, and least for effects that are looked
+# for at probes.
 NEARLY, NEAR_SHARE, PROBE_SHARE = 60.0, 0.15, 0.25
 CLEARLY_CHEAPER = 0.5  # of cost and price: swaps for less would go back and forth
 IMMATERIAL = 0.01  # of a lag or a drain
@@ -45,10 +47,11 @@ HOPELESS = 0.01  # of the cost, above the limit to first order: not worth a fit
 class Ablation(NamedTuple):
     """One effect of a model against doing without it and against its rivals.
 
-    gain: of chi2 over the model without it, refitted. inflation: of that gain's variance. num_parameters:
-    of its parameters, those that the log determines. rivals: effect -> how much worse the model is with that
-    one instead, of chi2; the better ones are refitted, and those are in ``swaps``, with the effect itself
-    in another group of its parameters. without: the model without the effect.
+    gain: of chi2 over the model without it, refitted. inflation: of that gain's variance.
+    num_parameters: of its parameters, those that the log determines. rivals: effect -> how much
+    worse the model is with that one instead, of chi2; the better ones are refitted, and those are
+    in ``swaps``, with the effect itself in another group of its parameters. without: the model
+    without the effect.
     """
 
     gain: float
@@ -70,7 +73,9 @@ def without_effect(state: SearchState, model: FittedModel, effect: str) -> Fitte
     return state.fitted([one for one in model.candidates if one.effect != effect], vector)
 
 
-def ablate(state: SearchState, model: FittedModel, linearization: Linearization, effect: str) -> Ablation:
+def ablate(
+    state: SearchState, model: FittedModel, linearization: Linearization, effect: str
+) -> Ablation:
     """Return what an effect of a model is worth; linearization: of the model, along everything."""
     less = without_effect(state, model, effect)
     # Slopes with the effect serve without it: rivals that come near are refitted.
@@ -78,7 +83,9 @@ def ablate(state: SearchState, model: FittedModel, linearization: Linearization,
     gain = less.cost - model.cost
     rivals: dict[str, float] = {}
     swaps: dict[str, FittedModel] = {}
-    ranked = [one for one in score_candidates(state, nearby, less) if one.candidate.effect != effect]
+    ranked = [
+        one for one in score_candidates(state, nearby, less) if one.candidate.effect != effect
+    ]
     for number, one in enumerate(ranked):
         rival = one.candidate.effect
         rivals[rival] = gain - one.gain.chi2
@@ -94,14 +101,18 @@ def ablate(state: SearchState, model: FittedModel, linearization: Linearization,
             swaps[rival] = with_candidate(state, model, effect, one.candidate)
             rivals[rival] = swaps[rival].cost - model.cost
     for other in other_groups(linearization, model, effect):
-        swaps[effect] = min(with_candidate(state, model, effect, other), swaps.get(effect, model), key=price)
+        swaps[effect] = min(
+            with_candidate(state, model, effect, other), swaps.get(effect, model), key=price
+        )
     columns = [linearization.column(field) for field in model.candidate(effect).fields]
     own = linearization.gain(columns, linearization.columns_at(model.places, without=columns))
     inflation, determined = (1.0, 1) if own is None else (own.inflation, own.num_parameters)
     return Ablation(gain, inflation, determined, rivals, swaps, less)
 
 
-def with_candidate(state: SearchState, model: FittedModel, effect: str, other: Candidate) -> FittedModel:
+def with_candidate(
+    state: SearchState, model: FittedModel, effect: str, other: Candidate
+) -> FittedModel:
     """Return the model with a candidate in an effect's place, refitted from where it is."""
     candidates = [other if one.effect == effect else one for one in model.candidates]
     dropped = {*model.candidate(effect).fields} - {*other.fields}
@@ -141,8 +152,12 @@ def select_effects(
     """Return the model without effects that it does not need and with better ones swapped in, ablated."""
     while True:
         state, linearization = state.linearized(model.vector)
-        ablations = {one.effect: ablate(state, model, linearization, one.effect) for one in model.candidates}
-        margins = {name: one.robust - threshold(one.num_parameters) for name, one in ablations.items()}
+        ablations = {
+            one.effect: ablate(state, model, linearization, one.effect) for one in model.candidates
+        }
+        margins = {
+            name: one.robust - threshold(one.num_parameters) for name, one in ablations.items()
+        }
         if margins and min(margins.values()) < 0.0:
             model = without_effect(state, model, min(margins, key=lambda name: margins[name]))
             continue
@@ -160,7 +175,11 @@ def with_lags_anew(state: SearchState, model: FittedModel) -> list[FittedModel]:
     """
     problem, vector = state.problem, model.vector.copy()
     shortest = [place for place in problem.index(TAUS) if vector[place] <= problem.low[place]]
-    shortest = [place for place in shortest if place in model.places and problem.start[place] > vector[place]]
+    shortest = [
+        place
+        for place in shortest
+        if place in model.places and problem.start[place] > vector[place]
+    ]
     if not shortest:
         return []
     vector[shortest] = problem.start[shortest]
@@ -208,7 +227,9 @@ def equivalents(ablation: Ablation, own: Separation) -> tuple[str, ...]:
         return worse < EQUIVALENT or (is_lost and worse < EQUIVALENT_BY_CHANCE)
 
     ranked = sorted(ablation.rivals.items(), key=lambda pair: pair[1])
-    return tuple(rival for rival, worse in ranked if rival in ablation.swaps and is_equivalent(rival, worse))
+    return tuple(
+        rival for rival, worse in ranked if rival in ablation.swaps and is_equivalent(rival, worse)
+    )
 
 
 class Marginal:
@@ -229,15 +250,17 @@ class Marginal:
     def half_widths(self, ways: np.ndarray | None = None) -> np.ndarray:
         """Return half of each parameter's 95 % interval, or of sums of them, ways (num_sums, parameters).
 
-        Its standard deviation is that of the information or, where it is larger, the sandwich estimate from
-        the scores of blocks; Student's t for so many blocks.
+        Its standard deviation is that of the information or, where it is larger, the sandwich
+        estimate from the scores of blocks; Student's t for so many blocks.
         """
         ways = np.eye(len(self.information)) if ways is None else ways
         covariance = solve(self.information, ways.T).T
         used = self.scores[np.abs(self.scores).sum(axis=1) > 0.0]
         number = max(len(used), 2)
         spread = used.T @ used * number / (number - 1)
-        variance = np.maximum(np.diag(covariance @ ways.T), np.diag(covariance @ spread @ covariance.T))
+        variance = np.maximum(
+            np.diag(covariance @ ways.T), np.diag(covariance @ spread @ covariance.T)
+        )
         return np.sqrt(variance) * stats.t.ppf(0.975, number - 1)
 
 
@@ -258,7 +281,10 @@ def _is_immaterial(problem: Problem, fields: Sequence[str], model: FittedModel) 
     record = problem.lanes.record
     thrust = np.asarray(collective_thrust(record.command[..., 3], record.battery_v, change))
     weight = float(problem.like.m) * float(problem.like.g)
-    return float(np.sqrt(np.mean(thrust[problem.counts.any(axis=(2, 3))] ** 2))) < IMMATERIAL_THRUST * weight
+    return (
+        float(np.sqrt(np.mean(thrust[problem.counts.any(axis=(2, 3))] ** 2)))
+        < IMMATERIAL_THRUST * weight
+    )
 
 
 def base_change(
@@ -286,11 +312,16 @@ def base_changes(
     state: SearchState, linearization: Linearization, model: FittedModel
 ) -> dict[str, BaseChange]:
     """Return the causes of the base that the log shows, by name."""
-    found = {name: base_change(state, linearization, model, fields) for name, fields in BASE_CAUSES.items()}
+    found = {
+        name: base_change(state, linearization, model, fields)
+        for name, fields in BASE_CAUSES.items()
+    }
     return {name: one for name, one in found.items() if one is not None}
 
 
-def explain_base_by_effect(state: SearchState, model: FittedModel) -> tuple[SearchState, FittedModel | None]:
+def explain_base_by_effect(
+    state: SearchState, model: FittedModel
+) -> tuple[SearchState, FittedModel | None]:
     """Return a model with one effect more and base parameters held at nominal, if it explains as much.
 
     A delay of all commands, say, looks like four longer lags.
@@ -331,12 +362,16 @@ def _best_instead(
     return replace(state, held=(*held, *(Held(field, effect) for field in fields))), best
 
 
-def is_determined(state: SearchState, model: FittedModel, fields: Sequence[str]) -> tuple[SearchState, bool]:
+def is_determined(
+    state: SearchState, model: FittedModel, fields: Sequence[str]
+) -> tuple[SearchState, bool]:
     """Return whether a log tells one of an effect's parameters, those of a model, from having no effect."""
     problem = state.problem
     places = problem.index(fields)
     change = np.abs(model.vector[places] - problem.start[places])
-    acting = [field.split(".")[1] not in BY_NAME[field.split(".")[0]].search.shapes for field in fields]
+    acting = [
+        field.split(".")[1] not in BY_NAME[field.split(".")[0]].search.shapes for field in fields
+    ]
     state, linearization = state.linearized(model.vector)
     half_widths = Marginal(linearization, model, fields).half_widths()
     return state, bool(np.any((change > half_widths) & acting))

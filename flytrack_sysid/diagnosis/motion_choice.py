@@ -1,16 +1,17 @@
 """How a log moves: by which motion, and how late its poses are against its gyro.
 
-A motion is a simulator's step, or the continuous motion of a drone. Half a step of another motion looks like
-clocks that are half a step apart, so both are chosen together. The correlation of gyro and attitude says how
-late poses are under each motion. Each is fitted so with the base and the few effects that can pass for half
-a step (delays, drag, scales), on some seconds of the log, the lateness of the likely ones along with it, and
-the likelihoods of what was logged are compared. Unlike named effects, motions are not nested, so that a small
-difference decides. Poses are never early: where they seem to be, gyro and accelerometer are late.
+A motion is a simulator's step, or the continuous motion of a drone. Half a step of another motion
+looks like clocks that are half a step apart, so both are chosen together. The correlation of gyro
+and attitude says how late poses are under each motion. Each is fitted so with the base and the few
+effects that can pass for half a step (delays, drag, scales), on some seconds of the log, the
+lateness of the likely ones along with it, and the likelihoods of what was logged are compared.
+Unlike named effects, motions are not nested, so that a small difference decides. Poses are never
+early: where they seem to be, gyro and accelerometer are late.
 
-A simulator's step with poses that are late by half a step is a drone whose poses are on time, but for the
-curvature within a step, which a model that lacks something fits worse than it differs. So who seems on time
-as a drone is a drone. (On Betaflight, whose rate loop the model lacks, the likelihoods chose a simulator's
-step with poses 4.5 ms late for 4 of 5 flights.)
+A simulator's step with poses that are late by half a step is a drone whose poses are on time, but
+for the curvature within a step, which a model that lacks something fits worse than it differs. So
+who seems on time as a drone is a drone. (On Betaflight, whose rate loop the model lacks, the
+likelihoods chose a simulator's step with poses 4.5 ms late for 4 of 5 flights.)
 """
 
 from collections.abc import Sequence
@@ -35,12 +36,14 @@ from flytrack_sysid.log_motion import required_motion
 from flytrack_sysid.parameters import base_of
 
 CLEAR = 10.0  # of minus twice the log likelihood, by which a simulator's step has to win
-# Of it, which poses that are not on time have to gain: effects that are not fitted here change it by so much.
+# Of it, which poses that are not on time have to gain: effects that are not fitted here change it
+# by so much.
 LATE = 60.0
 NEAR = 300.0  # of it: within so much of the best, lateness is fitted before one is chosen
 UNDECIDED = 60.0  # of it: while the second best is so near, more of the log is asked
 MOST_LANES = 4  # at a time, evenly spread: twenty seconds decide mostly
-# What a correlation has to say: smaller offsets are within its bias, or its standard errors up to a bound.
+# What a correlation has to say: smaller offsets are within its bias, or its standard errors up to a
+# bound.
 ON_TIME_S, STANDARD_ERRORS, UNCERTAIN_S = 0.7e-3, 3.0, 1.5e-3
 LEAST_S = 0.5e-3  # of a fitted lateness: a smaller one changes nothing
 DIFFERENCE_S, LONGEST_STEP_S = 2e-4, 3e-3  # for slopes; of a step of the fit
@@ -126,7 +129,10 @@ def _places(problem: Problem, moves: Moves) -> list[int]:
     """Return what is fitted; sensors are late only where poses would be early."""
     names = [f"{one.name}.{name}" for one in LOOK_ALIKES for name in one.ranges]
     return problem.index(
-        [*base_of(problem.like), *(name for name in names if name != IMU_LATENCY or moves.late_s < 0.0)]
+        [
+            *base_of(problem.like),
+            *(name for name in names if name != IMU_LATENCY or moves.late_s < 0.0),
+        ]
     )
 
 
@@ -160,7 +166,9 @@ def _with_later_poses(seen: Seen, trial: Trial) -> Moves:
     across = np.einsum("bpn,bn->p", rest, own)
     share = solve(linearization.total, across)
     information = float(np.sum(own**2) - across @ share)
-    score = -float(np.sum(own * blocks_of(linearization.white * root))) - float(share @ linearization.score)
+    score = -float(np.sum(own * blocks_of(linearization.white * root))) - float(
+        share @ linearization.score
+    )
     step_s = np.clip(score / information, -LONGEST_STEP_S, LONGEST_STEP_S)
     return Moves(moves.motion, moves.late_s + float(step_s), information**-0.5)
 
@@ -181,13 +189,18 @@ def _misfits(trials: Sequence[Trial]) -> list[float]:
     misfits = []
     for _, problem, vector in trials:
         lanes, left = problem.lanes._replace(counts=counts), problem.residuals(vector[None])[0]
-        misfits.append(noises.total_misfit(lanes, left, noises.fit_noise(lanes, left, problem.noise)))
+        misfits.append(
+            noises.total_misfit(lanes, left, noises.fit_noise(lanes, left, problem.noise))
+        )
     return misfits
 
 
 def _costs(trials: Sequence[Trial], misfits: Sequence[float]) -> list[float]:
     """Return the misfits and what it costs that a sensor is late."""
-    return [misfit + LATE * bool(trial.moves.late_s) for trial, misfit in zip(trials, misfits, strict=True)]
+    return [
+        misfit + LATE * bool(trial.moves.late_s)
+        for trial, misfit in zip(trials, misfits, strict=True)
+    ]
 
 
 def _apparent_lateness(log: FlightLog) -> tuple[float, float] | None:
@@ -204,8 +217,8 @@ def how_it_moves(
 ) -> Moves:
     """Return how a log moves, likeliest on judged rows, (num_rows,) bool, in float64.
 
-    model: where the search starts. motion: the only one that is tried, if given. A drone's where the log
-    hardly tells.
+    model: where the search starts. motion: the only one that is tried, if given. A drone's where
+    the log hardly tells.
     """
     motions, apparent = tuple(Motion) if motion is None else (motion,), _apparent_lateness(log)
     late = {one: Moves(one) for one in motions}
@@ -220,7 +233,9 @@ def how_it_moves(
                 late[one] = Moves(one, late_s, sigma_s)
     if motion is not None and late[motion].late_s <= 0.0:
         return Moves(motion)
-    if apparent is not None and [one for one in motions if late[one] == Moves(one)] == [Motion.CONTINUOUS]:
+    if apparent is not None and [one for one in motions if late[one] == Moves(one)] == [
+        Motion.CONTINUOUS
+    ]:
         return Moves(Motion.CONTINUOUS)
     seen = Seen(log, judged & _known_around(log, list(late.values())), model)
     num_parts = max(lanes_of(log, seen.judged, model).row.shape[1] // MOST_LANES, 1)
@@ -275,8 +290,9 @@ def _both(first: Trial, second: Trial) -> Trial:
 def likelier_motion(problem: Problem, vector: np.ndarray) -> Motion:
     """Return the motion under which a fitted model leaves the least, if clearly less than under its own.
 
-    Before the search, what the model lacks may fit another simulator's step better than the true one. Of
-    18 plants (benchmarks.beyond, seed 43) this was chosen on one, and only there another won afterwards.
+    Before the search, what the model lacks may fit another simulator's step better than the true
+    one. Of 18 plants (benchmarks.beyond, seed 43) this was chosen on one, and only there another
+    won afterwards.
     """
     assert problem.noise is not None
 
@@ -284,7 +300,9 @@ def likelier_motion(problem: Problem, vector: np.ndarray) -> Motion:
         moving = replace(problem, like=problem.like._replace(motion=motion))
         left = moving.residuals(vector[None])[0]
         noise = noises.fit_noise(problem.lanes, left, problem.noise)
-        return noises.total_misfit(problem.lanes, left, noise) - CLEAR * (motion is problem.like.motion)
+        return noises.total_misfit(problem.lanes, left, noise) - CLEAR * (
+            motion is problem.like.motion
+        )
 
     return min(Motion, key=misfit)
 

@@ -1,17 +1,18 @@
 """The noise of residuals: white sensor noise and a wandering disturbance; the filter that whitens them.
 
-Each axis (three of rotation, three of force, one of the battery) has two channels: a direct one, ``w`` or
-``f``, and a level, ``q``, ``v`` or ``v_bat``, whose rate of change the direct one measures. The model of
-their residuals is
+Each axis (three of rotation, three of force, one of the battery) has two channels: a direct one,
+``w`` or ``f``, and a level, ``q``, ``v`` or ``v_bat``, whose rate of change the direct one
+measures. The model of their residuals is
 
     d after = exp(-dt / tau) d + white        disturbance: gusts, vibration, what the model lacks
     e after = e + coupling d dt + white       what the disturbance, and the fed-in attitude, sum up to
     direct  = d + white                       sensor noise
     level   = e + white                       sensor noise; e begins unknown
 
-and a Kalman filter turns it into innovations, white and of variance 1. Its gains depend on the noise alone,
-so that it is one linear map for residuals and their slopes. It needs no windows: where nothing wanders, a
-level counts from the first row to the last; where much wanders, only its increments do.
+and a Kalman filter turns it into innovations, white and of variance 1. Its gains depend on the
+noise alone, so that it is one linear map for residuals and their slopes. It needs no windows: where
+nothing wanders, a level counts from the first row to the last; where much wanders, only its
+increments do.
 """
 
 from typing import Any, NamedTuple
@@ -40,8 +41,8 @@ class Noise(NamedTuple):
     """Noise by axis, each (NUM_AXES,).
 
     direct, level: standard deviations of the sensors. wander: of e in a second, as a random walk.
-    disturbance: standard deviation of d, unit of the direct channel. tau: its time constant, s. coupling:
-    0 where it is the direct sensor's alone, 1 where the drone feels it.
+    disturbance: standard deviation of d, unit of the direct channel. tau: its time constant, s.
+    coupling: 0 where it is the direct sensor's alone, 1 where the drone feels it.
     """
 
     direct: jax.Array
@@ -89,9 +90,15 @@ def make_gains(noise: Noise, step_s: jax.Array, is_known: jax.Array, counts: jax
         size = later_e + noise.level**2
         inverse = counting[..., 1] / size
         level_d, level_e, level_size = later_cov * inverse, later_e * inverse, size
-        carry = later_e - level_e * later_e, later_cov - level_e * later_cov, later_d - level_d * later_cov
+        carry = (
+            later_e - level_e * later_e,
+            later_cov - level_e * later_cov,
+            later_d - level_d * later_cov,
+        )
         keep, push = jnp.where(joined, keep, 0.0), jnp.where(joined, push, 0.0)
-        return carry, Gains(keep, push, direct_d, direct_e, direct_size, level_d, level_e, level_size)
+        return carry, Gains(
+            keep, push, direct_d, direct_e, direct_size, level_d, level_e, level_size
+        )
 
     keep = jnp.exp(-step_s[..., None] / noise.tau)
     by_row = (step_s, is_known, counts.astype(step_s.dtype), keep)
@@ -112,7 +119,9 @@ def innovations(gains: Gains, increments: jax.Array, counts: jax.Array) -> jax.A
         disturbed, wandered = disturbed + gain.direct_d * direct, wandered + gain.direct_e * direct
         off = (level - wandered) * counting[..., 1]
         later = level, wandered + gain.level_e * off, disturbed + gain.level_d * off
-        sized = jnp.stack([direct / jnp.sqrt(gain.direct_size), off / jnp.sqrt(gain.level_size)], axis=-1)
+        sized = jnp.stack(
+            [direct / jnp.sqrt(gain.direct_size), off / jnp.sqrt(gain.level_size)], axis=-1
+        )
         return later, sized
 
     nothing = jnp.zeros(increments.shape[1:3])
@@ -130,7 +139,9 @@ def noise_of(log_noise: jax.Array | np.ndarray) -> Noise:
     """Return the noise from its logarithms and a logit, (6, NUM_AXES)."""
     direct, level = jnp.exp(log_noise[0]), jnp.exp(log_noise[1])
     disturbance, wander = direct * jnp.exp(log_noise[3]), level * jnp.exp(log_noise[2])
-    return Noise(direct, level, wander, disturbance, jnp.exp(log_noise[4]), jax.nn.sigmoid(log_noise[5]))
+    return Noise(
+        direct, level, wander, disturbance, jnp.exp(log_noise[4]), jax.nn.sigmoid(log_noise[5])
+    )
 
 
 DIFFERENCE = 1e-4  # of logarithms, for slopes
@@ -158,7 +169,9 @@ def _misfit(
 
 
 @jax.jit
-def _misfit_and_slopes(log_noise: jax.Array, *given: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _misfit_and_slopes(
+    log_noise: jax.Array, *given: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return each axis's misfit (NUM_AXES,), slopes (6, NUM_AXES) and expected curvature (NUM_AXES, 6, 6).
 
     Axes do not depend on each other, so that one difference serves all.
@@ -235,10 +248,14 @@ def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -
         )
         is_stuck = ((best <= low) & (slopes > 0.0)) | ((best >= high) & (slopes < 0.0))
         pull = np.where(is_stuck, 0.0, slopes)
-        scaled = np.where(is_stuck.T[:, :, None] | is_stuck.T[:, None, :], np.eye(6) * scaled, scaled)
+        scaled = np.where(
+            is_stuck.T[:, :, None] | is_stuck.T[:, None, :], np.eye(6) * scaled, scaled
+        )
         step = np.linalg.solve(scaled, pull.T[..., None])[..., 0].T
         tried = np.clip(best - np.clip(step, -1.0, 1.0), low, high)
-        then, then_slopes, then_curvature = (np.asarray(part) for part in _misfit_and_slopes(tried, *given))
+        then, then_slopes, then_curvature = (
+            np.asarray(part) for part in _misfit_and_slopes(tried, *given)
+        )
         is_better = then < misfit
         best = np.where(is_better, tried, best)
         slopes = np.where(is_better, then_slopes, slopes)
@@ -255,5 +272,7 @@ def _bounds(lanes: Lanes) -> tuple[np.ndarray, np.ndarray]:
     """Return the bounds of the search, (6, NUM_AXES) and (6, 1), as logarithms and a logit."""
     low = [np.log(LEAST_SHARE), np.log(LEAST_SHARE), np.log(TAU_RANGE_S[0]), -5.0]
     high = [np.log(1e3)] * 4 + [np.log(TAU_RANGE_S[1]), 5.0]
-    lowest = np.concatenate([np.log(floors_of(lanes)), np.repeat(low, NUM_AXES).reshape(-1, NUM_AXES)])
+    lowest = np.concatenate(
+        [np.log(floors_of(lanes)), np.repeat(low, NUM_AXES).reshape(-1, NUM_AXES)]
+    )
     return lowest, np.array(high)[:, None]

@@ -1,11 +1,11 @@
 """Causes that begin or end within a log: when, told from constant ones and from slow drift.
 
-The scores of an effect, summed up after each second of the log, say what it would gain if it acted from
-there on only, all else constant (the largest of these is a sup-LM test: D. Andrews, Econometrica 61, 1993).
-Where that is more than chance, the search starts anew with windows: the likely effects act from then on (or
-until then), all others throughout. The new model stands if it explains clearly more than the constant one,
-and held-out rows agree. The time is then found to a row by profile likelihood, on the rows that are held out
-as well: one number more that they decide.
+The scores of an effect, summed up after each second of the log, say what it would gain if it acted
+from there on only, all else constant (the largest of these is a sup-LM test: D. Andrews,
+Econometrica 61, 1993). Where that is more than chance, the search starts anew with windows: the
+likely effects act from then on (or until then), all others throughout. The new model stands if it
+explains clearly more than the constant one, and held-out rows agree. The time is then found to a
+row by profile likelihood, on the rows that are held out as well: one number more that they decide.
 
 Times are those of one clock. Where a log's time goes back, it is of several flights, and nothing is
 looked for.
@@ -22,7 +22,13 @@ from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
 from flytrack_sysid.diagnosis.problem import Problem, Window, robust_square
 from flytrack_sysid.diagnosis.result import Estimated
-from flytrack_sysid.diagnosis.score_test import Candidate, Linearization, candidates_for, inflation_of, solve
+from flytrack_sysid.diagnosis.score_test import (
+    Candidate,
+    Linearization,
+    candidates_for,
+    inflation_of,
+    solve,
+)
 from flytrack_sysid.diagnosis.search import PER_PARAMETER, FittedModel, SearchState, search
 from flytrack_sysid.diagnosis.vetoes import Selection, select
 from flytrack_sysid.log import FlightLog
@@ -30,13 +36,16 @@ from flytrack_sysid.log import FlightLog
 CHANCE = 1e-5  # of a change for each effect, where nothing changes
 LEAST_S = 2.0  # of the log on each side of a change
 LEAST_SHARE = 0.04  # of the log there
-NEAR, MOST_NEAR = 0.3, 5  # of the largest gain: the search chooses among effects that come so near to it
+NEAR, MOST_NEAR = (
+    0.3,
+    5,
+)  # of the largest gain: the search chooses among effects that come so near to it
 CLEAR = 10.0  # of minus twice the log likelihood, by which an end has to be likelier than an onset
 MOST_CHANGES = 3
 ALWAYS, NEVER = Window("").start, Window("").end
 RIDGE = 1e-7  # of a column's own information
-# Of the likelihood ratio of a time of change: its distribution is that of the maximum of a Brownian motion
-# with drift (B. Hansen, Econometrica 68, 2000), not chi2.
+# Of the likelihood ratio of a time of change: its distribution is that of the maximum of a Brownian
+# motion with drift (B. Hansen, Econometrica 68, 2000), not chi2.
 DROP_95 = -2.0 * float(np.log(1.0 - np.sqrt(0.95)))
 # The profile: seconds about the time, and between the times tried, one after the other.
 PROFILES = ((8.0, 0.5), (1.0, 0.05), (0.1, 0.01))
@@ -45,8 +54,8 @@ PROFILES = ((8.0, 0.5), (1.0, 0.05), (0.1, 0.01))
 def threshold(num_parameters: int, trimmed: float = LEAST_SHARE, chance: float = CHANCE) -> float:
     """Return the sup-LM gain of chi2 that so many parameters exceed by chance (Andrews 1993, section 5).
 
-    trimmed: share of the log on each side within which no change is looked for. The tail is D. DeLong's
-    (Communications in Statistics 10, 1981).
+    trimmed: share of the log on each side within which no change is looked for. The tail is D.
+    DeLong's (Communications in Statistics 10, 1981).
     """
     span = 2.0 * np.log((1.0 - trimmed) / trimmed)
 
@@ -59,16 +68,22 @@ def threshold(num_parameters: int, trimmed: float = LEAST_SHARE, chance: float =
 
 
 def windowed_gains(
-    score: np.ndarray, information: np.ndarray, given: Sequence[int], own: Sequence[int], weights: np.ndarray
+    score: np.ndarray,
+    information: np.ndarray,
+    given: Sequence[int],
+    own: Sequence[int],
+    weights: np.ndarray,
 ) -> np.ndarray:
     """Return what columns gain, to first order, if they act with a weight in each block, (hypotheses,).
 
-    score, information: (blocks, columns) and (blocks, columns, columns); weights: (hypotheses, blocks).
-    given: the columns that are free throughout.
+    score, information: (blocks, columns) and (blocks, columns, columns); weights: (hypotheses,
+    blocks). given: the columns that are free throughout.
     """
     given, own = list(given), list(own)
     free = information[:, given][:, :, given].sum(axis=0)
-    across = np.tensordot(weights, information[:, given][:, :, own], axes=1)  # (hypotheses, given, own)
+    across = np.tensordot(
+        weights, information[:, given][:, :, own], axes=1
+    )  # (hypotheses, given, own)
     alone = np.tensordot(weights**2, information[:, own][:, :, own], axes=1)
     share = solve(free, np.moveaxis(across, 0, 1).reshape(len(given), -1))
     share = np.moveaxis(share.reshape(len(given), len(weights), len(own)), 1, 0)
@@ -82,8 +97,8 @@ def windowed_gains(
 class Hypothesis(NamedTuple):
     """An effect that changes within the log.
 
-    window: when it acts; None where it drifts instead. gain: of chi2 to first order, over its inflation.
-    num_parameters: those that change.
+    window: when it acts; None where it drifts instead. gain: of chi2 to first order, over its
+    inflation. num_parameters: those that change.
     """
 
     candidate: Candidate
@@ -115,7 +130,9 @@ def seconds_of(lanes: Lanes) -> tuple[np.ndarray, np.ndarray]:
     return start, known[least : len(known) - least + 1]
 
 
-def changes_of(linearization: Linearization, model: FittedModel, lacking: Sequence[str]) -> list[Hypothesis]:
+def changes_of(
+    linearization: Linearization, model: FittedModel, lacking: Sequence[str]
+) -> list[Hypothesis]:
     """Return how effects would change within the log, the likeliest first, one of each effect.
 
     linearization: of the model, along everything. lacking: effects that are not looked for.
@@ -136,7 +153,10 @@ def changes_of(linearization: Linearization, model: FittedModel, lacking: Sequen
 
 
 def _change_of(
-    linearization: Linearization, model: FittedModel, candidate: Candidate, seconds: tuple[np.ndarray, ...]
+    linearization: Linearization,
+    model: FittedModel,
+    candidate: Candidate,
+    seconds: tuple[np.ndarray, ...],
 ) -> Hypothesis | None:
     """Return the likeliest change of an effect; None where nothing depends on it. seconds: ``seconds_of``."""
     is_named = candidate.effect in model.effects
@@ -154,12 +174,19 @@ def _change_of(
     place = int(np.argmax(gains[way]))
     inflation = _inflation(score, information, given, own, ways[way][place])
     row = int(changes[place]) if way != "drift" else 0
-    window = {"start": Window(candidate.effect, start=row), "end": Window(candidate.effect, end=row)}.get(way)
+    window = {
+        "start": Window(candidate.effect, start=row),
+        "end": Window(candidate.effect, end=row),
+    }.get(way)
     return Hypothesis(candidate, window, float(gains[way][place]) / inflation, len(own))
 
 
 def _inflation(
-    score: np.ndarray, information: np.ndarray, given: Sequence[int], own: Sequence[int], weight: np.ndarray
+    score: np.ndarray,
+    information: np.ndarray,
+    given: Sequence[int],
+    own: Sequence[int],
+    weight: np.ndarray,
 ) -> float:
     """Return how much more the scores of blocks vary than information says, with the change put in.
 
@@ -208,13 +235,18 @@ def profile_of(problem: Problem, test: Problem, vector: np.ndarray, row: int) ->
     step_s = float(np.median(problem.lanes.record.step_s))
     problems = problem, replace(test, windows=problem.windows).with_noise(problem.noise)
     # As if what changes at the row changed after the log, and before it.
-    sides = [[moved(one, row, to).residuals(vector[None])[0] for to in (NEVER, ALWAYS)] for one in problems]
+    sides = [
+        [moved(one, row, to).residuals(vector[None])[0] for to in (NEVER, ALWAYS)]
+        for one in problems
+    ]
     known: dict[int, float] = {}
     for reach_s, every_s in PROFILES:
         centre = min(known, key=lambda tried: known[tried]) if known else row
         every = max(round(every_s / step_s), 1)
         reach = max(round(reach_s / step_s), every)
-        tried = [one for one in range(centre - reach, centre + reach + 1, every) if one not in known]
+        tried = [
+            one for one in range(centre - reach, centre + reach + 1, every) if one not in known
+        ]
         costs = np.zeros(len(tried))
         for own, (before, after) in zip(problems, sides, strict=True):
             is_after = own.lanes.row[..., None, None] >= np.array(tried)[:, None, None, None, None]
@@ -251,7 +283,10 @@ def spans_of(selection: Selection, test: Problem, log: FlightLog) -> dict[str, d
         return Estimated(value, (low, high), "s")
 
     return {
-        one.effect: {"onset_s": time_of(one.effect, one.start), "end_s": time_of(one.effect, one.end)}
+        one.effect: {
+            "onset_s": time_of(one.effect, one.start),
+            "end_s": time_of(one.effect, one.end),
+        }
         for one in windows_of(selection)
     }
 
@@ -285,7 +320,9 @@ def notes_of(selection: Selection, linearization: Linearization, log: FlightLog)
     spans, notes = windows_of(selection), []
     begun = [one.effect for one in spans if one.end == NEVER]
     if begun:
-        notes.append(f"the extended model has {', '.join(begun)} as at the end of the log, from the start on")
+        notes.append(
+            f"the extended model has {', '.join(begun)} as at the end of the log, from the start on"
+        )
     gone = ended(selection)
     if gone:
         notes.append(f"not in the extended model: {', '.join(gone)}, which ended within the log")
@@ -328,7 +365,9 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     if not found or found[0].margin < 0.0 or found[0].window is None:
         return None
     first, near = found[0], [one for one in found if one.window and one.gain > NEAR * found[0].gain]
-    state, model = _likeliest_side(selection, first, [one.candidate.effect for one in near[:MOST_NEAR]])
+    state, model = _likeliest_side(
+        selection, first, [one.candidate.effect for one in near[:MOST_NEAR]]
+    )
     state, base, model = search(_at_best_row(state, test, model, first.row))
     named = tuple(one for one in state.problem.windows if one.effect in model.effects)
     now, before = (
@@ -341,7 +380,8 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     state = _at_best_row(windowed(state, named), test, model, max(rows))
     later = select(state, base, state.fitted(model.candidates, model.vector))
     lost = [
-        misfit(later, problem) - misfit(selection, problem) for problem in (selection.state.problem, test)
+        misfit(later, problem) - misfit(selection, problem)
+        for problem in (selection.state.problem, test)
     ]
     price = PER_PARAMETER * (later.model.num_priced - selection.model.num_priced)
     is_better = lost[0] + price < -threshold(first.num_parameters) and lost[1] < 0.0
@@ -352,7 +392,9 @@ def misfit(selection: Selection, problem: Problem) -> float:
     """Return minus twice the log likelihood of the rows of a problem, under a selection and its noise."""
     state, lanes = selection.state, problem.lanes
     assert state.problem.noise is not None
-    left = replace(problem, windows=state.problem.windows).residuals(selection.model.vector[None])[0]
+    left = replace(problem, windows=state.problem.windows).residuals(selection.model.vector[None])[
+        0
+    ]
     return noises.total_misfit(lanes, left, state.problem.noise)
 
 
@@ -367,8 +409,8 @@ def _likeliest_side(
 ) -> tuple[SearchState, FittedModel]:
     """Return the state in which some effects begin, or end, at the row of a change, and a model of it.
 
-    The model has the change's effect and those that have changed before. Where both sides are as likely, as
-    of a scale of what is fitted besides, the effect begins.
+    The model has the change's effect and those that have changed before. Where both sides are as
+    likely, as of a scale of what is fitted besides, the effect begins.
     """
     old = {one.effect: one for one in selection.state.problem.windows}
     kept = [one for one in selection.model.candidates if one.effect in old]

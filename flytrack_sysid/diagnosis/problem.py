@@ -1,7 +1,7 @@
 """A log and all that its model may be: residuals, slopes and whitening for a vector of all parameters.
 
-One program evaluates 20 models at once, another four, each with every effect of the list; a model without
-an effect has it at its neutral value. So no set of effects needs a compilation of its own.
+One program evaluates 20 models at once, another four, each with every effect of the list; a model
+without an effect has it at its neutral value. So no set of effects needs a compilation of its own.
 
 ========  ==============================================================================  =======
 channel   residual of a row                                                               unit
@@ -34,9 +34,11 @@ from flytrack_sysid.parameters import TAUS, from_vector, in_batches, names_of, r
 from flytrack_sysid.record import Record
 from flytrack_sysid.replay import Step, replay
 
-# What a replay can show, whatever the craft: it is fed with poses, so that how late these are has to be known
-# before.
-SEARCHED = tuple(effect for effect in EFFECTS if "pose" not in effect.hooks and not effect.search.is_setting)
+# What a replay can show, whatever the craft: it is fed with poses, so that how late these are has
+# to be known before.
+SEARCHED = tuple(
+    effect for effect in EFFECTS if "pose" not in effect.hooks and not effect.search.is_setting
+)
 BATCH, SMALL_BATCH = 20, 4
 RELATIVE_STEP = 1e-6  # of a parameter's scale, for slopes
 
@@ -49,7 +51,9 @@ def _turn(measured: Quaternion, predicted: Quaternion) -> Vec3:
     return Vec3(double * error.x, double * error.y, double * error.z)
 
 
-def _of_step(step: Step, next_row: Record, sensed: dict[str, Any], model: ModelParameters) -> jax.Array:
+def _of_step(
+    step: Step, next_row: Record, sensed: dict[str, Any], model: ModelParameters
+) -> jax.Array:
     """Return the residuals of the row after a step, (NUM_AXES, 2); 0 for absent channels."""
     row, before, after = step.row, step.before, step.after
     read, zero = read_sensors(step.moved, model), Vec3(0.0, 0.0, 0.0)
@@ -67,7 +71,9 @@ def _of_lane(model: ModelParameters, lane: Record, sensed: dict[str, Any]) -> ja
     """Return the residuals of a lane's rows; of its first row nothing is predicted."""
     rows, gyro_b = jax.tree.map(lambda leaf: leaf[:-1], (lane, sensed.get("w")))
     later = jax.tree.map(lambda leaf: leaf[1:], (lane, sensed))
-    found = replay(model, rows, gyro_b, lambda step, extra: _of_step(step, extra[0], extra[1], model), later)
+    found = replay(
+        model, rows, gyro_b, lambda step, extra: _of_step(step, extra[0], extra[1], model), later
+    )
     return jnp.concatenate([jnp.zeros_like(found[:1]), found])
 
 
@@ -119,10 +125,11 @@ class Slopes(NamedTuple):
 class Problem:
     """Judged rows of a log and a noise, for models as vectors in the order of ``names``.
 
-    like: the nominal model with every effect, float64. given_effects: those that the nominal model has.
-    low, high, scale: of each parameter, its bounds and the size of its steps. noise: (6, NUM_AXES), as of
-    ``noise.fit_noise``, and gains of its filter; None before ``with_noise``. late: of lanes whose poses were
-    corrected. windows: of the effects that act for a part of the log only.
+    like: the nominal model with every effect, float64. given_effects: those that the nominal model
+    has. low, high, scale: of each parameter, its bounds and the size of its steps. noise: (6,
+    NUM_AXES), as of ``noise.fit_noise``, and gains of its filter; None before ``with_noise``. late:
+    of lanes whose poses were corrected. windows: of the effects that act for a part of the log
+    only.
     """
 
     lanes: Lanes
@@ -176,7 +183,9 @@ class Problem:
         like = self.like.with_effects(law._replace(scale=0.0))
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), like)
         names, start = names_of(like), to_vector(like)
-        low, high = np.array([range_of(name)[:2] for name in names[len(self.names) :]]).reshape(-1, 2).T
+        low, high = (
+            np.array([range_of(name)[:2] for name in names[len(self.names) :]]).reshape(-1, 2).T
+        )
         return replace(
             self,
             like=like,
@@ -206,13 +215,16 @@ class Problem:
     def residuals(self, vectors: np.ndarray) -> np.ndarray:
         """Return residuals of models (num_models, parameters), (num_models, rows, lanes, NUM_AXES, 2).
 
-        Where an effect's window ends, rows come from another replay: nothing of the effect is remembered.
+        Where an effect's window ends, rows come from another replay: nothing of the effect is
+        remembered.
         """
         found = self._composed(vectors) if self.windows else self._replayed(vectors)
         return found if self.late is None else self.late.residuals(found)
 
     def _replayed(self, vectors: np.ndarray) -> np.ndarray:
-        return in_batches(lambda part: _residuals(part, self.like, self.lanes), vectors, _size_for(vectors))
+        return in_batches(
+            lambda part: _residuals(part, self.like, self.lanes), vectors, _size_for(vectors)
+        )
 
     def _composed(self, vectors: np.ndarray) -> np.ndarray:
         """Return residuals of models whose effects act within their windows; each row is of a replay."""
@@ -221,14 +233,20 @@ class Problem:
         acts = np.stack([(row >= one.start) & (row < one.end) for one in self.windows])
         for acting in np.unique(acts.reshape(len(acts), -1), axis=1).T:
             if not acting.all():
-                still = [one.effect for one, is_on in zip(self.windows, acting, strict=True) if not is_on]
+                still = [
+                    one.effect for one, is_on in zip(self.windows, acting, strict=True) if not is_on
+                ]
                 there = (acts == acting[:, None, None]).all(axis=0)
-                found = np.where(there[..., None, None], self._replayed(self.without(vectors, still)), found)
+                found = np.where(
+                    there[..., None, None], self._replayed(self.without(vectors, still)), found
+                )
         return found
 
     def without(self, vectors: np.ndarray, effects: Sequence[str]) -> np.ndarray:
         """Return vectors, (..., parameters), with some effects as in the given model."""
-        return self.at_start(vectors, [name for name in self.names if name.split(".")[0] in effects])
+        return self.at_start(
+            vectors, [name for name in self.names if name.split(".")[0] in effects]
+        )
 
     def at_start(self, vectors: np.ndarray, fields: Sequence[str]) -> np.ndarray:
         """Return vectors, (..., parameters), with some parameters as in the given model."""
@@ -256,8 +274,8 @@ class Problem:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return copies of a vector with one of some places moved each, and by how much, for slopes.
 
-        One-sided differences, into the bounds: an effect may be defined on one side of neutral only.
-        share: of a parameter's scale.
+        One-sided differences, into the bounds: an effect may be defined on one side of neutral
+        only. share: of a parameter's scale.
         """
         places = list(places)
         step = share * self.scale[places]
@@ -266,7 +284,9 @@ class Problem:
         moved[np.arange(len(places)), places] += step
         return moved, step
 
-    def slopes(self, vector: np.ndarray, places: Sequence[int], others: np.ndarray | None = None) -> Slopes:
+    def slopes(
+        self, vector: np.ndarray, places: Sequence[int], others: np.ndarray | None = None
+    ) -> Slopes:
         """Return a model's residuals, their slopes along places, and the way to other vectors."""
         moved, step = self.nudged(vector, places)
         others = np.zeros((0, len(vector))) if others is None else others
@@ -287,7 +307,9 @@ def _size_for(values: np.ndarray) -> int:
 
 def as_replayed(model: ModelParameters) -> ModelParameters:
     """Return a model without the effects on poses."""
-    return model._replace(effects=tuple(one for one in model.effects if "pose" not in effect_of(one).hooks))
+    return model._replace(
+        effects=tuple(one for one in model.effects if "pose" not in effect_of(one).hooks)
+    )
 
 
 def vector_of(model: ModelParameters) -> np.ndarray:
@@ -299,7 +321,10 @@ def _longest(names: Sequence[str], lanes: Lanes) -> np.ndarray:
     """Return the longest delays, s, for the steps that effects remember; infinity for other parameters."""
     step_s = float(np.median(lanes.record.step_s))
     fields = [name.partition(".") for name in names]
-    steps = [BY_NAME[effect].max_steps.get(field, np.inf) if field else np.inf for effect, _, field in fields]
+    steps = [
+        BY_NAME[effect].max_steps.get(field, np.inf) if field else np.inf
+        for effect, _, field in fields
+    ]
     return np.array(steps) * step_s
 
 

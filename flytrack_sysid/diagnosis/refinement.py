@@ -1,11 +1,12 @@
 """Refinement: effects and their values are judged by how far ahead a model predicts, on rows held out.
 
-One-step residuals say what a model lacks; where they leave something unexplained, a law that stands in for
-it may fit every step and yet fly off. So free flights of 0.1 to 2 s are started from measured states
-(multiple shooting), all parameters are fitted to them on the rows that are learnt from, and effects are
-removed that make no held-out flight better, or any horizon worse. A placebo, which predicts from the state
-alone and knows no commands, is fitted beside it: where it predicts as well as the models, the flights
-say nothing about what answers the commands, and nothing is named from there.
+One-step residuals say what a model lacks; where they leave something unexplained, a law that stands
+in for it may fit every step and yet fly off. So free flights of 0.1 to 2 s are started from
+measured states (multiple shooting), all parameters are fitted to them on the rows that are learnt
+from, and effects are removed that make no held-out flight better, or any horizon worse. A placebo,
+which predicts from the state alone and knows no commands, is fitted beside it: where it predicts as
+well as the models, the flights say nothing about what answers the commands, and nothing is named
+from there.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +24,13 @@ from flytrack_env.effects import BY_NAME, LearnedLaw
 from flytrack_sysid.diagnosis.model_selection import ablate
 from flytrack_sysid.diagnosis.onset import ended
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Candidate, prior_information, solve, step_inside
+from flytrack_sysid.diagnosis.score_test import (
+    BASE_CAUSES,
+    Candidate,
+    prior_information,
+    solve,
+    step_inside,
+)
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log import FlightLog
@@ -46,19 +53,23 @@ FEWEST_WINDOWS, FEWEST_BLOCKS = 12, 3  # fewer say nothing of a cell
 RIDGE = 0.05  # of the placebo, in units of its regressors' variance
 ALWAYS_FITTED_S = 0.25  # horizons up to this are fitted even where the placebo is as good
 OUTLIER = 3.0  # errors beyond so many of the base's rms count by their size, not its square
-MOST_ROUNDS, REFIT_ROUNDS, LEAST_GAIN = 10, 4, 1e-3  # of a fit, of one without an effect; share of the cost
+MOST_ROUNDS, REFIT_ROUNDS, LEAST_GAIN = (
+    10,
+    4,
+    1e-3,
+)  # of a fit, of one without an effect; share of the cost
 NEUTRAL = 1e-3  # of a parameter's scale
 DAMPINGS = np.array([1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0])[:BATCH]
-# Standard errors over blocks by which an effect has to improve held-out prediction, and by which it may
-# where it is worth so large a share of the error: single steps have shown it already.
+# Standard errors over blocks by which an effect has to improve held-out prediction, and by which it
+# may where it is worth so large a share of the error: single steps have shown it already.
 SURE, LIKELY, WORTHWHILE = 2.0, 1.0, 0.02
 SURE_OF_COMMANDS = 1.64  # the same for the better of the models over the placebo, one-sided 95 %
-# Errors over the base's that make a horizon worse, and standard errors over blocks by which it then has to
-# be worse: where the commands matter, and where they do not and chance alone moves the error. What rounds to
-# 1.00 times is as good.
+# Errors over the base's that make a horizon worse, and standard errors over blocks by which it then
+# has to be worse: where the commands matter, and where they do not and chance alone moves the
+# error. What rounds to 1.00 times is as good.
 LIKELY_WORSE, WORSE_ANYWHERE = 1.005, 2.0
-# Standard errors by which a horizon has to be worse before a model is doubted whose one-step residuals are
-# noise: with twenty cells, one standard error is always somewhere.
+# Standard errors by which a horizon has to be worse before a model is doubted whose one-step
+# residuals are noise: with twenty cells, one standard error is always somewhere.
 SURELY_WORSE = 3.0
 
 
@@ -126,7 +137,9 @@ def _regressors(windows: Windows) -> np.ndarray:
     """Return what the placebo knows, (windows, regressors): the state at the start."""
     row, record = windows.first_free - 1, windows.record
     turned = Rotation.from_quat(record.quat[row], scalar_first=True).as_matrix().reshape(-1, 9)
-    return np.concatenate([record.vel_w[row], record.pos_w[row], turned, windows.gyro_b[row]], axis=1)
+    return np.concatenate(
+        [record.vel_w[row], record.pos_w[row], turned, windows.gyro_b[row]], axis=1
+    )
 
 
 def _changes(windows: Windows) -> np.ndarray:
@@ -145,7 +158,9 @@ def placebo_errors(learnt: Windows, judged: Windows) -> np.ndarray:
     """Return the errors of a ridge regression on the state at the start, (1, horizons, windows, ...)."""
     known, wanted = _regressors(learnt), _changes(learnt)
     mean, spread = known.mean(axis=0), known.std(axis=0) + 1e-9
-    rows, others = (np.c_[(one - mean) / spread, np.ones(len(one))] for one in (known, _regressors(judged)))
+    rows, others = (
+        np.c_[(one - mean) / spread, np.ones(len(one))] for one in (known, _regressors(judged))
+    )
     measured, errors = _changes(judged), []
     for index in range(len(HORIZONS_S)):
         used = learnt.counts[index].any(axis=-1)
@@ -231,7 +246,9 @@ class Target(NamedTuple):
 
         found = np.repeat(vector[None], len(DAMPINGS), axis=0)
         for number, damping in enumerate(DAMPINGS):
-            found[number, at] += step_inside(self.problem, vector, at, partial(along, damping=damping))
+            found[number, at] += step_inside(
+                self.problem, vector, at, partial(along, damping=damping)
+            )
         return self.problem.clipped(found)
 
     def _covariance(self, information: np.ndarray, scores: np.ndarray) -> np.ndarray:
@@ -246,8 +263,8 @@ class Target(NamedTuple):
 class Judge(NamedTuple):
     """Held-out windows, the refitted base's errors there and the placebo's; what cells are evidence.
 
-    scale: the base's rms errors, (horizons, quantities). matters: (horizons, quantities) bool, a model that
-    is given the commands predicts better than the placebo.
+    scale: the base's rms errors, (horizons, quantities). matters: (horizons, quantities) bool, a
+    model that is given the commands predicts better than the placebo.
     """
 
     problem: Problem
@@ -262,7 +279,9 @@ class Judge(NamedTuple):
         """Return the judge of a base model before anything is known to matter."""
         tested, placebo = errors_at(problem, base[None], judged), placebo_errors(learnt, judged)
         nothing = np.zeros(tested.scale.shape, bool)
-        return cls(problem, judged, tested, Tested(placebo, judged), tested.scale, nothing).seeing(base)
+        return cls(problem, judged, tested, Tested(placebo, judged), tested.scale, nothing).seeing(
+            base
+        )
 
     @property
     def is_known(self) -> np.ndarray:
@@ -302,10 +321,10 @@ class Judge(NamedTuple):
 class Refined(NamedTuple):
     """The outcome of a refinement.
 
-    kept: the effects of the extended model. fit: the extended model where it was fitted to windows; None
-    where the model from one-step residuals stands. base: the base alone, fitted likewise. removed: effects
-    that held-out prediction does not need or is worse with. without: by kept effect, the model without it,
-    refitted. problem: with the ranges that were searched.
+    kept: the effects of the extended model. fit: the extended model where it was fitted to windows;
+    None where the model from one-step residuals stands. base: the base alone, fitted likewise.
+    removed: effects that held-out prediction does not need or is worse with. without: by kept
+    effect, the model without it, refitted. problem: with the ranges that were searched.
     """
 
     kept: tuple[Candidate, ...]
@@ -320,7 +339,9 @@ class Refined(NamedTuple):
         """Return the same of the problem with a law, its base without it."""
         problem = self.problem.with_law(law)
         own = problem.start[len(self.problem.start) :]
-        return self._replace(problem=problem, base=None if self.base is None else np.append(self.base, own))
+        return self._replace(
+            problem=problem, base=None if self.base is None else np.append(self.base, own)
+        )
 
     @property
     def removal_costs(self) -> dict[str, float]:
@@ -349,7 +370,10 @@ class Refined(NamedTuple):
         if self.judge is None:
             return {}
         found = table_of(self.judge.tested(vector).rms()[0])
-        keys = (f"{name}_{UNITS[name].replace('/', '_per_')}" for name in ("position", "attitude", "rates"))
+        keys = (
+            f"{name}_{UNITS[name].replace('/', '_per_')}"
+            for name in ("position", "attitude", "rates")
+        )
         return next((found[key] for key in keys if key in found), {})
 
 
@@ -402,9 +426,9 @@ def refine(
 ) -> Refined:
     """Return which effects of a model predict held-out flights better, and their values.
 
-    base, model: those from one-step residuals. held_out: (num_rows,) bool. is_explained: one-step residuals
-    leave noise only; the model is then the most likely one already, and stands as long as it predicts no
-    horizon worse than the base.
+    base, model: those from one-step residuals. held_out: (num_rows,) bool. is_explained: one-step
+    residuals leave noise only; the model is then the most likely one already, and stands as long as
+    it predicts no horizon worse than the base.
     """
     learnt, judged = windows_of(log, ~held_out), windows_of(log, held_out)
     problem, candidates, extended = state.problem, model.candidates, model.vector
@@ -426,8 +450,8 @@ def refine(
 class _Refinement(NamedTuple):
     """What the steps of a refinement share.
 
-    acting: the effects that change how a model predicts: not those of sensors that windows do not see, whose
-    values stay as they are. is_explained: as in ``refine``.
+    acting: the effects that change how a model predicts: not those of sensors that windows do not
+    see, whose values stay as they are. is_explained: as in ``refine``.
     """
 
     judge: Judge
@@ -485,7 +509,9 @@ class _Refinement(NamedTuple):
             losses = judge.losses(fit.vector, *(one.vector for one in fits))
             sure = np.array([sureness(one - losses[0]) for one in losses[1:]])
             worth = np.sqrt(losses[1:].sum(axis=1) / losses[0].sum()) - 1.0
-            needed = np.where((worth >= WORTHWHILE) & (sure >= LIKELY), np.maximum(sure, SURE), sure)
+            needed = np.where(
+                (worth >= WORTHWHILE) & (sure >= LIKELY), np.maximum(sure, SURE), sure
+            )
             needed[:] = needed if judge.matters.any() else np.inf  # nothing that could tell
             without = {one.effect: less.vector for one, less in zip(tried, fits, strict=True)}
             if self.is_explained and not judge.is_surely_worse(fit.vector):
@@ -499,7 +525,9 @@ class _Refinement(NamedTuple):
             removed.append(tried[weakest].effect)
             places = self.places(target.problem, kept)
             fit = target.fitted(fits[weakest].vector, places, MOST_ROUNDS)
-        if not any(one.effect in self.acting for one in kept):  # the base as single steps have it stands
+        if not any(
+            one.effect in self.acting for one in kept
+        ):  # the base as single steps have it stands
             return found._replace(kept=tuple(kept), fit=None, removed=tuple(removed), without={})
         return found._replace(kept=tuple(kept), fit=fit, removed=tuple(removed), without=without)
 
@@ -516,12 +544,18 @@ def _acting(
     without = [problem.at_start(vector, one.fields) for one in candidates]
     found = errors_at(problem, np.stack([vector, *without]), windows).errors
     changes = np.abs(found[1:] - found[0]).max(axis=(1, 2, 3, 4))
-    return tuple(one.effect for one, change in zip(candidates, changes, strict=True) if change > 0.0)
+    return tuple(
+        one.effect for one, change in zip(candidates, changes, strict=True) if change > 0.0
+    )
 
 
 def _is_neutral(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> bool:
     """Return whether parameters are as in the nominal model, those apart that only shape what others do."""
-    own = [name for name in fields if name.split(".")[1] not in BY_NAME[name.split(".")[0]].search.shapes]
+    own = [
+        name
+        for name in fields
+        if name.split(".")[1] not in BY_NAME[name.split(".")[0]].search.shapes
+    ]
     places = problem.index(own)
     return bool(np.all(np.abs(vector - problem.start)[places] < NEUTRAL * problem.scale[places]))
 
@@ -551,21 +585,25 @@ def table_of(tested: np.ndarray) -> dict[str, dict[str, float]]:
 def reduced(selection: Selection, refined: Refined) -> Selection:
     """Return the selection with only those effects that a refinement kept; its base alone without any.
 
-    Where none was fitted to flights, as sensors that flights do not see, single steps decide; the base alone
-    stands where it flies better.
+    Where none was fitted to flights, as sensors that flights do not see, single steps decide; the
+    base alone stands where it flies better.
     """
     model = selection.model
     if refined.fit is not None:
         if refined.kept == model.candidates:
             return selection
-        return selection._replace(model=model._replace(candidates=refined.kept, places=refined.fit.places))
+        return selection._replace(
+            model=model._replace(candidates=refined.kept, places=refined.fit.places)
+        )
     if refined.kept:
         kept = selection if refined.kept == model.candidates else _narrowed(selection, refined.kept)
         if not _flies_worse(kept, refined.judge):
             return kept
     state, base = selection.state, selection.base
     # What an effect that is gone held at nominal is free again, as it was when the base was fitted.
-    held = tuple(one for one in state.held if state.problem.names.index(one.field) not in base.places)
+    held = tuple(
+        one for one in state.held if state.problem.names.index(one.field) not in base.places
+    )
     return selection._replace(state=replace(state, held=held), model=base)
 
 

@@ -12,7 +12,14 @@ from flytrack_env.effects import BY_NAME, LearnedLaw
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
-from flytrack_sysid.diagnosis.evidence import EVIDENCE, Panel, draw_cause, list_words, without, words_of
+from flytrack_sysid.diagnosis.evidence import (
+    EVIDENCE,
+    Panel,
+    draw_cause,
+    list_words,
+    without,
+    words_of,
+)
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
     CONSISTENT,
@@ -40,9 +47,7 @@ WRONG = "has the wrong value of"
 LOG_BARS = 20.0  # times the smallest error: from there on bars would vanish on an even scale
 MOST_LIMITS = 8  # rows of the text's table of what a log could not show
 CHANNEL_WORDS = {"rates": "body rates", "force": "specific force"}
-DIFFERENCES = (
-    "The log lacks a gyro or an accelerometer; attitude or velocity replace them, by their change per row."
-)
+DIFFERENCES = "The log lacks a gyro or an accelerometer; attitude or velocity replace them, by their change per row."
 HOW = (
     "Every step of the log is predicted from the row before it. The model carries on what follows from the "
     "commands alone; attitude, velocity, position and voltage are taken from the log.",
@@ -121,7 +126,9 @@ def fault_of(cause: str, diagnosis: Diagnosis) -> str:
     if [*map(float, models[0])] == [*map(float, neutral)]:
         return "lacks"
     had, shown = (
-        np.array([float(getattr(one, name) - getattr(neutral, name)) / notable[name] for name in notable])
+        np.array(
+            [float(getattr(one, name) - getattr(neutral, name)) / notable[name] for name in notable]
+        )
         for one in models
     )
     if had @ shown < 0.0:
@@ -145,7 +152,11 @@ def _gain(diagnosis: Diagnosis) -> str:
     if np.isfinite(refitted):
         as_good = ": no effect adds to that" if _closer(refitted, after) == AS_CLOSE else ""
         details.append(f"{refitted:.2g} m when only refitted{as_good}")
-    blind = diagnosis.prediction.errors.get("placebo", {}).get("position_m", {}).get(HEADLINE_HORIZON, np.inf)
+    blind = (
+        diagnosis.prediction.errors.get("placebo", {})
+        .get("position_m", {})
+        .get(HEADLINE_HORIZON, np.inf)
+    )
     if blind <= after:
         details.append(f"a guess that ignores the commands, {blind:.2g} m")
     return f"{text} ({'; '.join(details)})."
@@ -177,7 +188,9 @@ def verdict_of(diagnosis: Diagnosis) -> Verdict:
     left = diagnosis.unexplained
     depends = f" It depends on {', '.join(left.depends_on)}." if left.depends_on else ""
     if diagnosis.verdict == CONSISTENT:
-        return Verdict("The log agrees with the model: the residuals look like sensor noise.", "good")
+        return Verdict(
+            "The log agrees with the model: the residuals look like sensor noise.", "good"
+        )
     beyond = _beyond(diagnosis)
     if not diagnosis.causes:
         text = f"The model is wrong, and no known cause explains it.{depends}"
@@ -186,7 +199,9 @@ def verdict_of(diagnosis: Diagnosis) -> Verdict:
     if left.depends_on:
         parts.append(f"Something else remains that no known cause explains.{depends}")
     parts.append(_learned(diagnosis))
-    return Verdict(" ".join(filter(None, parts)), "found" if diagnosis.verdict == CAUSES_FOUND else "open")
+    return Verdict(
+        " ".join(filter(None, parts)), "found" if diagnosis.verdict == CAUSES_FOUND else "open"
+    )
 
 
 def _causes_part(diagnosis: Diagnosis) -> Part:
@@ -202,7 +217,9 @@ def _causes_part(diagnosis: Diagnosis) -> Part:
         for cause in diagnosis.causes
     ]
     caption = "Values with 95 % intervals. Gain: fall of minus twice the log likelihood on the held-out part."
-    return Table(["cause", "parameters", "gain", "could it be another?"], rows, caption, is_text=True)
+    return Table(
+        ["cause", "parameters", "gain", "could it be another?"], rows, caption, is_text=True
+    )
 
 
 def _errors_table(diagnosis: Diagnosis) -> Table:
@@ -210,7 +227,11 @@ def _errors_table(diagnosis: Diagnosis) -> Table:
     steps = dict.fromkeys(key for one in models for key in one.one_step_nrmse)
     flights = dict.fromkeys(key for one in models for key in one.position_m)
     rows = [
-        [CHANNEL_WORDS.get(key, key), "NRMSE", *(_number(one.one_step_nrmse.get(key)) for one in models)]
+        [
+            CHANNEL_WORDS.get(key, key),
+            "NRMSE",
+            *(_number(one.one_step_nrmse.get(key)) for one in models),
+        ]
         for key in steps
     ]
     rows += [
@@ -219,14 +240,20 @@ def _errors_table(diagnosis: Diagnosis) -> Table:
     ]
     responses = [diagnosis.half_response_s.get(name, {}) for name in diagnosis.error]
     rows += [
-        [f"time to half response, {stick}", "ms", *(_half_response(one.get(stick)) for one in responses)]
+        [
+            f"time to half response, {stick}",
+            "ms",
+            *(_half_response(one.get(stick)) for one in responses),
+        ]
         for stick in diagnosis.half_response_s.get("extended", {})
     ]
     caption = (
         "Held-out part. One step: 1 is as bad as predicting the mean; position in free flight, rms. Half "
         "response: of body rate or thrust to a small step of the stick; in brackets, to full stick."
     )
-    return Table(["error", "unit", *(name.replace("_", " ") for name in diagnosis.error)], rows, caption)
+    return Table(
+        ["error", "unit", *(name.replace("_", " ") for name in diagnosis.error)], rows, caption
+    )
 
 
 BARS = {
@@ -248,7 +275,10 @@ def _errors_picture(diagnosis: Diagnosis) -> list[Part]:
     models = [(name, one.position_m) for name, one in diagnosis.error.items() if one.position_m]
     width = 0.8 / len(models)
     for place, (name, errors) in enumerate(models):
-        at, heights = np.arange(len(horizons)) + place * width, [errors[horizon] for horizon in horizons]
+        at, heights = (
+            np.arange(len(horizons)) + place * width,
+            [errors[horizon] for horizon in horizons],
+        )
         axes.bar(at, heights, width, color=BARS[name], label=name.replace("_", " "))
     every = [error for _, errors in models for error in errors.values()]
     if max(every) > LOG_BARS * min(every):
@@ -277,7 +307,9 @@ def _half_response(found: HalfResponse | None) -> str:
 
 def _limits_part(diagnosis: Diagnosis) -> Part:
     if not diagnosis.not_identifiable:
-        return Text("This log could have shown every effect that is looked for, and told it from all others.")
+        return Text(
+            "This log could have shown every effect that is looked for, and told it from all others."
+        )
     rows = [
         [
             f"{words_of(one.effect)}\n({one.effect})",
@@ -287,7 +319,9 @@ def _limits_part(diagnosis: Diagnosis) -> Part:
         ]
         for one in diagnosis.not_identifiable
     ]
-    caption = "Smaller than the second column, such an effect may be there without showing in this log."
+    caption = (
+        "Smaller than the second column, such an effect may be there without showing in this log."
+    )
     header = ["effect", "visible from", "looks like", "fly this to settle it"]
     return Table(header, rows, caption, is_text=True)
 
@@ -349,8 +383,12 @@ def _evidence_parts(diagnosis: Diagnosis, found: Traces, start_s: float) -> list
     for cause in sorted(diagnosis.causes, key=lambda cause: -cause.chi2_gain)[:MOST_PICTURED]:
         evidence = EVIDENCE[cause.effect]
         acting = while_acting(found, cause, start_s)
-        figure = draw_cause(cause.effect, evidence.panels, acting, _LESS + cause.effect, when_of(cause))
-        parts.append(Picture(png_of(figure), f"{evidence.reading} ({cause.effect}{when_of(cause)})"))
+        figure = draw_cause(
+            cause.effect, evidence.panels, acting, _LESS + cause.effect, when_of(cause)
+        )
+        parts.append(
+            Picture(png_of(figure), f"{evidence.reading} ({cause.effect}{when_of(cause)})")
+        )
     if parts and any(found.used(name) != name for name in ("rates_x", "force_x")):
         parts.append(Text(DIFFERENCES))
     return parts
@@ -362,11 +400,15 @@ def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
     minutes = found.elapsed_s[-1] / SECONDS_PER_MINUTE
     introduction: list[Part] = [
         verdict_of(diagnosis),
-        Text(f"{diagnosis.source}: {len(log)} rows, {minutes:.1f} min. SHA-256 {diagnosis.sha256[:12]}."),
+        Text(
+            f"{diagnosis.source}: {len(log)} rows, {minutes:.1f} min. SHA-256 {diagnosis.sha256[:12]}."
+        ),
         _causes_part(diagnosis),
     ]
     if diagnosis.negligible:
-        listed = "; ".join(f"{words_of(one.effect)} ({_plus_minus(one)})" for one in diagnosis.negligible)
+        listed = "; ".join(
+            f"{words_of(one.effect)} ({_plus_minus(one)})" for one in diagnosis.negligible
+        )
         introduction.append(Text(f"Seen, but negligible: {listed}."))
     if diagnosis.warnings:
         introduction.append(Bullets(diagnosis.warnings))
@@ -375,7 +417,10 @@ def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
         Section("Errors before and after", [*_errors_picture(diagnosis), _errors_table(diagnosis)]),
         *([Section("The evidence, cause by cause", evidence)] if evidence else []),
         Section("What this log could not show, and what to fly", [_limits_part(diagnosis)]),
-        Section("What remains unexplained", _unexplained_parts(diagnosis) + _learned_parts(diagnosis, found)),
+        Section(
+            "What remains unexplained",
+            _unexplained_parts(diagnosis) + _learned_parts(diagnosis, found),
+        ),
         Section("How this was done", [Bullets(HOW)]),
     ]
     return page("What the model gets wrong", sections, introduction)
@@ -431,7 +476,9 @@ def text_of(diagnosis: Diagnosis) -> str:
     if diagnosis.learned is not None:
         lines += [f"learnt: {line}" for line in diagnosis.learned.text().splitlines()]
     closing = _gain(diagnosis) if diagnosis.causes else ""
-    return "\n".join([*lines, *_limits_text(diagnosis), *diagnosis.warnings, *filter(None, [closing])])
+    return "\n".join(
+        [*lines, *_limits_text(diagnosis), *diagnosis.warnings, *filter(None, [closing])]
+    )
 
 
 def _limits_text(diagnosis: Diagnosis) -> list[str]:
@@ -444,7 +491,9 @@ def _limits_text(diagnosis: Diagnosis) -> list[str]:
         size = f"{one.smallest:.3g} {one.unit}" if np.isfinite(one.smallest) else "-"
         rows.append((one.effect, size, ", ".join(one.confused_with[:MOST_LISTED]) or "noise"))
     widths = [max(len(row[column]) for row in rows) for column in range(2)]
-    lines = [f"{name:<{widths[0]}}  {size:<{widths[1]}}  {alike}".rstrip() for name, size, alike in rows]
+    lines = [
+        f"{name:<{widths[0]}}  {size:<{widths[1]}}  {alike}".rstrip() for name, size, alike in rows
+    ]
     if len(limits) > MOST_LIMITS:
         lines.append(f"and {len(limits) - MOST_LIMITS} more, in {REPORT_NAME}")
     flight, number = Counter(one.fly for one in limits).most_common(1)[0]

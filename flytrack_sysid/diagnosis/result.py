@@ -13,9 +13,8 @@ from flytrack_sysid.diagnosis.lanes import AXES
 SCHEMA = 1
 TO_LOG = "log "  # what comes instead of a manoeuvre where a channel is missing
 CONSISTENT, CAUSES_FOUND, UNEXPLAINED = "consistent", "causes_found", "unexplained"
-DRIFT = (
-    "thrust_drift"  # no effect: what a curve that depends on the voltage may be, which falls with the time
-)
+# no effect: what a curve that depends on the voltage may be, which falls with the time
+DRIFT = "thrust_drift"
 # Direct and level channel of each side: rotation, force, battery.
 CHANNELS: tuple[tuple[str | None, str], ...] = (
     ("rates", "attitude"),
@@ -57,14 +56,14 @@ class Cause:
     """Something that the model has wrong, by name.
 
     effect: of ``flytrack_env.effects``, or a base parameter (tau_roll ... tau_thrust, thrust_curve,
-    thrust_scale, battery_drain). equivalent: names that this log cannot tell from it, or DRIFT. channel:
-    rates, attitude, force, velocity or battery: where it shows most. parameters: by name. chi2_gain: what it
-    gains on the part that was fitted, heldout_gain: on the part held out, of minus twice the log likelihood.
-    lambda_: squared size of its signature over the noise, all else that is free taken out. lambda_sep: the
-    same with the closest rival taken out too, and closest which that is; base parameters have none.
-    beyond: where a value lies at the end of what is searched, "delay_s at least 0.04 s": the true cause may
-    be beyond the list. onset_s, end_s: when it began and ended, in the log's time; None where the log begins
-    and ends with it.
+    thrust_scale, battery_drain). equivalent: names that this log cannot tell from it, or DRIFT.
+    channel: rates, attitude, force, velocity or battery: where it shows most. parameters: by name.
+    chi2_gain: what it gains on the part that was fitted, heldout_gain: on the part held out, of
+    minus twice the log likelihood. lambda_: squared size of its signature over the noise, all else
+    that is free taken out. lambda_sep: the same with the closest rival taken out too, and closest
+    which that is; base parameters have none. beyond: where a value lies at the end of what is
+    searched, "delay_s at least 0.04 s": the true cause may be beyond the list. onset_s, end_s: when
+    it began and ended, in the log's time; None where the log begins and ends with it.
     """
 
     effect: str
@@ -85,8 +84,8 @@ class Cause:
 class Unexplained:
     """What no known cause explains.
 
-    flagged: something is left, or has a value beyond the list. depends_on: what is left varies with position,
-    time, heading, airspeed, attitude, command, "periodic at F Hz" or is stochastic.
+    flagged: something is left, or has a value beyond the list. depends_on: what is left varies with
+    position, time, heading, airspeed, attitude, command, "periodic at F Hz" or is stochastic.
     shares: of each, how many times the sensor noise it is (rms), by "channel: dependence".
     """
 
@@ -99,8 +98,9 @@ class Unexplained:
 class NotIdentifiable:
     """An effect that this log could not have shown, or not apart from others.
 
-    smallest: of its parameter that is seen worst, what the log would show for sure. confused_with: what
-    looks alike in this log. fly: what to fly to settle it, one of ``flytrack_sysid.manoeuvres``.
+    smallest: of its parameter that is seen worst, what the log would show for sure. confused_with:
+    what looks alike in this log. fly: what to fly to settle it, one of
+    ``flytrack_sysid.manoeuvres``.
     """
 
     effect: str
@@ -114,7 +114,8 @@ class NotIdentifiable:
 class Errors:
     """Errors of one model on the held-out part.
 
-    one_step_nrmse: by channel, 1 is as bad as saying the mean. position_m: by seconds of free flight, rms.
+    one_step_nrmse: by channel, 1 is as bad as saying the mean. position_m: by seconds of free
+    flight, rms.
     """
 
     one_step_nrmse: Mapping[str, float]
@@ -141,11 +142,12 @@ class Changed:
 class Prediction:
     """Held-out errors of free flights from measured states, rms, and where they tell anything.
 
-    errors: by model (nominal, refitted_base, extended, placebo; refitted_to_flights, the base alone fitted
-    as the extended model was, where that was done; without_learned, the extended model without what was
-    learnt beyond the list), by quantity with its unit, and by seconds. evidence: by quantity, the horizons,
-    s, at which a model predicts better than the placebo, which knows the state at the start and no commands.
-    removal_costs: by effect, by which share these errors grow without it.
+    errors: by model (nominal, refitted_base, extended, placebo; refitted_to_flights, the base alone
+    fitted as the extended model was, where that was done; without_learned, the extended model
+    without what was learnt beyond the list), by quantity with its unit, and by seconds. evidence:
+    by quantity, the horizons, s, at which a model predicts better than the placebo, which knows the
+    state at the start and no commands. removal_costs: by effect, by which share these errors grow
+    without it.
     """
 
     errors: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
@@ -178,15 +180,16 @@ class Outliers:
 class Diagnosis:
     """What is wrong with a model, according to a log.
 
-    verdict: consistent, causes_found, unexplained, or "causes_found+unexplained". error: by model: nominal,
-    refitted_base, extended, noise_floor, and without_learned as in ``Prediction``. nominal, base, extended:
-    the models, with the motion that the log shows. negligible: what is significant and too small to matter.
-    beyond: what has a value at the end of what is searched, so that it is not named. source, sha256: of the
-    log. noise: by channel and axis, fitted standard deviations of the sensors. voltages: the lowest and the
-    highest of the battery that were learnt from, V; None where it was not measured. prediction: how far
-    ahead the models predict. changed: every parameter of the extended model that is not as in the nominal
-    one. learned: a law for what is unexplained, part of the extended model. half_response_s:
-    by model (nominal, refitted_base, extended) and by stick. outliers: by channel, if any.
+    verdict: consistent, causes_found, unexplained, or "causes_found+unexplained". error: by model:
+    nominal, refitted_base, extended, noise_floor, and without_learned as in ``Prediction``.
+    nominal, base, extended: the models, with the motion that the log shows. negligible: what is
+    significant and too small to matter. beyond: what has a value at the end of what is searched, so
+    that it is not named. source, sha256: of the log. noise: by channel and axis, fitted standard
+    deviations of the sensors. voltages: the lowest and the highest of the battery that were learnt
+    from, V; None where it was not measured. prediction: how far ahead the models predict. changed:
+    every parameter of the extended model that is not as in the nominal one. learned: a law for what
+    is unexplained, part of the extended model. half_response_s: by model (nominal, refitted_base,
+    extended) and by stick. outliers: by channel, if any.
     """
 
     verdict: str
@@ -218,7 +221,10 @@ class Diagnosis:
         for cause in (*causes, *negligible, *beyond):
             cause |= {"lambda": cause.pop("lambda_"), "closest_rival": cause.pop("closest")}
         for limit in limits:
-            limit["smallest_detectable"] = {"value": limit.pop("smallest"), "unit": limit.pop("unit")}
+            limit["smallest_detectable"] = {
+                "value": limit.pop("smallest"),
+                "unit": limit.pop("unit"),
+            }
         return {
             "schema": SCHEMA,
             "verdict": self.verdict,

@@ -1,8 +1,8 @@
 """The score test: what freeing parameters would gain to first order, from one linearization of a log.
 
-A ``Linearization`` has a model's whitened residuals and their slopes along every parameter, summed up over
-blocks of a second. Gains are divided by how much more the scores of blocks vary than independent rows would
-(``inflation``).
+A ``Linearization`` has a model's whitened residuals and their slopes along every parameter, summed
+up over blocks of a second. Gains are divided by how much more the scores of blocks vary than
+independent rows would (``inflation``).
 """
 
 import copy
@@ -27,10 +27,15 @@ CHANCE = 1e-4  # of a name where there is nothing, for each effect
 # A direction of which the others leave less than this share cannot be told apart from them.
 LEAST_OWN_SHARE = 1e-7
 AT_BOUND = 1e-9
-SAME_SLOPE = 0.1  # relative change of a parameter that is looked for at probes, within which its slope holds
+# relative change of a parameter that is looked for at probes, within which its slope holds
+SAME_SLOPE = 0.1
 PROBE_PRIOR = 1e-2  # a step to a probe is known to be less than ten times that
 # Names of causes in the base, and the parameters of each.
-BASE_CAUSES = {**{name: (name,) for name in TAUS}, "thrust_curve": THRUST_COEFFS, "battery_drain": (DRAIN,)}
+BASE_CAUSES = {
+    **{name: (name,) for name in TAUS},
+    "thrust_curve": THRUST_COEFFS,
+    "battery_drain": (DRAIN,),
+}
 
 
 class Probe(NamedTuple):
@@ -54,8 +59,8 @@ class Probe(NamedTuple):
 class Candidate(NamedTuple):
     """An effect and one way to look for it.
 
-    fields: ``effect.parameter`` names that are freed. probes: of some of them, where there is no slope at
-    neutral; each may lie on another share of its way.
+    fields: ``effect.parameter`` names that are freed. probes: of some of them, where there is no
+    slope at neutral; each may lie on another share of its way.
     """
 
     effect: str
@@ -72,7 +77,11 @@ class Candidate(NamedTuple):
     def groups(self) -> list[tuple[str, ...]]:
         """Its fields by what changes together: several groups of an effect whose settings are independent."""
         fields = set(self.fields)
-        own = [one.fields for one in candidates_of(BY_NAME[self.effect]) if fields.issuperset(one.fields)]
+        own = [
+            one.fields
+            for one in candidates_of(BY_NAME[self.effect])
+            if fields.issuperset(one.fields)
+        ]
         largest = [one for one in own if not any(set(one) < set(other) for other in own)]
         return largest if BY_NAME[self.effect].search.is_setting else [self.fields]
 
@@ -120,7 +129,10 @@ CANDIDATES = [candidate for effect in SEARCHED for candidate in candidates_of(ef
 def candidates_for(problem: Problem) -> list[Candidate]:
     """Return the ways to look for effects: of the list, and what settings of the craft may be changed."""
     given = [BY_NAME[name] for name in problem.given_effects if BY_NAME[name].search.is_setting]
-    return [*CANDIDATES, *(one for effect in given if effect.search.groups for one in candidates_of(effect))]
+    return [
+        *CANDIDATES,
+        *(one for effect in given if effect.search.groups for one in candidates_of(effect)),
+    ]
 
 
 def threshold(num_parameters: int) -> float:
@@ -131,9 +143,9 @@ def threshold(num_parameters: int) -> float:
 class Gain(NamedTuple):
     """What freeing some parameters besides others would gain.
 
-    chi2: in minus twice the log likelihood. inflation: of its variance, where residuals within a second are
-    correlated. step: of the parameters. given_step: of the others, along with it. information: about those
-    that others cannot replace, with what others explain projected out.
+    chi2: in minus twice the log likelihood. inflation: of its variance, where residuals within a
+    second are correlated. step: of the parameters. given_step: of the others, along with it.
+    information: about those that others cannot replace, with what others explain projected out.
     """
 
     chi2: float
@@ -156,8 +168,9 @@ class Gain(NamedTuple):
 class Linearization:
     """A model and, to first order, what every column would change: parameters, and ways to probes.
 
-    vector: the model. places: parameters of the first columns. probes: of further ones, whose step is the
-    share of the way to the probe. columns: whitened. The slopes may be those of a nearby model.
+    vector: the model. places: parameters of the first columns. probes: of further ones, whose step
+    is the share of the way to the probe. columns: whitened. The slopes may be those of a nearby
+    model.
     """
 
     def __init__(self, problem: Problem, slopes: Slopes, probes: Sequence[Probe] = ()):
@@ -171,7 +184,9 @@ class Linearization:
         root = np.sqrt(robust_weight(self.white))
         weighted = blocks_of(self.columns * root)
         self.by_block = weighted @ np.swapaxes(weighted, 1, 2)
-        self.score_by_block = -np.einsum("bpn,bn->bp", weighted, blocks_of(self.white * root), optimize=True)
+        self.score_by_block = -np.einsum(
+            "bpn,bn->bp", weighted, blocks_of(self.white * root), optimize=True
+        )
         self.total = self.by_block.sum(axis=0) + np.diag(self.prior)
         self._sum_scores()
 
@@ -191,7 +206,9 @@ class Linearization:
         later.white = self.problem.whitened_residuals(vector)[0] if white is None else white
         root = np.sqrt(robust_weight(later.white))
         weighted = blocks_of(later.white * root * root)
-        later.score_by_block = -np.einsum("bpn,bn->bp", blocks_of(self.columns), weighted, optimize=True)
+        later.score_by_block = -np.einsum(
+            "bpn,bn->bp", blocks_of(self.columns), weighted, optimize=True
+        )
         later._sum_scores()
         return later
 
@@ -239,7 +256,9 @@ class Linearization:
 
     def acting(self, columns: Sequence[int]) -> list[int]:
         """Return the columns that change anything."""
-        return [column for column in columns if self.total[column, column] > 2.0 * self.prior[column]]
+        return [
+            column for column in columns if self.total[column, column] > 2.0 * self.prior[column]
+        ]
 
     def step(self, columns: Sequence[int]) -> np.ndarray:
         """Return the step along columns that explains most, nothing else moving."""
@@ -248,10 +267,15 @@ class Linearization:
     def step_inside(self) -> np.ndarray:
         """Return the step along all places that explains most within bounds; those stuck there stay."""
         return step_inside(
-            self.problem, self.vector, self.places, lambda free: self.step(np.flatnonzero(free).tolist())
+            self.problem,
+            self.vector,
+            self.places,
+            lambda free: self.step(np.flatnonzero(free).tolist()),
         )
 
-    def projected(self, columns: Sequence[int], given: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    def projected(
+        self, columns: Sequence[int], given: Sequence[int]
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return information about columns with given ones projected out, and the shares of these in them."""
         across = self.total[np.ix_(given, columns)]
         share = solve(self.total[np.ix_(given, given)], across)
@@ -287,7 +311,10 @@ class Linearization:
 
         Parameters that begin at neutral do not move away from their probes; the step of those is 0.
         """
-        columns, probed = self.columns_of(candidate), [self.probe_column(one) for one in candidate.probes]
+        columns, probed = (
+            self.columns_of(candidate),
+            [self.probe_column(one) for one in candidate.probes],
+        )
         one_way = {self.probe_column(one) for one in candidate.probes if one.is_one_way}
         kept = list(columns)
         while not probed or set(kept) & set(probed):
@@ -307,7 +334,9 @@ class Linearization:
         for column in columns:
             others = given + kept
             across = self.total[others, column]
-            own = self.total[column, column] - across @ solve(self.total[np.ix_(others, others)], across)
+            own = self.total[column, column] - across @ solve(
+                self.total[np.ix_(others, others)], across
+            )
             least = max(LEAST_OWN_SHARE * self.total[column, column], 2.0 * self.prior[column])
             if own > least:
                 kept.append(column)
@@ -331,7 +360,9 @@ def step_inside(
     while free.any():
         step[:] = 0.0
         step[free] = step_along(free)
-        stuck = free & (((now <= low + room) & (step < 0.0)) | ((now >= high - room) & (step > 0.0)))
+        stuck = free & (
+            ((now <= low + room) & (step < 0.0)) | ((now >= high - room) & (step > 0.0))
+        )
         if not stuck.any():
             break
         free &= ~stuck

@@ -22,15 +22,16 @@ from flytrack_sysid.parameters import DRAIN, base_of
 
 PER_PARAMETER = 4.0  # of chi2: what one more parameter has to gain to be preferred to fewer
 MOST_EFFECTS = 6
-CLOSE = 0.6  # of the best gain: candidates that come so near to first order are refitted before one is chosen
+# of the best gain: candidates that come so near to first order are refitted before one is chosen
+CLOSE = 0.6
 MOST_REFITTED = 4
 MOST_FAILED_ROUNDS = 3  # of refits before a search ends
 PROMISING = 0.7  # of the threshold, to first order
 SHARE_OF_WAY = (0.02, 1.5)  # to a probe, at which a fit starts
 KEPT_PROMISE = 0.6  # of a gain to first order: a fit that comes to less may have gone astray
 SATURATED_SHARES = np.array([0.0, 1.0, 0.5, 0.2])  # of the step to everything at once
-# Gauss-Newton: rounds, the least gain of a round, shares of a step tried at once, and after how much gain
-# slopes are taken again; gains in minus twice the log likelihood.
+# Gauss-Newton: rounds, the least gain of a round, shares of a step tried at once, and after how
+# much gain slopes are taken again; gains in minus twice the log likelihood.
 MOST_ROUNDS, LEAST_GAIN, STALE = 30, 0.05, 30.0
 STEP_SHARES = np.array([1.0, 0.5, 0.2, 0.05])[:SMALL_BATCH]
 
@@ -80,9 +81,9 @@ class Held(NamedTuple):
 class SearchState:
     """What a search knows; every step of the search returns a new one.
 
-    problem: what is learnt from, with the noise. unobservable: effects that need channels the log lacks.
-    refused: effects that vetoes have rejected. held: base parameters that stay nominal. linearization:
-    the last one along everything, kept because slopes are expensive.
+    problem: what is learnt from, with the noise. unobservable: effects that need channels the log
+    lacks. refused: effects that vetoes have rejected. held: base parameters that stay nominal.
+    linearization: the last one along everything, kept because slopes are expensive.
     """
 
     problem: Problem
@@ -99,8 +100,11 @@ class SearchState:
         """
         noise = noises.first_guess(problem.lanes, problem.residuals(problem.start[None])[0])
         channels = {*log.channels, *problem.lanes.measured}
-        lacking = tuple(effect.name for effect in SEARCHED if not set(effect.search.needs) <= channels)
-        # The replay's voltage is then assumed at every row; what falls within a step would pass for thrust.
+        lacking = tuple(
+            effect.name for effect in SEARCHED if not set(effect.search.needs) <= channels
+        )
+        # The replay's voltage is then assumed at every row; what falls within a step would pass for
+        # thrust.
         held = () if voltages_of(problem.lanes) else (Held(DRAIN, ""),)
         return cls(problem.with_noise(noise), unobservable=lacking, held=held)
 
@@ -129,13 +133,20 @@ class SearchState:
                 last = Linearization(problem, last.slopes, last.probes)
             found = last.moved(vector)
         else:
-            probes = list(dict.fromkeys(probe for one in candidates_for(problem) for probe in one.probes))
-            others = problem.clipped(np.array([probe.placed_in(problem, vector) for probe in probes]))
+            probes = list(
+                dict.fromkeys(probe for one in candidates_for(problem) for probe in one.probes)
+            )
+            others = problem.clipped(
+                np.array([probe.placed_in(problem, vector) for probe in probes])
+            )
             found = Linearization(problem, problem.slopes(vector, self.every_place, others), probes)
         return replace(self, linearization=found), found
 
     def fitted(
-        self, candidates: Sequence[Candidate], vector: np.ndarray, nearby: Linearization | None = None
+        self,
+        candidates: Sequence[Candidate],
+        vector: np.ndarray,
+        nearby: Linearization | None = None,
     ) -> FittedModel:
         """Return the model with these effects that fits best, from a vector. nearby: as in ``refine``."""
         effects = [place for one in candidates for place in self.problem.index(one.fields)]
@@ -149,8 +160,8 @@ def refine(
 ) -> tuple[np.ndarray, float]:
     """Return the model of least cost along some places, from a vector, and its cost, by Gauss-Newton.
 
-    Slopes are kept while little is gained: residuals cost a tenth of them. nearby: a linearization whose
-    slopes serve at first.
+    Slopes are kept while little is gained: residuals cost a tenth of them. nearby: a linearization
+    whose slopes serve at first.
     """
     places = list(places)
     if nearby is None:
@@ -189,7 +200,9 @@ class Scored(NamedTuple):
         return self.gain.robust - PER_PARAMETER * self.gain.num_parameters
 
 
-def score_candidates(state: SearchState, linearization: Linearization, model: FittedModel) -> list[Scored]:
+def score_candidates(
+    state: SearchState, linearization: Linearization, model: FittedModel
+) -> list[Scored]:
     """Return all effects that a model lacks, by merit to first order, one way of each."""
     given = linearization.columns_at(model.places)
     excluded = {*state.unobservable, *state.refused}
@@ -211,7 +224,8 @@ def add_effect(
 ) -> FittedModel:
     """Return the model with an effect more, fitted from where first order says.
 
-    An effect that is looked for at a probe also starts there, if it came to much less than promised.
+    An effect that is looked for at a probe also starts there, if it came to much less than
+    promised.
     """
     problem, (candidate, gain) = state.problem, scored
     candidates = model.joined_by(candidate)
@@ -224,7 +238,9 @@ def add_effect(
         at_probes = model.vector
         for probe, share in zip(candidate.probes, gain.step, strict=False):
             at_probes = probe.placed_in(problem, at_probes) if share > 0.0 else at_probes
-        best = min(best, state.fitted(candidates, problem.clipped(at_probes)), key=lambda one: one.cost)
+        best = min(
+            best, state.fitted(candidates, problem.clipped(at_probes)), key=lambda one: one.cost
+        )
     return best
 
 
@@ -241,7 +257,9 @@ def _on_the_way(problem: Problem, model: FittedModel, scored: Scored) -> np.ndar
     return problem.clipped(vector)
 
 
-def add_best(state: SearchState, linearization: Linearization, model: FittedModel) -> FittedModel | None:
+def add_best(
+    state: SearchState, linearization: Linearization, model: FittedModel
+) -> FittedModel | None:
     """Return the model with the effect added that explains most; None where none explains enough."""
     ranked = [
         one
@@ -292,7 +310,8 @@ def saturated_residuals(linearization: Linearization) -> np.ndarray:
 def search(state: SearchState) -> tuple[SearchState, FittedModel, FittedModel]:
     """Return the state with its noise, the base refitted without effects, and the model with effects.
 
-    Noise and effects take turns: a large effect hides small ones as long as its remainder passes for noise.
+    Noise and effects take turns: a large effect hides small ones as long as its remainder passes
+    for noise.
     """
     lanes = state.problem.lanes
     base = state.fitted((), state.problem.start)

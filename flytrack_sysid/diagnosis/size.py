@@ -1,8 +1,8 @@
 """Whether a cause matters: what is significant may still be too small to be worth a name.
 
-A cause matters where a parameter departs from what the nominal model has by a notable size (an effect's
-``notable``; for the base, the sizes here), or where flight without it, all else refitted, ends at least 2 %
-farther off on held-out rows.
+A cause matters where a parameter departs from what the nominal model has by a notable size (an
+effect's ``notable``; for the base, the sizes here), or where flight without it, all else refitted,
+ends at least 2 % farther off on held-out rows.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -32,8 +32,8 @@ def split_by_size(
 ) -> tuple[tuple[Cause, ...], tuple[Cause, ...]]:
     """Return the causes that matter, and those that are negligible.
 
-    vector: the extended model. flight_error: of a vector, by horizon, on held-out rows; empty where the log
-    cannot show it. without: the vector that is refitted without a cause.
+    vector: the extended model. flight_error: of a vector, by horizon, on held-out rows; empty where
+    the log cannot show it. without: the vector that is refitted without a cause.
     """
     small = [cause for cause in causes if not is_notable(cause.effect, problem, vector)]
     full = flight_error(vector) if small else {}

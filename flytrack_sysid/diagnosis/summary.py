@@ -53,7 +53,9 @@ from flytrack_sysid.response import FULL_STEP, SMALL_STEP, half_responses
 
 TWO_SIDED_95 = 1.959964
 LOOSE = 0.5  # of the prior's width: a parameter that the log knows no better is not determined
-SCALE_TWINS = ("thrust_curve",)  # mass, payload, battery and motors all scale the thrust over the mass
+SCALE_TWINS = (
+    "thrust_curve",
+)  # mass, payload, battery and motors all scale the thrust over the mass
 SLOPE_STEP = 1e-3  # of a parameter's scale, for slopes of times to half response
 STILL = (*MAX_RATES, DRAIN, *THRUST_COEFFS)  # a model where these are 0 does not move
 
@@ -83,7 +85,11 @@ def mean_thrust(problem: Problem) -> np.ndarray:
     record, flown = problem.lanes.record, problem.counts.any(axis=(2, 3))
     return np.array(
         [
-            np.mean(np.asarray(collective_thrust(record.command[..., 3], record.battery_v, coeffs))[flown])
+            np.mean(
+                np.asarray(collective_thrust(record.command[..., 3], record.battery_v, coeffs))[
+                    flown
+                ]
+            )
             for coeffs in np.eye(len(THRUST_COEFFS))
         ]
     )
@@ -102,7 +108,10 @@ def mean_factor(problem: Problem, vector: np.ndarray, half_n: float) -> dict[str
 
 
 def half_responses_of(
-    linearization: Linearization, model: FittedModel, refined: Refined, vectors: Mapping[str, np.ndarray]
+    linearization: Linearization,
+    model: FittedModel,
+    refined: Refined,
+    vectors: Mapping[str, np.ndarray],
 ) -> dict[str, dict[str, HalfResponse]]:
     """Return the times to half response of models by name, by stick.
 
@@ -137,7 +146,9 @@ def channel_of(problem: Problem, less: np.ndarray, full: np.ndarray) -> str:
     return max(power, key=lambda name: power[name])
 
 
-def effect_causes(selection: vetoes.Selection, test: Problem, linearization: Linearization) -> list[Cause]:
+def effect_causes(
+    selection: vetoes.Selection, test: Problem, linearization: Linearization
+) -> list[Cause]:
     """Return the effects of a model as causes, those that explain most first.
 
     A force may as well be one of the laws of velocity or attitude where the log lacks these.
@@ -149,7 +160,9 @@ def effect_causes(selection: vetoes.Selection, test: Problem, linearization: Lin
         less = ablation.without.vector
         own = separation(linearization, model, one.effect)
         # Refitted where that was worth it, else to first order.
-        rivals = {name: min(ablation.rivals.get(name, size), size) for name, size in own.beside.items()}
+        rivals = {
+            name: min(ablation.rivals.get(name, size), size) for name, size in own.beside.items()
+        }
         closest = min(rivals, key=lambda name: rivals[name], default="")
         alike = equivalents(ablation, own)
         channel = channel_of(problem, less, model.vector)
@@ -157,7 +170,8 @@ def effect_causes(selection: vetoes.Selection, test: Problem, linearization: Lin
             alike += tuple(
                 name
                 for name in selection.state.unobservable
-                if vetoes.is_force_law(name) and not {"v", "q"}.isdisjoint(BY_NAME[name].search.needs)
+                if vetoes.is_force_law(name)
+                and not {"v", "q"}.isdisjoint(BY_NAME[name].search.needs)
             )
         causes.append(
             Cause(
@@ -173,7 +187,11 @@ def effect_causes(selection: vetoes.Selection, test: Problem, linearization: Lin
             )
         )
     # A scale of thrust that was found in place of a thrust curve may be a remainder, too.
-    kept = [cause for cause in causes if cause.effect != "thrust_scale" or not _is_remainder(cause, causes)]
+    kept = [
+        cause
+        for cause in causes
+        if cause.effect != "thrust_scale" or not _is_remainder(cause, causes)
+    ]
     return sorted(kept, key=lambda cause: -cause.chi2_gain)
 
 
@@ -185,7 +203,10 @@ def _is_remainder(cause: Cause, others: Sequence[Cause]) -> bool:
 
 
 def base_causes(
-    selection: vetoes.Selection, test: Problem, linearization: Linearization, effects: Sequence[Cause]
+    selection: vetoes.Selection,
+    test: Problem,
+    linearization: Linearization,
+    effects: Sequence[Cause],
 ) -> tuple[list[Cause], list[str]]:
     """Return base changes that the log shows, as causes, and names that held-out rows contradict.
 
@@ -214,7 +235,9 @@ def base_causes(
     return sorted(causes, key=lambda cause: -cause.chi2_gain), contradicted
 
 
-def vector_without(cause: Cause, selection: vetoes.Selection, linearization: Linearization) -> np.ndarray:
+def vector_without(
+    cause: Cause, selection: vetoes.Selection, linearization: Linearization
+) -> np.ndarray:
     """Return the extended model without one of its causes, the rest fitted again."""
     if cause.effect in selection.ablations:
         return selection.ablations[cause.effect].without.vector
@@ -236,7 +259,9 @@ def _refitted_to_first_order(
     return problem.clipped(less)
 
 
-def _as_thrust_scale(cause: Cause, change: BaseChange, problem: Problem, model: FittedModel) -> Cause:
+def _as_thrust_scale(
+    cause: Cause, change: BaseChange, problem: Problem, model: FittedModel
+) -> Cause:
     """Return the cause as a scale of thrust if it is a curve, and one factor explains all of its change."""
     if cause.effect != "thrust_curve":
         return cause
@@ -266,14 +291,18 @@ def not_identifiable(
             twins[cause.effect] = (*twins.get(cause.effect, ()), *cause.equivalent)
             twins |= {name: (*twins.get(name, ()), cause.effect) for name in cause.equivalent}
     wanted = {name: limit.confused_with for name, limit in limits.items()} | twins
-    flights = {name: TO_LOG + " and ".join(BY_NAME[name].search.needs) for name in state.unobservable}
+    flights = {
+        name: TO_LOG + " and ".join(BY_NAME[name].search.needs) for name in state.unobservable
+    }
     asked = {name: alike for name, alike in wanted.items() if name not in state.unobservable}
     flights |= advise(state.problem, model, linearization, asked)
     result = []
     for name, alike in wanted.items():
         # A twin of what was found has no size of its own.
         twin = NotIdentifiable(name, float("inf"), unit_of(name), (), "")
-        result.append(replace(limits.get(name, twin), confused_with=tuple(alike), fly=flights[name]))
+        result.append(
+            replace(limits.get(name, twin), confused_with=tuple(alike), fly=flights[name])
+        )
     return tuple(result)
 
 
@@ -290,12 +319,16 @@ def model_of(problem: Problem, model: FittedModel) -> ModelParameters:
     """Return a fitted model in float32, with the effects that it has and those the nominal one had."""
     found = as_float32(from_vector(model.vector, problem.like))
     kept = model.effects | set(problem.given_effects)
-    return found._replace(effects=tuple(one for one in found.effects if effect_of(one).name in kept))
+    return found._replace(
+        effects=tuple(one for one in found.effects if effect_of(one).name in kept)
+    )
 
 
 def _by_channel(values: np.ndarray, problem: Problem) -> dict[str, np.ndarray]:
     """Return values (NUM_AXES, 2) by channel that is judged; (axes of it,) each."""
-    return {name: values[place] for name, place in PLACES.items() if problem.counts[..., *place].any()}
+    return {
+        name: values[place] for name, place in PLACES.items() if problem.counts[..., *place].any()
+    }
 
 
 def sensor_noise(problem: Problem) -> dict[str, list[float]]:
@@ -303,14 +336,16 @@ def sensor_noise(problem: Problem) -> dict[str, list[float]]:
     noise = problem.fitted_noise
     found = np.stack([np.asarray(noise.direct), np.asarray(noise.level)], axis=-1)
     return {
-        name: [float(f"{value:.4g}") for value in own] for name, own in _by_channel(found, problem).items()
+        name: [float(f"{value:.4g}") for value in own]
+        for name, own in _by_channel(found, problem).items()
     }
 
 
 def _with_voltage_summed(left: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Return residuals with those of the battery summed up, less their mean in each lane.
 
-    A voltage changes by less in a step than its last digit, so that a single step tells nothing of it.
+    A voltage changes by less in a step than its last digit, so that a single step tells nothing of
+    it.
     """
     found = left.copy()
     is_counted = counts[..., -1, 1]
@@ -337,16 +372,19 @@ def _free_flight_floor(problem: Problem) -> dict[str, float]:
     }
 
 
-def errors_of(test: Problem, vectors: Mapping[str, np.ndarray], prediction: Prediction) -> dict[str, Errors]:
+def errors_of(
+    test: Problem, vectors: Mapping[str, np.ndarray], prediction: Prediction
+) -> dict[str, Errors]:
     """Return errors of models on held-out rows, by name, and what the sensors' noise alone would leave.
 
-    One-step errors are relative to those of a model that does not move, whose residuals are the measured
-    changes themselves, less their mean.
+    One-step errors are relative to those of a model that does not move, whose residuals are the
+    measured changes themselves, less their mean.
     """
     still = test.start.copy()
     still[test.index(STILL)] = 0.0
     left = [
-        _with_voltage_summed(one, test.counts) for one in test.residuals(np.stack([still, *vectors.values()]))
+        _with_voltage_summed(one, test.counts)
+        for one in test.residuals(np.stack([still, *vectors.values()]))
     ]
     scales = _by_channel(_rms(left[0], test.counts, is_centred=True), test)
 
@@ -379,11 +417,13 @@ def _is_beyond(problem: Problem, vector: np.ndarray, field: str) -> str:
     return f"{field.split('.')[-1]} at {'most' if is_low else 'least'} {size}"
 
 
-def causes_at_end(selection: vetoes.Selection, refined: Refined, test: Problem) -> tuple[Cause, ...]:
+def causes_at_end(
+    selection: vetoes.Selection, refined: Refined, test: Problem
+) -> tuple[Cause, ...]:
     """Return effects with a value at the end of what is searched, as causes that say which way it would go.
 
-    Left out are values that the log does not determine, which end anywhere, and delays that end at how many
-    rows are remembered: their law holds.
+    Left out are values that the log does not determine, which end anywhere, and delays that end at
+    how many rows are remembered: their law holds.
     """
     problem, model = selection.state.problem, selection.model
     searched, vector = problem, model.vector
@@ -399,7 +439,9 @@ def causes_at_end(selection: vetoes.Selection, refined: Refined, test: Problem) 
         marginal = Marginal(selection.state.linearized(model.vector)[1], model, one.fields)
         widths = dict(zip(one.fields, marginal.half_widths(), strict=True))
         where = [
-            _is_beyond(searched, vector, field) for field in fields if widths[field] < LOOSE * ranges[field]
+            _is_beyond(searched, vector, field)
+            for field in fields
+            if widths[field] < LOOSE * ranges[field]
         ]
         if where:
             stuck[one.effect] = ", ".join(where)
@@ -411,7 +453,9 @@ def causes_at_end(selection: vetoes.Selection, refined: Refined, test: Problem) 
     return tuple(replace(one, beyond=stuck[one.effect]) for one in refused)
 
 
-def with_refined_values(causes: Sequence[Cause], refined: Refined, vector: np.ndarray) -> tuple[Cause, ...]:
+def with_refined_values(
+    causes: Sequence[Cause], refined: Refined, vector: np.ndarray
+) -> tuple[Cause, ...]:
     """Return causes with the values and intervals of a refinement, and which of them are at a bound."""
     problem, fit = refined.problem, refined.fit
     half = {} if fit is None else dict(zip(fit.places, fit.half_widths, strict=True))
@@ -425,7 +469,9 @@ def with_refined_values(causes: Sequence[Cause], refined: Refined, vector: np.nd
             if half.get(place) == 0.0 and len(values) > 1:
                 del values[name]  # no flight depends on it
             elif place in half:
-                value, low, high = (float(one[place]) for one in (vector, problem.low, problem.high))
+                value, low, high = (
+                    float(one[place]) for one in (vector, problem.low, problem.high)
+                )
                 values[name] = Estimated.around(value, half[place], range_of(field).unit, low, high)
         fields = [field for field in fields if field.split(".")[-1] in values]
         if "mean_factor" in values and fit is not None:
@@ -470,12 +516,20 @@ def changed_parameters(
     if fit is not None:
         widths = dict(zip(fit.places, fit.half_widths, strict=True))
     else:
-        acting = [place for place in places if linearization.acting([linearization.places.index(place)])]
-        halves = Marginal(linearization, extended, [problem.names[place] for place in acting]).half_widths()
+        acting = [
+            place for place in places if linearization.acting([linearization.places.index(place)])
+        ]
+        halves = Marginal(
+            linearization, extended, [problem.names[place] for place in acting]
+        ).half_widths()
         widths = dict(zip(acting, halves, strict=True))
     result = []
     for place in places:
-        name, value, half = problem.names[place], float(vector[place]), float(widths.get(place, np.inf))
+        name, value, half = (
+            problem.names[place],
+            float(vector[place]),
+            float(widths.get(place, np.inf)),
+        )
         bound = bool(at_bounds(problem, vector, [name]))
         ends, unit = (value - half, value + half), range_of(name).unit
         result.append(Changed(name, float(problem.start[place]), value, ends, unit, bound))
@@ -488,7 +542,10 @@ def refinement_notes(refined: Refined, model: FittedModel) -> list[str]:
     if judge is None:
         return []
     notes = []
-    removed = [*refined.removed, *(one.effect for one in refined.kept if one not in model.candidates)]
+    removed = [
+        *refined.removed,
+        *(one.effect for one in refined.kept if one not in model.candidates),
+    ]
     if removed:
         names = ", ".join(removed)
         notes.append(
@@ -496,7 +553,9 @@ def refinement_notes(refined: Refined, model: FittedModel) -> list[str]:
             "predicted no better with them, or worse at some horizon"
         )
         if refined.fit is None:
-            notes.append("no effect predicts held-out flights better: the extended model is the refitted one")
+            notes.append(
+                "no effect predicts held-out flights better: the extended model is the refitted one"
+            )
     silent = [
         f"{HORIZONS_S[index]:g} s"
         for index in range(len(HORIZONS_S))
@@ -510,7 +569,9 @@ def refinement_notes(refined: Refined, model: FittedModel) -> list[str]:
     return notes
 
 
-def warnings_of(problem: Problem, causes: Sequence[Cause], contradicted: Sequence[str]) -> list[str]:
+def warnings_of(
+    problem: Problem, causes: Sequence[Cause], contradicted: Sequence[str]
+) -> list[str]:
     """Return what a reader must know before trusting causes or the extended model.
 
     contradicted: names that were rejected because held-out rows contradict them.
@@ -569,7 +630,9 @@ def _at_bound(cause: Cause) -> str:
     why = "its law may stand in for something else"
     if cause.effect in BY_NAME:
         why += ", and is not in the extended model"
-    if cause.effect in BY_NAME and any(name in cause.beyond for name in BY_NAME[cause.effect].max_steps):
+    if cause.effect in BY_NAME and any(
+        name in cause.beyond for name in BY_NAME[cause.effect].max_steps
+    ):
         why = "only so many rows of the log are remembered; import it with fewer rows per second"
     return f"{cause.effect} is beyond the list: {cause.beyond}, the end of what is searched; {why}"
 
@@ -579,7 +642,9 @@ def _voltage_unknown(problem: Problem, causes: Sequence[Cause]) -> list[str]:
     thrust = [cause.effect for cause in causes if cause.effect in ("thrust_curve", "thrust_scale")]
     if not thrust or voltages_of(problem.lanes) is not None:
         return []
-    assumed = f"no voltage was logged and {problem.lanes.record.battery_v.flat[0]:.4g} V were assumed"
+    assumed = (
+        f"no voltage was logged and {problem.lanes.record.battery_v.flat[0]:.4g} V were assumed"
+    )
     return [f"{assumed}: {thrust[0]} may only be the error of that"]
 
 

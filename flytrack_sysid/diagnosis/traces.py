@@ -10,8 +10,8 @@ channel       residual of a row, measured minus modelled                        
 ``battery``   voltage, summed up since the flight began                              V
 ============  =====================================================================  =======
 
-``attitude`` and ``velocity`` measure the same as ``rates`` and ``force``, without gyro and accelerometer:
-what shows in only one of a pair is wrong with a sensor.
+``attitude`` and ``velocity`` measure the same as ``rates`` and ``force``, without gyro and
+accelerometer: what shows in only one of a pair is wrong with a sensor.
 """
 
 from collections.abc import Mapping
@@ -41,15 +41,14 @@ BETWEEN_FLIGHTS = 1000  # slots: no lag of a correlation reaches from one flight
 class Traces(NamedTuple):
     """Residuals of models and regressors, a value per row of the log.
 
-    residuals: model -> channel -> (num_rows, 3), battery (num_rows, 1); units of the module's table;
-    anything where nothing counts. counts: channel -> (num_rows,) bool, what a fit is made of; all False
-    of a channel that the log lacks.
-    regressors: (num_rows,) each, in the units of ``REGRESSORS``.
-    elapsed_s: (num_rows,) s, flights one after the other.
-    slot: (num_rows,) int, place of a row among evenly spaced ones; a lost row leaves its slot empty, and
-    flights are far apart. step_s: between slots.
-    attitude: body to world, of the row before: the frame of force and velocity.
-    row: (num_rows,) int, of the log that was given; ends of flights whose poses came late are left out.
+    residuals: model -> channel -> (num_rows, 3), battery (num_rows, 1); units of the module's
+    table; anything where nothing counts. counts: channel -> (num_rows,) bool, what a fit is made
+    of; all False of a channel that the log lacks. regressors: (num_rows,) each, in the units of
+    ``REGRESSORS``. elapsed_s: (num_rows,) s, flights one after the other. slot: (num_rows,) int,
+    place of a row among evenly spaced ones; a lost row leaves its slot empty, and flights are far
+    apart. step_s: between slots. attitude: body to world, of the row before: the frame of force and
+    velocity. row: (num_rows,) int, of the log that was given; ends of flights whose poses came late
+    are left out.
     """
 
     residuals: Mapping[str, Mapping[str, np.ndarray]]
@@ -71,8 +70,8 @@ class Traces(NamedTuple):
     def column(self, model: str, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return one component of a residual and where it counts, both (num_rows,).
 
-        name: ``rates_x``, ``force_world_z``, ``force_along`` (the direction of flight through the air),
-        ``battery``, ...; what is ``used`` for it.
+        name: ``rates_x``, ``force_world_z``, ``force_along`` (the direction of flight through the
+        air), ``battery``, ...; what is ``used`` for it.
         """
         channel, *rest = self.used(name).split("_")
         values = self.residuals[model][channel]
@@ -131,8 +130,8 @@ def _lagged(record: Record, tau: np.ndarray) -> Action:
 class _Rows(NamedTuple):
     """Where the log's rows are in lanes, and what was fed in there.
 
-    place: of the record's rows; kept: of these, the log's rows. record: in that order. before: attitude in
-    the row before each of the log's.
+    place: of the record's rows; kept: of these, the log's rows. record: in that order. before:
+    attitude in the row before each of the log's.
     """
 
     place: tuple[np.ndarray, np.ndarray]
@@ -146,7 +145,9 @@ class _Rows(NamedTuple):
 
 
 def _rows_of(lanes: Lanes) -> _Rows:
-    row = np.where((np.arange(len(lanes.row)) >= lead_in_of(len(lanes.row)))[:, None], lanes.row, -1)
+    row = np.where(
+        (np.arange(len(lanes.row)) >= lead_in_of(len(lanes.row)))[:, None], lanes.row, -1
+    )
     lane, place = np.nonzero(row.T >= 0)  # lane after lane is the record's order
     record = Record(*(leaf[place, lane] for leaf in lanes.record))
     record = record._replace(begins=~lanes.is_joined[place, lane])
@@ -169,7 +170,9 @@ def _residuals(left: np.ndarray, rows: _Rows) -> dict[str, np.ndarray]:
             values = summed - summed[started]
         elif name in _PER_STEP:
             values = values / step_s
-        found[name] = values[rows.kept] if name == "battery" else rows.before.inv().apply(values[rows.kept])
+        found[name] = (
+            values[rows.kept] if name == "battery" else rows.before.inv().apply(values[rows.kept])
+        )
     return found
 
 
@@ -184,7 +187,9 @@ def _counts(lanes: Lanes, rows: _Rows) -> dict[str, np.ndarray]:
     }
 
 
-def _regressors(model: ModelParameters, record: Record, applied: np.ndarray) -> dict[str, np.ndarray]:
+def _regressors(
+    model: ModelParameters, record: Record, applied: np.ndarray
+) -> dict[str, np.ndarray]:
     """Return the regressors in the record's order; applied: (num_rows, 4)."""
     attitude = Rotation.from_quat(record.quat, scalar_first=True)
     wind = model.effect("wind")
@@ -205,7 +210,8 @@ def _regressors(model: ModelParameters, record: Record, applied: np.ndarray) -> 
     for index, axis in enumerate(_AXES):
         found[f"airspeed_{axis}"] = airspeed[:, index]
         found[f"spin_up_{axis}"] = change[:, index] * full_rates[index]
-    # Values of a row are those of the step to it, from the row before; the lag acts first in a step.
+    # Values of a row are those of the step to it, from the row before; the lag acts first in a
+    # step.
     found = {name: np.roll(values, 1) for name, values in found.items()}
     return found | {f"applied_{stick}": applied[:, index] for index, stick in enumerate(STICKS)}
 
@@ -227,16 +233,18 @@ def _predicted(
     turning = squares.sum(axis=1, keepdims=True) - squares
     parts = {"model_rates": rates, "model_force": force, "turning": turning}
     return {
-        f"{name}_{axis}": part[:, index] for name, part in parts.items() for index, axis in enumerate(_AXES)
+        f"{name}_{axis}": part[:, index]
+        for name, part in parts.items()
+        for index, axis in enumerate(_AXES)
     }
 
 
 def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> Traces:
     """Return the residuals of models on the rows of a log at which they know the pose, each by its latency.
 
-    like: name of the model whose lags, rates and wind make the regressors; a delay of commands does not
-    enter. Regressors of a row are those of the step to it: what was flown and commanded in the row before,
-    the action after its lag.
+    like: name of the model whose lags, rates and wind make the regressors; a delay of commands does
+    not enter. Regressors of a row are those of the step to it: what was flown and commanded in the
+    row before, the action after its lag.
 
     Raises:
         KeyError: ``like`` is not one of the models.
@@ -267,4 +275,6 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
     slot = np.arange(len(rows.record.begins)) + BETWEEN_FLIGHTS * np.cumsum(rows.record.begins)
     elapsed_s, counts = step_s * rows.kept, _counts(lanes, rows)
     row = np.flatnonzero(is_known)
-    return Traces(residuals, counts, regressors, elapsed_s, slot[rows.kept], step_s, rows.before, row)
+    return Traces(
+        residuals, counts, regressors, elapsed_s, slot[rows.kept], step_s, rows.before, row
+    )

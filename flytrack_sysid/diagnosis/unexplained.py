@@ -21,13 +21,18 @@ RIDGE = 1e-6  # of each column's own: features are nearly dependent where little
 CHANCE = 1e-6  # of a flag where nothing is left, for each dependence
 MATERIAL = 0.08  # of the sensor's noise, rms: less is left alone
 OF_NAMED = 0.15  # of what the named causes do, rms: laws of the list are not exact
-OF_WANDERING = 0.45  # of the wandering disturbance, rms: a dependence that explains less is a coincidence
+# of the wandering disturbance, rms: a dependence that explains less is a coincidence
+OF_WANDERING = 0.45
 MOST_DEPENDENCES = 3
 PERIODIC_HZ = (0.3, 25.0)
 LINE = 28.0  # power of a line over that of its neighbourhood: e^-28 by chance
 NEIGHBOURS = 40  # frequencies on each side
-STOCHASTIC_GAIN, STOCHASTIC_SHARE = 50.0, 0.15  # of minus twice the log likelihood; of the sensor's noise
-DRIFT_SHARE = 0.1  # of a base change beside a steady force: it keeps less beside one that drifts, too
+STOCHASTIC_GAIN, STOCHASTIC_SHARE = (
+    50.0,
+    0.15,
+)  # of minus twice the log likelihood; of the sensor's noise
+# of a base change beside a steady force: it keeps less beside one that drifts, too
+DRIFT_SHARE = 0.1
 FELT = 0.3  # coupling from which a disturbance moves the drone and not only the sensor
 TIME_WAVES, RANK_WAVES, CHANGE_WAVES, HEADING_WAVES, PLACE_WAVES = 8, 6, 4, 4, 2
 TINY_SPEED = 0.3  # m/s: slower flight has no direction
@@ -39,8 +44,8 @@ BUMP_SIZE = 3  # features of one bump: a force along each world axis
 class Flown(NamedTuple):
     """The flight at the step to each row, (rows, lanes, ...): what a force or rate of the step may depend on.
 
-    body_to_world: (rows, lanes, 3, 3). applied: action, and change: its derivative, 1/s; (rows, lanes, 4).
-    is_counted: bool, rows that are judged.
+    body_to_world: (rows, lanes, 3, 3). applied: action, and change: its derivative, 1/s; (rows,
+    lanes, 4). is_counted: bool, rows that are judged.
     """
 
     body_to_world: np.ndarray
@@ -61,13 +66,21 @@ def flight_of(problem: Problem, model: FittedModel) -> Flown:
 
     record = lanes.record
     quat = before(record.quat).reshape(-1, 4)
-    rotation = Rotation.from_quat(quat, scalar_first=True).as_matrix().reshape(*lanes.row.shape, 3, 3)
+    rotation = (
+        Rotation.from_quat(quat, scalar_first=True).as_matrix().reshape(*lanes.row.shape, 3, 3)
+    )
     applied = _lagged(record.command, record.step_s, tau)
     change = (record.command - applied) / tau
     time_s = np.where(lanes.row >= 0, lanes.row, 0) * float(np.median(noises.step_to(lanes)))
     is_counted = np.asarray(lanes.counts.any(axis=(2, 3)))
     return Flown(
-        rotation, before(record.pos_w), before(record.vel_w), applied, before(change), time_s, is_counted
+        rotation,
+        before(record.pos_w),
+        before(record.vel_w),
+        applied,
+        before(change),
+        time_s,
+        is_counted,
     )
 
 
@@ -89,7 +102,9 @@ def _rank_waves(values: np.ndarray, is_counted: np.ndarray, number: int) -> np.n
 
 def _place_waves(flight: Flown) -> np.ndarray:
     """Return products of cosines of the ranks of x, y and z, (number, rows, lanes)."""
-    axes = [_rank_waves(flight.pos_w[..., axis], flight.is_counted, PLACE_WAVES) for axis in range(3)]
+    axes = [
+        _rank_waves(flight.pos_w[..., axis], flight.is_counted, PLACE_WAVES) for axis in range(3)
+    ]
     axes = [np.concatenate([np.ones_like(waves[:1]), waves]) for waves in axes]
     orders = np.argwhere(np.indices((PLACE_WAVES + 1,) * 3).sum(axis=0) <= PLACE_WAVES)
     return np.stack([axes[0][i] * axes[1][j] * axes[2][k] for i, j, k in orders if i + j + k > 0])
@@ -139,7 +154,9 @@ def dependences(flight: Flown) -> Mapping[str, Mapping[str, np.ndarray]]:
     place = _place_waves(flight)
     moves = ((flight.applied, RANK_WAVES), (flight.change, CHANGE_WAVES))
     sticks = [
-        np.concatenate([_rank_waves(values[..., stick], counted, number) for values, number in moves])
+        np.concatenate(
+            [_rank_waves(values[..., stick], counted, number) for values, number in moves]
+        )
         for stick in range(ACTION_SIZE)
     ]
     rate = {
@@ -148,7 +165,9 @@ def dependences(flight: Flown) -> Mapping[str, Mapping[str, np.ndarray]]:
         "heading": _along(turns, body),
         "airspeed": _along(fast, body),
         "attitude": _along(tilt, body),
-        "command": np.concatenate([_along(sticks[axis], body[axis : axis + 1]) for axis in range(3)]),
+        "command": np.concatenate(
+            [_along(sticks[axis], body[axis : axis + 1]) for axis in range(3)]
+        ),
     }
     force = rate | {
         "position": _along(place, world),
@@ -239,7 +258,9 @@ class SideTest(NamedTuple):
         """Return the test on some blocks, (blocks,) bool."""
         return self._replace(rest=self.rest[is_kept], given=self.given[is_kept])
 
-    def projected(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def projected(
+        self, columns: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return shares of given columns in others, information and score with those projected out.
 
         Last, the step along the given columns alone.
@@ -257,8 +278,9 @@ class SideTest(NamedTuple):
     def fit(self, columns: np.ndarray, least_own: float = 0.0) -> SideFit:
         """Return features fitted besides what is given.
 
-        least_own: columns with less information of their own, beyond what is given, stay 0. Where a feature
-        nearly is what is given, it only moves the model's forces to another instant of the step.
+        least_own: columns with less information of their own, beyond what is given, stay 0. Where a
+        feature nearly is what is given, it only moves the model's forces to another instant of the
+        step.
         """
         share, own, score, alone = self.projected(columns)
         total = np.einsum("bfn,bfn->f", columns, columns, optimize=True)
@@ -268,11 +290,23 @@ class SideTest(NamedTuple):
         own += np.eye(len(own))  # a weak prior: features of size 1
         step = solve(own, score)
         given = alone - share @ step
-        after = self.rest - np.einsum("bfn,f->bn", columns, step) - np.einsum("bgn,g->bn", self.given, given)
-        blocks = np.einsum("bfn,bn->bf", columns, after) - np.einsum("bgn,bn->bg", self.given, after) @ share
+        after = (
+            self.rest
+            - np.einsum("bfn,f->bn", columns, step)
+            - np.einsum("bgn,g->bn", self.given, given)
+        )
+        blocks = (
+            np.einsum("bfn,bn->bf", columns, after)
+            - np.einsum("bgn,bn->bg", self.given, after) @ share
+        )
         inflation = inflation_of(own, blocks) if is_own.any() else 1.0
-        fit = SideFit(np.zeros(len(is_own)), np.zeros(len(is_own)), given, float(score @ step), inflation)
-        fit.step[is_own], fit.errors[is_own] = step, np.sqrt(np.diag(np.linalg.pinv(own)) * inflation)
+        fit = SideFit(
+            np.zeros(len(is_own)), np.zeros(len(is_own)), given, float(score @ step), inflation
+        )
+        fit.step[is_own], fit.errors[is_own] = (
+            step,
+            np.sqrt(np.diag(np.linalg.pinv(own)) * inflation),
+        )
         return fit
 
     def noncentrality(self, columns: np.ndarray, size: np.ndarray) -> float:
@@ -359,14 +393,18 @@ def find_dependences(
 def is_like_drift(problem: Problem, model: FittedModel, fields: Sequence[str]) -> bool:
     """Return whether a drift of the force would take up 90 % of a base change that no steady force does.
 
-    Within one flight the voltage falls with the time, so that a thrust curve takes up motors that warm up.
+    Within one flight the voltage falls with the time, so that a thrust curve takes up motors that
+    warm up.
     """
     axes, flight = SIDES["force"], flight_of(problem, model)
     left, slopes = linearized_residuals(problem, model)
     places = problem.index(fields)
     own = [model.places.index(place) for place in places]
     test = SideTest.of("force", left, np.delete(slopes, own, axis=0))
-    columns, size = blocks_of(slopes[own][..., axes, :] * test.root), (model.vector - problem.start)[places]
+    columns, size = (
+        blocks_of(slopes[own][..., axes, :] * test.root),
+        (model.vector - problem.start)[places],
+    )
 
     def beside(*features_w: np.ndarray) -> float:
         given = [blocks_of(whitened(problem, one, "force") * test.root) for one in features_w]
@@ -374,7 +412,10 @@ def is_like_drift(problem: Problem, model: FittedModel, fields: Sequence[str]) -
 
     steady = constants(flight, "force")
     alone = beside(steady)
-    return alone >= threshold(len(fields)) and beside(steady, time_features(flight)) < DRIFT_SHARE * alone
+    return (
+        alone >= threshold(len(fields))
+        and beside(steady, time_features(flight)) < DRIFT_SHARE * alone
+    )
 
 
 def _greedy(
@@ -433,7 +474,9 @@ def find_lines(problem: Problem, model: FittedModel) -> list[Line]:
         counts = np.asarray(problem.counts[..., axes, 0].all(axis=-1))
         if not counts.any():
             continue
-        body = np.einsum("rlji,rlj->rli", flight.body_to_world, left[..., axes, 0]) * counts[..., None]
+        body = (
+            np.einsum("rlji,rlj->rli", flight.body_to_world, left[..., axes, 0]) * counts[..., None]
+        )
         series = np.swapaxes(body[lead_in_of(len(body)) :], 0, 1).reshape(-1, 3)
         step_s = float(np.median(noises.step_to(problem.lanes)))
         power = (np.abs(np.fft.rfft(series, axis=0)) ** 2).max(axis=1)

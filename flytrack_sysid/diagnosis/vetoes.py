@@ -1,7 +1,8 @@
 """Vetoes: rules that reject an effect or a base change although it gains enough where it was fitted.
 
-``VETOES`` is the one list of rules on a selected model; each returns the effects that it rejects. A rejected
-effect is not searched for again, the model is selected again without it, and the rules start over.
+``VETOES`` is the one list of rules on a selected model; each returns the effects that it rejects. A
+rejected effect is not searched for again, the model is selected again without it, and the rules
+start over.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,36 +21,38 @@ from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.record import Record
 
-# Held-out rows contradict a cause where it gains so many standard deviations less than it would if it were
-# there, and less than that share of its size is there: laws are not exact where they are flown harder.
+# Held-out rows contradict a cause where it gains so many standard deviations less than it would if
+# it were there, and less than that share of its size is there: laws are not exact where they are
+# flown harder.
 HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.35
 HELD_OUT_SHOWN = 20.0  # of chi2: held-out rows that would show less contradict nothing
 LOSS_SIGMAS = 2.5  # instead, where held-out rows are likelier without the cause
-# Commands are at rest if they changed by no more than this share of the largest stick for this long.
+# Commands are at rest if they changed by no more than this share of the largest stick for this
+# long.
 REST_S, REST_SHARE = 0.1, 0.05
-# A choice among many effects finds what fits the noise of one log: an effect that gains less than so many
-# thresholds has to gain on held-out rows, too, if they would show that much chi2 of it.
+# A choice among many effects finds what fits the noise of one log: an effect that gains less than
+# so many thresholds has to gain on held-out rows, too, if they would show that much chi2 of it.
 BARELY, BARELY_SHOWN = 2.0, 1.0
-# No law of a force is exact to 5 % of the force, 1/400 of what it explains: an effect with less than that
-# beside another one is the remainder of the other's law.
+# No law of a force is exact to 5 % of the force, 1/400 of what it explains: an effect with less
+# than that beside another one is the remainder of the other's law.
 FORCE_REMAINDER = 0.0025
-# The same for a base change beside an effect that shows in the same channels: lags and thrust curves absorb
-# remainders more easily than a law does, so that the share is larger.
+# The same for a base change beside an effect that shows in the same channels: lags and thrust
+# curves absorb remainders more easily than a law does, so that the share is larger.
 BASE_REMAINDER = 0.01
-# A name on a side that something unknown disturbs needs so many thresholds; one that keeps less than that
-# share of its noncentrality beside what the unknown depends on stood in for it.
-# Base changes, which absorb remainders easily, need more.
+# A name on a side that something unknown disturbs needs so many thresholds; one that keeps less
+# than that share of its noncentrality beside what the unknown depends on stood in for it. Base
+# changes, which absorb remainders easily, need more.
 DISTURBED, DISTURBED_BASE, KEPT_SHARE = 3.0, 10.0, 0.1
-# What stands in for something unknown takes up a part of it: a name that explains so many times what the
-# dependences do is no stand-in, and they are the remainder of its law.
+# What stands in for something unknown takes up a part of it: a name that explains so many times
+# what the dependences do is no stand-in, and they are the remainder of its law.
 OUTWEIGHS = 30.0
 
 
 class Selection(NamedTuple):
     """A selected model, what it leaves unexplained, and the state of the search that led to it.
 
-    base: the refitted model without effects. ablations: of each effect of the model. stand_ins: effects and
-    causes in the base that stand in for something unknown.
+    base: the refitted model without effects. ablations: of each effect of the model. stand_ins:
+    effects and causes in the base that stand in for something unknown.
     """
 
     state: SearchState
@@ -118,7 +121,9 @@ def examined(selection: Selection) -> Selection:
     for name, change in model_selection.base_changes(state, linearization, model).items():
         robust = change.gain / change.marginal.inflation
         suspects.append(Suspect(name, tuple(change.fields), robust, len(change.fields)))
-    return selection._replace(state=state, stand_ins=find_stand_ins(selection, suspects, dependences))
+    return selection._replace(
+        state=state, stand_ins=find_stand_ins(selection, suspects, dependences)
+    )
 
 
 class Suspect(NamedTuple):
@@ -135,9 +140,9 @@ def find_stand_ins(
 ) -> tuple[str, ...]:
     """Return names that stand in for something that no list has.
 
-    Their gain is gone beside smooth functions of what the rest depends on (with the constants of those,
-    which a wind, say, would be), or is small where something unknown disturbs the same side; unless it
-    outweighs what the dependences explain.
+    Their gain is gone beside smooth functions of what the rest depends on (with the constants of
+    those, which a wind, say, would be), or is small where something unknown disturbs the same side;
+    unless it outweighs what the dependences explain.
     """
     problem, model = selection.state.problem, selection.model
     left, slopes = unknown.linearized_residuals(problem, model)
@@ -169,8 +174,12 @@ def find_stand_ins(
             continue  # it acts on neither side: the battery
         own_side = max(by_side, key=lambda side: by_side[side][0])
         least = threshold(one.num_parameters)
-        rest_gain = sum(dependence.gain for dependence in dependences if dependence.side == own_side)
-        is_gone = after < least or (after < KEPT_SHARE * before and one.robust < OUTWEIGHS * rest_gain)
+        rest_gain = sum(
+            dependence.gain for dependence in dependences if dependence.side == own_side
+        )
+        is_gone = after < least or (
+            after < KEPT_SHARE * before and one.robust < OUTWEIGHS * rest_gain
+        )
         needed = least * (DISTURBED_BASE if one.name in BASE_CAUSES else DISTURBED)
         if is_gone or (own_side in disturbed and one.robust < needed):
             result.append(one.name)
@@ -225,9 +234,10 @@ def rests(record: Record) -> np.ndarray:
 def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
     """Reject laws of the sticks that do not hold while those rest, each or all together.
 
-    What is there in transients only is dynamics that no list has: feedforward, say, turns faster than asked
-    for on the way to full stick, as a scale and a saturation would, and not while the stick stays there.
-    Where turns are left unexplained, laws that this log never shows at rest are rejected, too.
+    What is there in transients only is dynamics that no list has: feedforward, say, turns faster
+    than asked for on the way to full stick, as a scale and a saturation would, and not while the
+    stick stays there. Where turns are left unexplained, laws that this log never shows at rest are
+    rejected, too.
     """
     state, model = selection.state, selection.model
     laws = [name for name in selection.ablations if BY_NAME[name].search.follows_sticks]
@@ -264,8 +274,12 @@ def is_force_law(effect: str) -> bool:
 
 def remainder_of_force_law(selection: Selection, test: Problem) -> list[str]:
     """Reject laws of a force that explain next to nothing beside another one."""
-    gains = {effect: one.gain for effect, one in selection.ablations.items() if is_force_law(effect)}
-    return [effect for effect, gain in gains.items() if gain < FORCE_REMAINDER * max(gains.values())]
+    gains = {
+        effect: one.gain for effect, one in selection.ablations.items() if is_force_law(effect)
+    }
+    return [
+        effect for effect, gain in gains.items() if gain < FORCE_REMAINDER * max(gains.values())
+    ]
 
 
 def seen_once(selection: Selection, test: Problem) -> list[str]:

@@ -11,7 +11,12 @@ from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.file_kinds import UNKNOWN, ZSTD, check_kind
 from flytrack_sysid.importing.flight import ImportedFlight
 from flytrack_sysid.importing.mapping import Mapping
-from flytrack_sysid.importing.table_flight import LONGEST_LIST, RECORDED, TIMESTAMP, flight_of_topics
+from flytrack_sysid.importing.table_flight import (
+    LONGEST_LIST,
+    RECORDED,
+    TIMESTAMP,
+    flight_of_topics,
+)
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import Table
 
@@ -21,8 +26,8 @@ LARGEST_BYTES = 2**30
 def read_bag(path: Path, mapping: Mapping) -> ImportedFlight:
     """Return the flight in a bag, by a mapping of its topics' fields; SI units and our frames.
 
-    Messages are at the times in their headers, else at those of their recording. Raises LogError for what is
-    no bag, or lacks a topic or a field that the mapping names.
+    Messages are at the times in their headers, else at those of their recording. Raises LogError
+    for what is no bag, or lacks a topic or a field that the mapping names.
     """
     wanted: dict[str, list[str]] = {}
     for channel in mapping.channels:
@@ -30,16 +35,22 @@ def read_bag(path: Path, mapping: Mapping) -> ImportedFlight:
             topic, colon, field = column.rpartition(":")
             if not colon or not topic or not field:
                 expected = "expected topic:field, as in /imu:angular_velocity.x"
-                raise LogError(f"{mapping.source}: {channel.table}: found {quote_name(column)}, {expected}")
+                raise LogError(
+                    f"{mapping.source}: {channel.table}: found {quote_name(column)}, {expected}"
+                )
             wanted.setdefault(topic, []).append(field)
     if not path.exists():
         raise LogError(f"{path}: cannot be read: no such file or folder")
-    if not (path.is_file() or path.is_dir()) or (path.is_file() and path.stat().st_size > LARGEST_BYTES):
+    if not (path.is_file() or path.is_dir()) or (
+        path.is_file() and path.stat().st_size > LARGEST_BYTES
+    ):
         raise LogError(
             f"{path}: cannot be read: expected a folder, or a file of at most {LARGEST_BYTES} bytes"
         )
     if path.is_file():
-        check_kind(path, "bag", "an MCAP file, a ROS 1 bag or the folder of a ROS 2 bag", (UNKNOWN, ZSTD))
+        check_kind(
+            path, "bag", "an MCAP file, a ROS 1 bag or the folder of a ROS 2 bag", (UNKNOWN, ZSTD)
+        )
     notes, arrays = decode(str(path), "bag", path, wanted)
     for topic, field, kind in notes["missing"]:
         where = f"{path}: topic {quote_name(topic)}: field {quote_name(field)}"

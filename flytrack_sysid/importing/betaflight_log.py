@@ -1,8 +1,8 @@
 """Betaflight blackbox logs (``.bbl``, ``.bfl``), decoded by orangebox.
 
-Betaflight's body frame is ours: x forward, y left, z up; so is its accelerometer's sign (+1 g at rest), and
-positive yaw is to the left. docs/real_logs.md says how that was checked on a real log. Attitude is
-there since Betaflight 2025.12; there is no velocity.
+Betaflight's body frame is ours: x forward, y left, z up; so is its accelerometer's sign (+1 g at
+rest), and positive yaw is to the left. docs/real_logs.md says how that was checked on a real log.
+Attitude is there since Betaflight 2025.12; there is no velocity.
 """
 
 import json
@@ -15,7 +15,12 @@ from flytrack_env.effects import effect_of
 from flytrack_env.messages import quote_name, quote_value
 from flytrack_sysid.importing.betaflight_settings import RATES_TYPES, full_stick_rate, stick_curve
 from flytrack_sysid.importing.decoding import decode
-from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, read_log_file, saturation
+from flytrack_sysid.importing.flight import (
+    ImportedFlight,
+    not_a_quadcopter,
+    read_log_file,
+    saturation,
+)
 from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.units import GRAVITY, PER_DEGREE, UNITS
 from flytrack_sysid.log import LogError
@@ -30,7 +35,8 @@ STICKS = tuple(f"setpoint[{axis}]" for axis in range(4))
 GYRO = tuple(f"gyroADC[{axis}]" for axis in range(3))
 ACCELEROMETER = tuple(f"accSmooth[{axis}]" for axis in range(3))
 ATTITUDE = tuple(f"imuQuaternion[{axis}]" for axis in range(3))
-UNIT_QUATERNION = 32767.0  # of x, y, z of a quaternion whose w is at least 0 (Betaflight's blackbox.c)
+# of x, y, z of a quaternion whose w is at least 0 (Betaflight's blackbox.c)
+UNIT_QUATERNION = 32767.0
 BATTERY = "vbatLatest"
 FULL_THROTTLE = 1000.0  # setpoint[3] at full throttle; 0 at none
 FINE = 10.0  # units in one deg/s where blackbox_high_resolution is set
@@ -38,9 +44,11 @@ MICROSECOND = UNITS["time"]["us"]
 LARGEST_SETTING = 1e9
 LONGEST_LIST = 1000  # characters of names of fields in a message
 PERCENT = 100.0
-LARGEST_OVERSHOOT = 0.05  # past full stick: smoothing by a Butterworth filter overshoots a step by 4.3 %
+# past full stick: smoothing by a Butterworth filter overshoots a step by 4.3 %
+LARGEST_OVERSHOOT = 0.05
 NUM_MOTORS = 4
-# Settings that stand between throttle, voltage and thrust: name, what is neutral, what the setting does.
+# Settings that stand between throttle, voltage and thrust: name, what is neutral, what the setting
+# does.
 THRUST_SETTINGS = (
     ("vbat_sag_compensation", (0,), "motors get more at a low voltage"),
     ("thrust_linear", (0,), "motors get less at low throttle"),
@@ -51,8 +59,9 @@ THRUST_SETTINGS = (
 def read_betaflight(path: Path, mapping: Mapping) -> list[ImportedFlight]:
     """Return the flights in a blackbox file, one per log in it: commands, rates, specific force, voltage.
 
-    docs/real_logs.md says what the channels are. A log that cannot be used is left out, and a note says why.
-    Raises LogError for what is no blackbox file of Betaflight 4, or has no log that can be used.
+    docs/real_logs.md says what the channels are. A log that cannot be used is left out, and a note
+    says why. Raises LogError for what is no blackbox file of Betaflight 4, or has no log that can
+    be used.
     """
     content = read_log_file(path, LARGEST_BYTES, FIRST_BYTES, "a Betaflight blackbox log")
     is_cut_off = [END_OF_LOG not in log for log in content.split(FIRST_BYTES)[1:]]
@@ -72,7 +81,9 @@ def read_betaflight(path: Path, mapping: Mapping) -> list[ImportedFlight]:
     return [flights[0]._replace(notes=notes + flights[0].notes), *flights[1:]]
 
 
-def _read_log(source: str, notes: dict[str, Any], frames: np.ndarray, mapping: Mapping) -> ImportedFlight:
+def _read_log(
+    source: str, notes: dict[str, Any], frames: np.ndarray, mapping: Mapping
+) -> ImportedFlight:
     """Return the flight in one log; notes: ``headers`` and the ``names`` of the frames' fields."""
     headers, names = _Headers(source, notes["headers"]), notes["names"]
     cut_off = "cut off: found no end-of-log event"
@@ -81,7 +92,9 @@ def _read_log(source: str, notes: dict[str, Any], frames: np.ndarray, mapping: M
         raise LogError(f"{source}: {why}, expected at least one")
     revision = str(headers.values.get("Firmware revision", "none"))
     if not revision.startswith(FIRMWARE):
-        raise headers.error("Firmware revision", f"found {quote_value(revision)}, expected {FIRMWARE} 4")
+        raise headers.error(
+            "Firmware revision", f"found {quote_value(revision)}, expected {FIRMWARE} 4"
+        )
     for name in ("time", *STICKS, *GYRO):
         if name not in names:
             listed = ", ".join(map(quote_name, names))[:LONGEST_LIST]
@@ -131,9 +144,13 @@ class _Headers:
         """Return the numbers of a setting, 0 or more, or the default of an absent one."""
         value: Any = self.values.get(name, default)
         found = value if isinstance(value, list) else [value]
-        is_valid = all(isinstance(one, (int, float)) and 0 <= one < LARGEST_SETTING for one in found)
+        is_valid = all(
+            isinstance(one, (int, float)) and 0 <= one < LARGEST_SETTING for one in found
+        )
         if len(found) != size or not is_valid:
-            raise self.error(name, f"found {quote_value(value)}, expected {size} numbers of at least 0")
+            raise self.error(
+                name, f"found {quote_value(value)}, expected {size} numbers of at least 0"
+            )
         return [float(one) for one in found]
 
     def rate_unit_deg_s(self) -> float:
@@ -167,9 +184,13 @@ class _Headers:
         curve = stick_curve(self.rates_type(), list(zip(*settings, strict=True)))
         if curve is None:
             return []
-        numbers = json.dumps({name: round(value, 4) for name, value in curve._asdict().items() if value})
+        numbers = json.dumps(
+            {name: round(value, 4) for name, value in curve._asdict().items() if value}
+        )
         name = effect_of(curve).name
-        return [f"commands are setpoints; for a pilot's sticks a model needs the effect {name}: {numbers}"]
+        return [
+            f"commands are setpoints; for a pilot's sticks a model needs the effect {name}: {numbers}"
+        ]
 
     def thrust_settings(self) -> list[str]:
         """Return notes on settings that change which thrust a throttle means."""
@@ -184,14 +205,17 @@ class _Headers:
         )
         if kind and percent != PERCENT:
             how = {1.0: "scaled to", 2.0: "clipped at"}.get(kind, "limited to")
-            found.append(f"throttle_limit: the throttle is {how} {percent:g} %, and a command of 1 is more")
+            found.append(
+                f"throttle_limit: the throttle is {how} {percent:g} %, and a command of 1 is more"
+            )
         return found
 
 
 def _commands(table: Table, headers: _Headers, full: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """Return commands (num_rows, 4) and a note if some are clipped; full: the setpoints at full stick, (4,).
 
-    What is further past full stick than smoothing overshoots is left, for ``log_of_table`` to refuse.
+    What is further past full stick than smoothing overshoots is left, for ``log_of_table`` to
+    refuse.
     """
     per_unit = headers.rate_unit_deg_s()
     units = np.array([per_unit, per_unit, per_unit, 1.0])
@@ -219,11 +243,15 @@ def _channels(table: Table, headers: _Headers) -> tuple[dict[str, np.ndarray], l
         found["f"] = table.matrix(ACCELEROMETER) * GRAVITY / g_unit
     if BATTERY in table.columns:
         found["v_bat"] = table.matrix([BATTERY]) * UNITS["voltage"]["cV"]
-    vector = table.matrix(ATTITUDE) / UNIT_QUATERNION if table.columns.keys() >= set(ATTITUDE) else None
+    vector = (
+        table.matrix(ATTITUDE) / UNIT_QUATERNION if table.columns.keys() >= set(ATTITUDE) else None
+    )
     if vector is None or not np.any(vector):
         return found, []
     size = np.linalg.norm(vector, axis=1, keepdims=True)
-    found["q"] = np.column_stack([np.sqrt(np.maximum(1.0 - size**2, 0.0)), vector / np.maximum(size, 1.0)])
+    found["q"] = np.column_stack(
+        [np.sqrt(np.maximum(1.0 - size**2, 0.0)), vector / np.maximum(size, 1.0)]
+    )
     return found, []
 
 
@@ -255,5 +283,7 @@ def _chosen_logs(path: Path, num_logs: int, mapping: Mapping) -> list[int]:
     numbers = list(mapping.rows.logs or ()) or list(range(1, num_logs + 1))
     for number in numbers:
         if number > num_logs:
-            raise LogError(f"{mapping.source}: rows.logs: found {number}, expected 1 to {num_logs} of {path}")
+            raise LogError(
+                f"{mapping.source}: rows.logs: found {number}, expected 1 to {num_logs} of {path}"
+            )
     return sorted(numbers)

@@ -1,7 +1,7 @@
 """Betaflight's settings: the rate at full stick, and the curve of the sticks and the rate loop as effects.
 
-Source: ``apply...Rates`` in Betaflight 4.6, src/main/fc/rc.c, and controlrate_profile.h. The loop's body is
-still to be fitted.
+Source: ``apply...Rates`` in Betaflight 4.6, src/main/fc/rc.c, and controlrate_profile.h. The loop's
+body is still to be fitted.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,14 +29,19 @@ ASSUMED = {
 }
 # A racer of 5 inch, before anything was fitted.
 GENERIC = BetaflightLoop(20.0, 20.0, 2.0, 2.0, 0.02, 0.5)
-SETTINGS = BetaflightLoop._fields[BetaflightLoop._fields.index("p_roll") :]  # before them: the craft
+SETTINGS = BetaflightLoop._fields[
+    BetaflightLoop._fields.index("p_roll") :
+]  # before them: the craft
 LEAST_SMOOTHING_HZ, SMOOTHING, TENTHS = 15, 1.5, 10.0
 
 
-def full_stick_rate(rates_type: str, rc_rate: float, super_rate: float, limit_deg_s: float) -> float:
+def full_stick_rate(
+    rates_type: str, rc_rate: float, super_rate: float, limit_deg_s: float
+) -> float:
     """Return the body rate at full stick, deg/s, by Betaflight's rate settings; expo plays no part there.
 
-    rc_rate, super_rate, limit_deg_s: as in the log's headers ``rc_rates``, ``rates``, ``rate_limits``.
+    rc_rate, super_rate, limit_deg_s: as in the log's headers ``rc_rates``, ``rates``,
+    ``rate_limits``.
     """
     remainder = max(1.0 - super_rate / PERCENT, LEAST_REMAINDER)
     rate = rc_rate / PERCENT
@@ -54,15 +59,18 @@ def full_stick_rate(rates_type: str, rc_rate: float, super_rate: float, limit_de
 def stick_curve(rates_type: str, axes: Sequence[Sequence[float]]) -> Any:
     """Return the effect that bends sticks as the rate settings do; None of types without one, or straight.
 
-    axes: of roll, pitch, yaw, the rates and the expo as in the log's headers ``rc_rates``, ``rates``,
-    ``rc_expo``. Assumption: no rate limit is below the rate at full stick, and Quick rates leave the expo
-    out of the stick (``quick_rates_rc_expo`` is OFF, as it comes).
+    axes: of roll, pitch, yaw, the rates and the expo as in the log's headers ``rc_rates``,
+    ``rates``, ``rc_expo``. Assumption: no rate limit is below the rate at full stick, and Quick
+    rates leave the expo out of the stick (``quick_rates_rc_expo`` is OFF, as it comes).
     """
     rc_rates, super_rates, expos = zip(*axes, strict=True)
 
     def bends(slope_deg_s: float) -> list[float]:
         slopes = [slope_deg_s * rc_rate for rc_rate in rc_rates]  # about the centre, deg/s
-        return [1.0 - slope / max(slope, TENS * top) for slope, top in zip(slopes, super_rates, strict=True)]
+        return [
+            1.0 - slope / max(slope, TENS * top)
+            for slope, top in zip(slopes, super_rates, strict=True)
+        ]
 
     shares = [expo / PERCENT for expo in expos]
     if rates_type == "ACTUAL":
@@ -80,8 +88,8 @@ def stick_curve(rates_type: str, axes: Sequence[Sequence[float]]) -> Any:
 def rate_loop(value: Callable[[str], str], frames_hz: float) -> BetaflightLoop | None:
     """Return the effect of a craft's settings; None where the firmware flies by a loop that it has not.
 
-    value: of a setting, by its name on the command line. frames_hz: how often the receiver's frames come,
-    which should be how often a log has commands.
+    value: of a setting, by its name on the command line. frames_hz: how often the receiver's frames
+    come, which should be how often a log has commands.
     """
     if any(value(name) not in ("", expected) for name, expected in ASSUMED.items()):
         return None
@@ -93,7 +101,9 @@ def rate_loop(value: Callable[[str], str], frames_hz: float) -> BetaflightLoop |
     if value("iterm_relax") == "OFF":
         found["iterm_relax_cutoff"] = 0.0
     found["sticks_hz"] = _smoothing(value, "setpoint", "rc_smoothing_auto_factor", frames_hz)
-    found["throttle_hz"] = _smoothing(value, "throttle", "rc_smoothing_auto_factor_throttle", frames_hz)
+    found["throttle_hz"] = _smoothing(
+        value, "throttle", "rc_smoothing_auto_factor_throttle", frames_hz
+    )
     return GENERIC._replace(**found)
 
 

@@ -1,9 +1,9 @@
 """Commands of logs whose autopilot was not given body rates: attitude or torque setpoints, motor outputs.
 
-An attitude controller asks for rates in proportion to the error of the attitude, so these are the rate
-commands. A rate controller asks for a torque in proportion to the error of the rates; the torque over that
-gain, on top of the measured rates, is the rate command. Gains are stated in the mapping, or identified from
-the log.
+An attitude controller asks for rates in proportion to the error of the attitude, so these are the
+rate commands. A rate controller asks for a torque in proportion to the error of the rates; the
+torque over that gain, on top of the measured rates, is the rate command. Gains are stated in the
+mapping, or identified from the log.
 """
 
 from collections.abc import Mapping as Channels
@@ -31,9 +31,10 @@ LEAST_EXPLAINED = 0.9  # of the variance of torques, which a controller computes
 class CommandRules(NamedTuple):
     """How commands follow from setpoints of attitude or torque, and from motors.
 
-    attitude_gain: rad/s per rad, of roll, pitch, yaw, 0 to identify it. rate_gain: N m per rad/s, None to
-    identify it. motors_as_thrust: their mean replaces the thrust command. motor_torque: N m about x, y, z by
-    each motor at its upper end, (3, num_motors), None where torques are logged or not known.
+    attitude_gain: rad/s per rad, of roll, pitch, yaw, 0 to identify it. rate_gain: N m per rad/s,
+    None to identify it. motors_as_thrust: their mean replaces the thrust command. motor_torque: N m
+    about x, y, z by each motor at its upper end, (3, num_motors), None where torques are logged or
+    not known.
     """
 
     attitude_gain: tuple[float, ...] = (0.0, 0.0, 0.0)
@@ -51,10 +52,10 @@ def commands_of(
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the commands (num_rows, 4) in [-1, 1] of a flight, and notes on what was assumed and clipped.
 
-    channels: of ``CHANNELS``, and ``attitude_command`` (roll, pitch, yaw, rad), ``own_attitude`` (as the
-    autopilot estimates it), ``torque_command`` (N m), ``reference_rates`` (rad/s), ``thrust_command`` (-1 to
-    1) and ``motors`` (0 to 1), (num_rows, n) each. Raises LogError for what is missing or cannot be
-    identified.
+    channels: of ``CHANNELS``, and ``attitude_command`` (roll, pitch, yaw, rad), ``own_attitude``
+    (as the autopilot estimates it), ``torque_command`` (N m), ``reference_rates`` (rad/s),
+    ``thrust_command`` (-1 to 1) and ``motors`` (0 to 1), (num_rows, n) each. Raises LogError for
+    what is missing or cannot be identified.
     """
     notes: tuple[str, ...] = ()
     if "motors" in channels:
@@ -73,7 +74,9 @@ def commands_of(
         notes += said
     is_past = np.any(np.abs(commands) > 1.0 + COMMAND_MARGIN, axis=1)
     if is_past.any():
-        notes += (f"{source}: commands clipped to [-1, 1] in {is_past.sum()} of {len(is_past)} rows",)
+        notes += (
+            f"{source}: commands clipped to [-1, 1] in {is_past.sum()} of {len(is_past)} rows",
+        )
     return np.clip(commands, -1.0, 1.0), notes
 
 
@@ -83,7 +86,9 @@ def _thrust(
     """Return the thrust commands (num_rows,), and notes."""
     if rules.motors_as_thrust:
         if "motors" not in channels:
-            raise LogError(f"{source}: motors.as_thrust: found no motor outputs in the log or mapping")
+            raise LogError(
+                f"{source}: motors.as_thrust: found no motor outputs in the log or mapping"
+            )
         return 2.0 * channels["motors"].mean(axis=1) - 1.0, (
             f"{source}: thrust command: the mean of the motors",
         )
@@ -100,7 +105,10 @@ def _rates(
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the rate commands (num_rows, 3), rad/s, and a note on the assumption."""
     if rules.motor_torque is not None and "motors" in channels:
-        channels = {**channels, "torque_command": channels["motors"] @ np.array(rules.motor_torque).T}
+        channels = {
+            **channels,
+            "torque_command": channels["motors"] @ np.array(rules.motor_torque).T,
+        }
     if "torque_command" in channels:
         _check_there(source, channels, "w")
         if rules.rate_gain is None:
@@ -122,7 +130,9 @@ def _rates(
 def _check_there(source: str, channels: Channels[str, np.ndarray], *names: str) -> None:
     for name in names:
         if name not in channels:
-            raise LogError(f"{source}: {name}: not in the log or its mapping, and rate commands need it")
+            raise LogError(
+                f"{source}: {name}: not in the log or its mapping, and rate commands need it"
+            )
 
 
 def _listed(values: tuple[float, ...]) -> str:
@@ -149,7 +159,9 @@ def _identified_attitude_gain(
     """Return the gain of each axis, rad/s per rad, at which lagged and delayed errors show the rates best."""
     _check_there(source, channels, "w")
     if len(time) < FEWEST_ROWS:
-        raise LogError(f"{source}: attitude_command.gain: found {len(time)} rows, too few for it; state it")
+        raise LogError(
+            f"{source}: attitude_command.gain: found {len(time)} rows, too few for it; state it"
+        )
     is_flying = channels["thrust_command"][:, 0] > FLYING_THRUST
     step_s, gains, correlations = float(np.median(np.diff(time))), [], []
     for axis, name in enumerate(AXES):
@@ -170,9 +182,7 @@ def _identified_attitude_gain(
                 if correlation > best:
                     best, gain = correlation, float(shown @ rates / (shown @ shown))
         if not best >= LEAST_CORRELATION:
-            found = (
-                f"rates correlate with the attitude error by {best:.2f}, expected {LEAST_CORRELATION} or more"
-            )
+            found = f"rates correlate with the attitude error by {best:.2f}, expected {LEAST_CORRELATION} or more"
             raise LogError(
                 f"{source}: attitude_command.gain: cannot be identified for {name}: {found}; state it"
             )
@@ -207,7 +217,11 @@ def _rates_of_the_law(
         parts = (errors[:, axis], rates[:, axis], integrals[:, axis], np.ones(len(time)))
         design = np.stack(parts, axis=1)
         weights = np.linalg.lstsq(design, torque, rcond=None)[0]
-        share = 1.0 - float(np.var(torque - design @ weights) / np.var(torque)) if np.ptp(torque) else 0.0
+        share = (
+            1.0 - float(np.var(torque - design @ weights) / np.var(torque))
+            if np.ptp(torque)
+            else 0.0
+        )
         if not share >= LEAST_EXPLAINED or weights[1] >= 0.0:
             found = f"attitude and rates explain {share:.0%} of the torque, expected {LEAST_EXPLAINED:.0%}"
             where = f"{source}: torque_command.rate_gain: cannot be identified for {name}"
@@ -230,5 +244,7 @@ def _rotation_errors(source: str, channels: Channels[str, np.ndarray]) -> np.nda
         attitude = Rotation.from_quat(channels["q"], scalar_first=True)
     else:
         attitude = Rotation.from_euler("ZYX", own[:, ::-1])
-    turn = (Rotation.from_euler("ZYX", channels["attitude_command"][:, ::-1]).inv() * attitude).as_matrix()
+    turn = (
+        Rotation.from_euler("ZYX", channels["attitude_command"][:, ::-1]).inv() * attitude
+    ).as_matrix()
     return 0.5 * (turn - turn.transpose(0, 2, 1))[:, (2, 0, 1), (1, 2, 0)]

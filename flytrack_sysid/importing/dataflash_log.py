@@ -1,7 +1,7 @@
 """ArduPilot's DataFlash logs (``.bin``), decoded by pymavlink: NED and FRD converted to our frames.
 
-Source of messages, fields and units: ardupilot.org/copter/docs/logmessages.html. A message that comes from
-several sensors has an instance.
+Source of messages, fields and units: ardupilot.org/copter/docs/logmessages.html. A message that
+comes from several sensors has an instance.
 """
 
 from pathlib import Path
@@ -39,9 +39,13 @@ FIELDS: dict[str, tuple[str, ...]] = {
     "BAT": ("Volt",),
     "RCOU": tuple(f"C{number}" for number in range(1, NUM_OUTPUTS + 1)),
 }
-# Full stick of roll, pitch, yaw, deg/s: the rate of acro mode (before 4.1: a gain, with the degrees of the
-# firmware's full stick), and the limit of other modes, 0 for none. The larger one counts.
-ACRO_RATES = (("ACRO_RP_RATE", "ACRO_RP_P"), ("ACRO_RP_RATE", "ACRO_RP_P"), ("ACRO_Y_RATE", "ACRO_YAW_P"))
+# Full stick of roll, pitch, yaw, deg/s: the rate of acro mode (before 4.1: a gain, with the degrees
+# of the firmware's full stick), and the limit of other modes, 0 for none. The larger one counts.
+ACRO_RATES = (
+    ("ACRO_RP_RATE", "ACRO_RP_P"),
+    ("ACRO_RP_RATE", "ACRO_RP_P"),
+    ("ACRO_Y_RATE", "ACRO_YAW_P"),
+)
 RATE_LIMITS = ("ATC_RATE_R_MAX", "ATC_RATE_P_MAX", "ATC_RATE_Y_MAX")
 FULL_STICK_DEG = 45.0
 # FRAME_CLASS of what is no quadcopter, and SERVOn_FUNCTION of the motors 1 to 8, and 9 to 12.
@@ -56,7 +60,12 @@ FRAMES = {
 MOTOR_FUNCTIONS = (*range(33, 41), *range(82, 86))
 NUM_MOTORS = 4
 # MOT_PWM_MIN, MOT_PWM_MAX, us, and MOT_SPIN_MIN, MOT_SPIN_MAX, between them, as the firmware comes.
-MOTOR_DEFAULTS = {"MOT_PWM_MIN": 1000.0, "MOT_PWM_MAX": 2000.0, "MOT_SPIN_MIN": 0.15, "MOT_SPIN_MAX": 0.95}
+MOTOR_DEFAULTS = {
+    "MOT_PWM_MIN": 1000.0,
+    "MOT_PWM_MAX": 2000.0,
+    "MOT_SPIN_MIN": 0.15,
+    "MOT_SPIN_MAX": 0.95,
+}
 MIN_HEALTHY_FRACTION = 0.5  # of the rows of an instance say so: the sensor of most of the flight
 
 
@@ -70,10 +79,12 @@ class _Message(NamedTuple):
 def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
     """Return the flight in a DataFlash log: commands, rates, attitude, and what else it has.
 
-    docs/real_logs.md says which messages the channels are of. Raises LogError for what is no such log, is not
-    of a copter, or lacks rates and their setpoints.
+    docs/real_logs.md says which messages the channels are of. Raises LogError for what is no such
+    log, is not of a copter, or lacks rates and their setpoints.
     """
-    read_log_file(path, LARGEST_BYTES, FIRST_BYTES, "an ArduPilot log (DataFlash)", len(FIRST_BYTES))
+    read_log_file(
+        path, LARGEST_BYTES, FIRST_BYTES, "an ArduPilot log (DataFlash)", len(FIRST_BYTES)
+    )
     notes, arrays = decode(
         str(path), "dataflash", path, {name: [TIME, *names] for name, names in FIELDS.items()}
     )
@@ -89,20 +100,26 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
     chosen = {name: _choose(name, instances, said) for name, instances in messages.items()}
     for name in ("RATE",):
         if name not in chosen or any(field not in chosen[name] for field in (TIME, *FIELDS[name])):
-            listed = ", ".join(map(quote_name, sorted(chosen))) or "none of the messages that are read"
+            listed = (
+                ", ".join(map(quote_name, sorted(chosen))) or "none of the messages that are read"
+            )
             raise LogError(
                 f"{path}: message {name}: missing or without {', '.join(FIELDS[name])}; found {listed}"
             )
     craft = mapping.craft
     if craft.max_rate_deg_s is None:
-        craft = craft._replace(max_rate_deg_s=_full_stick_deg_s(path, parameters, chosen["RATE"], said))
+        craft = craft._replace(
+            max_rate_deg_s=_full_stick_deg_s(path, parameters, chosen["RATE"], said)
+        )
     channels = _channels(chosen, parameters, np.array(craft.max_rate_deg_s), said)
     topics = [
         Table(str(path), {TIMESTAMP: fields[TIME] * UNITS["time"]["us"], **_named(name, fields)})
         for name, fields in chosen.items()
         if TIME in fields
     ]
-    flight = flight_of_topics(str(path), topics, mapping._replace(channels=tuple(channels), craft=craft))
+    flight = flight_of_topics(
+        str(path), topics, mapping._replace(channels=tuple(channels), craft=craft)
+    )
     return flight._replace(notes=(*(f"{path}: {text}" for text in said), *flight.notes))
 
 
@@ -115,7 +132,9 @@ def _check_vehicle(path: Path, texts: list[str], parameters: dict[str, float]) -
     for text in texts:
         for vehicle in OTHER_VEHICLES:
             if text.startswith(vehicle):
-                raise LogError(f"{path}: found a log of {quote_name(text)}, expected one of {VEHICLE}")
+                raise LogError(
+                    f"{path}: found a log of {quote_name(text)}, expected one of {VEHICLE}"
+                )
     if parameters.get("Q_ENABLE", 0.0) > 0.0:
         raise LogError(f"{path}: found a log of a quadplane (Q_ENABLE), expected one of {VEHICLE}")
 
@@ -123,7 +142,9 @@ def _check_vehicle(path: Path, texts: list[str], parameters: dict[str, float]) -
 def _airframe(parameters: dict[str, float]) -> list[str]:
     """Return a note if the log's own parameters say that the craft is no quadcopter."""
     frame = FRAMES.get(int(parameters.get("FRAME_CLASS", 0)))
-    num_motors = sum(_function(parameters, number) in MOTOR_FUNCTIONS for number in range(1, NUM_OUTPUTS + 1))
+    num_motors = sum(
+        _function(parameters, number) in MOTOR_FUNCTIONS for number in range(1, NUM_OUTPUTS + 1)
+    )
     if frame:
         return [not_a_quadcopter(f"{frame} (FRAME_CLASS {parameters['FRAME_CLASS']:.0f})")]
     return [not_a_quadcopter(f"{num_motors} motors")] if num_motors not in (0, NUM_MOTORS) else []
@@ -166,7 +187,9 @@ def _without_zeros(message: _Message, said: list[str]) -> _Message:
 def _is_healthy(name: str, fields: dict[str, np.ndarray]) -> bool:
     if name == "BAT":
         return bool(np.any(np.isfinite(fields["Volt"])))
-    return all(np.mean(fields[health]) > MIN_HEALTHY_FRACTION for health in HEALTH if health in fields)
+    return all(
+        np.mean(fields[health]) > MIN_HEALTHY_FRACTION for health in HEALTH if health in fields
+    )
 
 
 def _full_stick_deg_s(
@@ -178,11 +201,17 @@ def _full_stick_deg_s(
         stated = parameters.get(acro, FULL_STICK_DEG * parameters.get(gain, 0.0))
         known = max(stated, parameters.get(limit, 0.0))
         if known <= 0.0:
-            missing = f"{path}: parameters {acro}, {gain} and {limit}: missing, so full stick is unknown"
+            missing = (
+                f"{path}: parameters {acro}, {gain} and {limit}: missing, so full stick is unknown"
+            )
             raise LogError(f"{missing}; a mapping can state craft.max_rate_deg_s")
-        largest = float(np.max(np.abs(rate[setpoint]), initial=0.0, where=np.isfinite(rate[setpoint])))
+        largest = float(
+            np.max(np.abs(rate[setpoint]), initial=0.0, where=np.isfinite(rate[setpoint]))
+        )
         if largest > known:
-            said.append(f"{setpoint} reaches {largest:.4g} deg/s: full stick is that, not {known:.4g} deg/s")
+            said.append(
+                f"{setpoint} reaches {largest:.4g} deg/s: full stick is that, not {known:.4g} deg/s"
+            )
         full_stick.append(max(known, largest))
     roll, pitch, yaw = full_stick
     return roll, pitch, yaw
@@ -199,9 +228,15 @@ def _channels(
     def columns_of(message: str, fields: tuple[str, ...]) -> tuple[str, ...]:
         """Return the columns of a message; none if the log lacks one of them."""
         there = messages.get(message, {})
-        return tuple(f"{message}.{field}" for field in fields) if {TIME, *fields} <= there.keys() else ()
+        return (
+            tuple(f"{message}.{field}" for field in fields)
+            if {TIME, *fields} <= there.keys()
+            else ()
+        )
 
-    def vector(name: str, message: str, fields: tuple[str, ...], scale: float = 1.0) -> list[Channel]:
+    def vector(
+        name: str, message: str, fields: tuple[str, ...], scale: float = 1.0
+    ) -> list[Channel]:
         columns = columns_of(message, fields)
         convert = lambda table: vector_from(table.matrix(columns) * scale, True)  # noqa: E731
         return [Channel(message, name, columns, convert)] if columns else []
@@ -222,9 +257,13 @@ def _channels(
     if volts and np.any(np.isfinite(messages["BAT"]["Volt"])):
         found.append(Channel("BAT", "v_bat", volts, lambda table: table.matrix(volts)))
     outputs = [
-        number for number in range(1, NUM_OUTPUTS + 1) if _function(parameters, number) in MOTOR_FUNCTIONS
+        number
+        for number in range(1, NUM_OUTPUTS + 1)
+        if _function(parameters, number) in MOTOR_FUNCTIONS
     ]
-    motors = columns_of("RCOU", tuple(f"C{number}" for number in outputs or range(1, NUM_MOTORS + 1)))
+    motors = columns_of(
+        "RCOU", tuple(f"C{number}" for number in outputs or range(1, NUM_MOTORS + 1))
+    )
     return [*found, *_motors(motors, parameters)]
 
 
@@ -244,9 +283,13 @@ def _attitude(quaternion: tuple[str, ...], euler: tuple[str, ...]) -> list[Chann
 
 def _motors(columns: tuple[str, ...], parameters: dict[str, float]) -> list[Channel]:
     """Return the motors' outputs, 0 to 1 between the ends that the firmware uses in flight."""
-    known: dict[str, Any] = {name: parameters.get(name) or usual for name, usual in MOTOR_DEFAULTS.items()}
+    known: dict[str, Any] = {
+        name: parameters.get(name) or usual for name, usual in MOTOR_DEFAULTS.items()
+    }
     low_us, high_us = known["MOT_PWM_MIN"], known["MOT_PWM_MAX"]
-    low, high = (low_us + known[name] * (high_us - low_us) for name in ("MOT_SPIN_MIN", "MOT_SPIN_MAX"))
+    low, high = (
+        low_us + known[name] * (high_us - low_us) for name in ("MOT_SPIN_MIN", "MOT_SPIN_MAX")
+    )
     if not columns or high <= low:
         return []
     convert = lambda table: np.clip((table.matrix(columns) - low) / (high - low), 0.0, 1.0)  # noqa: E731

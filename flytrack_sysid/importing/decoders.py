@@ -1,8 +1,8 @@
 """Decoders of other programs' logs: pyulog, orangebox, pymavlink, mcap, rosbags, run by a sandbox.
 
-A small file can make some of them run forever or exhaust the memory (an interval of 0; arrays of arrays).
-This file is imported alone there, so it imports nothing of this package. A decoder takes its arguments, the
-path first, and returns an ``.npz`` of notes (JSON) and arrays.
+A small file can make some of them run forever or exhaust the memory (an interval of 0; arrays of
+arrays). This file is imported alone there, so it imports nothing of this package. A decoder takes
+its arguments, the path first, and returns an ``.npz`` of notes (JSON) and arrays.
 """
 
 import io
@@ -19,24 +19,33 @@ import numpy as np
 
 ULOG_HEADER_BYTES = 3  # before every message: its size and type
 DATAFLASH_MESSAGE = b"\xa3\x95"  # before every message
-INSTANCES = ("I", "C", "Instance", "Inst")  # of ArduPilot: fields that number sensors, estimators, batteries
+INSTANCES = (
+    "I",
+    "C",
+    "Instance",
+    "Inst",
+)  # of ArduPilot: fields that number sensors, estimators, batteries
 MAX_TEXTS = 1000  # messages of text, whose first ones name the firmware
-WHOLE_FILE_COMPRESSION = re.compile(r"^\s*compression_mode:\s*[\"']?FILE\b", re.IGNORECASE | re.MULTILINE)
+WHOLE_FILE_COMPRESSION = re.compile(
+    r"^\s*compression_mode:\s*[\"']?FILE\b", re.IGNORECASE | re.MULTILINE
+)
 MAIN_FRAME = "I"  # of Betaflight: the frame type whose fields the others repeat
 
 
 def _pack(notes: Any, arrays: list[np.ndarray]) -> bytes:
     content = io.BytesIO()
-    np.savez(content, np.frombuffer(json.dumps(notes).encode(), np.uint8), *arrays, allow_pickle=False)
+    np.savez(
+        content, np.frombuffer(json.dumps(notes).encode(), np.uint8), *arrays, allow_pickle=False
+    )
     return content.getvalue()
 
 
 def decode_ulog(arguments: Any, _: bytes) -> bytes:
     """Return fields of a PX4 log's topics, of all their instances.
 
-    arguments: path, and the wanted fields by topic. The arrays are float64, (num_rows,). The notes have their
-    topics, instances and fields (``fields``), ``parameters`` (finite numbers), ``is_damaged`` and
-    ``is_cut_off``.
+    arguments: path, and the wanted fields by topic. The arrays are float64, (num_rows,). The notes
+    have their topics, instances and fields (``fields``), ``parameters`` (finite numbers),
+    ``is_damaged`` and ``is_cut_off``.
     """
     import pyulog
 
@@ -92,11 +101,15 @@ def decode_betaflight(arguments: Any, _: bytes) -> bytes:
     import orangebox
 
     path, numbers, cut_off = arguments
-    logging.getLogger("orangebox").setLevel(logging.CRITICAL)  # it warns of events that it does not know
+    logging.getLogger("orangebox").setLevel(
+        logging.CRITICAL
+    )  # it warns of events that it does not know
     notes, arrays = [], []
     for number in numbers:
         parser = orangebox.Parser.load(path, number)
-        main = next(fields for kind, fields in parser.reader.field_defs.items() if kind.value == MAIN_FRAME)
+        main = next(
+            fields for kind, fields in parser.reader.field_defs.items() if kind.value == MAIN_FRAME
+        )
         names = [str(field.name) for field in main]
         values, num_undecoded, end = array("d"), 0, 0
         for frame in _whole_frames(parser, number in cut_off):
@@ -105,7 +118,9 @@ def decode_betaflight(arguments: Any, _: bytes) -> bytes:
                 num_undecoded += 1
                 continue
             if len(frame.data) < len(names):
-                raise ValueError(f"found a frame of {len(frame.data)} fields, expected {len(names)}")
+                raise ValueError(
+                    f"found a frame of {len(frame.data)} fields, expected {len(names)}"
+                )
             values.extend(frame.data[: len(names)])
         num_left = parser.reader.tell() - end if number in cut_off else 0
         counts = {"num_undecoded": num_undecoded, "num_bytes_left": num_left}
@@ -117,10 +132,10 @@ def decode_betaflight(arguments: Any, _: bytes) -> bytes:
 def decode_dataflash(arguments: Any, _: bytes) -> bytes:
     """Return fields of the messages of an ArduPilot log.
 
-    arguments: path, and the wanted fields by message. The arrays are those of each instance of each message
-    found, (num_messages, num_fields) float64. The notes have of those ``found`` the ``name`` of the message,
-    its ``instance`` (0 without one) and its ``fields``; ``parameters``, as they are at first; ``texts``; and
-    ``is_cut_off``: the last message is not whole.
+    arguments: path, and the wanted fields by message. The arrays are those of each instance of each
+    message found, (num_messages, num_fields) float64. The notes have of those ``found`` the
+    ``name`` of the message, its ``instance`` (0 without one) and its ``fields``; ``parameters``, as
+    they are at first; ``texts``; and ``is_cut_off``: the last message is not whole.
     """
     from pymavlink.DFReader import DFReader_binary
 
@@ -141,14 +156,22 @@ def decode_dataflash(arguments: Any, _: bytes) -> bytes:
         columns = message.get_fieldnames()
         if name not in fields:
             fields[name] = [field for field in wanted[name] if field in columns]
-        instance = next((int(getattr(message, field)) for field in INSTANCES if field in columns), 0)
+        instance = next(
+            (int(getattr(message, field)) for field in INSTANCES if field in columns), 0
+        )
         values.setdefault((name, instance), array("d")).extend(
             float(getattr(message, field)) for field in fields[name]
         )
-    found = [{"name": name, "instance": instance, "fields": fields[name]} for name, instance in values]
-    arrays = [np.array(rows, float).reshape(-1, len(fields[name])) for (name, _), rows in values.items()]
+    found = [
+        {"name": name, "instance": instance, "fields": fields[name]} for name, instance in values
+    ]
+    arrays = [
+        np.array(rows, float).reshape(-1, len(fields[name])) for (name, _), rows in values.items()
+    ]
     ends = [
-        offsets[-1] + reader.formats[kind].len for kind, offsets in enumerate(reader.offsets) if len(offsets)
+        offsets[-1] + reader.formats[kind].len
+        for kind, offsets in enumerate(reader.offsets)
+        if len(offsets)
     ]
     end = max(ends, default=0)
     # Flash memory is padded behind the last message, but not with the beginning of another.
@@ -169,12 +192,12 @@ def _whole_frames(parser: Any, is_cut_off: bool) -> Iterator[Any]:
 def decode_bag(arguments: Any, _: bytes) -> bytes:
     """Return fields of a bag's topics: a folder of ROS 2, a ``.bag`` of ROS 1, an ``.mcap`` file.
 
-    arguments: path, and the wanted fields by topic, as in ``pose.position.x`` or ``axes[0]``. The arrays are
-    those of each topic found, (num_messages, 2 + num_fields) float64: time and time of recording, s from 1 s
-    before the first recording, and the fields; the time is NaN where a sender that stamps others did not. The
-    notes have all ``topics`` of the bag; of those ``found`` their name, their ``fields``, and whether they
-    are ``stamped`` by the sender; and the fields that are ``missing``, as [topic, field, type of the
-    messages].
+    arguments: path, and the wanted fields by topic, as in ``pose.position.x`` or ``axes[0]``. The
+    arrays are those of each topic found, (num_messages, 2 + num_fields) float64: time and time of
+    recording, s from 1 s before the first recording, and the fields; the time is NaN where a sender
+    that stamps others did not. The notes have all ``topics`` of the bag; of those ``found`` their
+    name, their ``fields``, and whether they are ``stamped`` by the sender; and the fields that are
+    ``missing``, as [topic, field, type of the messages].
     """
     path, wanted = arguments
     messages = _mcap_messages if Path(path).suffix == ".mcap" else _bag_messages
@@ -191,14 +214,18 @@ def decode_bag(arguments: Any, _: bytes) -> bytes:
         if topic not in fields:
             values[topic], is_stamped[topic] = array("d"), False
             fields[topic] = [field for field in wanted[topic] if _is_number(message, field)]
-            missing += [[topic, field, kind] for field in wanted[topic] if field not in fields[topic]]
+            missing += [
+                [topic, field, kind] for field in wanted[topic] if field not in fields[topic]
+            ]
         stamp_ns = _stamp_ns(message)
         is_stamped[topic] |= stamp_ns > 0
         first_ns = time_ns - 10**9 if first_ns is None else first_ns  # a time of 0 means "not set"
         stamp_s = (stamp_ns - first_ns) * 1e-9 if stamp_ns > 0 else math.nan
         values[topic].extend((stamp_s, (time_ns - first_ns) * 1e-9))
         values[topic].extend(float(_part(message, field)) for field in fields[topic])
-    found = [{"topic": name, "fields": fields[name], "is_stamped": is_stamped[name]} for name in fields]
+    found = [
+        {"topic": name, "fields": fields[name], "is_stamped": is_stamped[name]} for name in fields
+    ]
     arrays = [np.array(values[name], float).reshape(-1, 2 + len(fields[name])) for name in fields]
     for name, rows in zip(fields, arrays, strict=True):
         if not is_stamped[name]:
@@ -221,7 +248,9 @@ def _bag_messages(path: str, wanted: list[str]) -> Iterator[tuple[str, str, int,
         raise UnsupportedError(f"compressed as a whole, which is not read; first: {convert}")
     with AnyReader([Path(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         yield from ((topic, "", 0, None) for topic in reader.topics)
-        connections = [connection for connection in reader.connections if connection.topic in wanted]
+        connections = [
+            connection for connection in reader.connections if connection.topic in wanted
+        ]
         if connections:  # none would mean all
             for connection, time_ns, raw in reader.messages(connections):
                 message = reader.deserialize(raw, connection.msgtype)
@@ -247,10 +276,14 @@ def _mcap_messages(path: str, wanted: list[str]) -> Iterator[tuple[str, str, int
                 if schema.id not in known:
                     known.add(schema.id)
                     found = get_types_from_msg(schema.data.decode(), kind)
-                    types.register({name: one for name, one in found.items() if name not in types.fielddefs})
+                    types.register(
+                        {name: one for name, one in found.items() if name not in types.fielddefs}
+                    )
                 content = types.deserialize_cdr(message.data, kind)
             else:
-                encodings = f"{channel.message_encoding} of {schema.encoding if schema else 'no schema'}"
+                encodings = (
+                    f"{channel.message_encoding} of {schema.encoding if schema else 'no schema'}"
+                )
                 raise ValueError(
                     f"topic {channel.topic}: found {encodings}, expected cdr of ros2msg, or json"
                 )

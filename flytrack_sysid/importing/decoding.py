@@ -23,8 +23,8 @@ PACKAGES = {
 }
 # Kinds of errors that say nothing of the file: its decoder cannot, or its process may not.
 NO_DAMAGE = ("UnsupportedError", "FileNotFoundError", "PermissionError", "OSError")
-# For every MiB of the file, beyond the usual limits. Orangebox, the slowest decoder, takes 3 s of processor
-# time for one on a free machine, 5 s on a busy one.
+# For every MiB of the file, beyond the usual limits. Orangebox, the slowest decoder, takes 3 s of
+# processor time for one on a free machine, 5 s on a busy one.
 CPU_S_PER_MIB, BYTES_PER_BYTE = 15, 32
 
 
@@ -32,15 +32,17 @@ def limits_of(num_bytes: int) -> sandbox.ResourceLimits:
     """Return the limits for decoding a file of that size."""
     usual, more_s = sandbox.ResourceLimits(), CPU_S_PER_MIB * (num_bytes // 2**20)
     return sandbox.ResourceLimits(
-        usual.cpu_s + more_s, usual.memory_bytes + BYTES_PER_BYTE * num_bytes, usual.wall_s + 4.0 * more_s
+        usual.cpu_s + more_s,
+        usual.memory_bytes + BYTES_PER_BYTE * num_bytes,
+        usual.wall_s + 4.0 * more_s,
     )
 
 
 def decode(source: str, format_name: str, path: Path, *rest: Any) -> tuple[Any, list[np.ndarray]]:
     """Return the notes and arrays that a format's decoder (``decoders.py``) finds in a file.
 
-    source: the file, for messages. rest: the decoder's arguments after the path. Raises LogError if the
-    package is not installed, or cannot decode the file.
+    source: the file, for messages. rest: the decoder's arguments after the path. Raises LogError if
+    the package is not installed, or cannot decode the file.
     """
     try:
         check_installed(*PACKAGES[format_name])
@@ -49,7 +51,9 @@ def decode(source: str, format_name: str, path: Path, *rest: Any) -> tuple[Any, 
     try:
         files = [path, *path.glob("*")] if path.is_dir() else [path]
         limits = limits_of(sum(file.stat().st_size for file in files))
-        packed = sandbox.run(DECODERS, f"decode_{format_name}", [str(path.absolute()), *rest], limits=limits)
+        packed = sandbox.run(
+            DECODERS, f"decode_{format_name}", [str(path.absolute()), *rest], limits=limits
+        )
         notes, *arrays = load_npz(io.BytesIO(packed), limits.memory_bytes).values()
         return json.loads(notes.tobytes()), arrays
     except (OSError, sandbox.SandboxError, NpzError) as error:

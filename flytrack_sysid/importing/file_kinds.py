@@ -69,7 +69,8 @@ def identify(content: bytes) -> FileKind:
     try:
         text = content.decode("utf-8-sig", errors="strict")
     except UnicodeDecodeError as error:
-        text = content[: error.start].decode() if error.start > len(content) - 4 else "\0"  # cut in a letter
+        is_cut_letter = error.start > len(content) - 4
+        text = content[: error.start].decode() if is_cut_letter else "\0"
     if all(letter.isprintable() or letter.isspace() for letter in text):
         return TEXT
     if len(content) > TELEMETRY_START and content[TELEMETRY_START] in TELEMETRY:
@@ -77,7 +78,9 @@ def identify(content: bytes) -> FileKind:
     return UNKNOWN
 
 
-def check_kind(path: Path, format: str, expected: str, allowed: tuple[FileKind, ...] = (UNKNOWN,)) -> None:
+def check_kind(
+    path: Path, format: str, expected: str, allowed: tuple[FileKind, ...] = (UNKNOWN,)
+) -> None:
     """Raise LogError for a file that is of another kind than a format reads.
 
     Args:

@@ -19,8 +19,8 @@ VOLTAGE_TERMS = 4  # of the thrust map: from this coefficient on they multiply t
 class Craft(NamedTuple):
     """What a log or its mapping states of a craft; None where it states nothing.
 
-    max_rate_deg_s: (roll, pitch, yaw), body rate at a command of 1. mass_kg. voltage_v: (lowest, highest)
-    in flight.
+    max_rate_deg_s: (roll, pitch, yaw), body rate at a command of 1. mass_kg. voltage_v: (lowest,
+    highest) in flight.
     """
 
     max_rate_deg_s: tuple[float, float, float] | None = None
@@ -41,9 +41,10 @@ class Craft(NamedTuple):
     def nominal_model(self, source: str) -> ModelParameters:
         """Return the generic racing quadcopter scaled to this craft: where a fit may start.
 
-        Assumption: the nominal craft's lags, and its thrust-to-weight ratios at the same fractions of the
-        highest voltage: thrust scales with the mass, and a volt counts for more where there are fewer.
-        Raises LogError, with ``source``, where full-stick rates, mass or voltage are unknown.
+        Assumption: the nominal craft's lags, and its thrust-to-weight ratios at the same fractions
+        of the highest voltage: thrust scales with the mass, and a volt counts for more where there
+        are fewer. Raises LogError, with ``source``, where full-stick rates, mass or voltage are
+        unknown.
         """
         if self.max_rate_deg_s is None or self.mass_kg is None or self.voltage_v is None:
             name = next(name for name, value in self._asdict().items() if value is None)
@@ -69,8 +70,8 @@ class Craft(NamedTuple):
 class ImportedFlight(NamedTuple):
     """A flight as a reader returns it: its log, the craft by file and mapping, and notes for the user.
 
-    is_landed: rows at which the autopilot itself says that it is on the ground, (num_rows,) bool; None if it
-    says nothing.
+    is_landed: rows at which the autopilot itself says that it is on the ground, (num_rows,) bool;
+    None if it says nothing.
     """
 
     log: FlightLog
@@ -79,7 +80,9 @@ class ImportedFlight(NamedTuple):
     is_landed: np.ndarray | None = None
 
 
-def read_log_file(path: Path, most_bytes: int, first: bytes, expected: str, part: int | None = None) -> bytes:
+def read_log_file(
+    path: Path, most_bytes: int, first: bytes, expected: str, part: int | None = None
+) -> bytes:
     """Return the content of a log file.
 
     Args:
@@ -104,9 +107,7 @@ def read_log_file(path: Path, most_bytes: int, first: bytes, expected: str, part
 
 def not_a_quadcopter(found: str) -> str:
     """Return the note on a craft that is none."""
-    return (
-        f"found {found}, not a quadcopter: thrust and rates stand for all rotors together, and for no wings"
-    )
+    return f"found {found}, not a quadcopter: thrust and rates stand for all rotors together, and for no wings"
 
 
 def saturation(is_at_end: np.ndarray) -> str:

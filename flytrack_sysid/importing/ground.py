@@ -1,11 +1,13 @@
 """Rows on the ground: the legs carry the craft, and a fit would take its weight for thrust.
 
-On the ground a craft keeps still and its accelerometer shows 1 g, as in a calm hover, but its thrust command
-is far below what holds it in the air. That thrust is estimated from the logs themselves. Without an
-accelerometer, velocity or position tell that it does not move. In a steady descent on drag an accelerometer
-shows 1 g at little thrust, too; there the craft has fallen before, which the accelerometer shows as well.
+On the ground a craft keeps still and its accelerometer shows 1 g, as in a calm hover, but its
+thrust command is far below what holds it in the air. That thrust is estimated from the logs
+themselves. Without an accelerometer, velocity or position tell that it does not move. In a steady
+descent on drag an accelerometer shows 1 g at little thrust, too; there the craft has fallen before,
+which the accelerometer shows as well.
 
-A craft that is carried by hand, or hangs on a tether, turns as a flying one does: its rows are not found.
+A craft that is carried by hand, or hangs on a tether, turns as a flying one does: its rows are not
+found.
 """
 
 from collections.abc import Sequence
@@ -18,23 +20,27 @@ from scipy.spatial.transform import Rotation
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.plausibility import FEWEST_ROWS, GRAVITY, SHORTEST_S, summed_turns
 
-# Blocks of rows: an idle propeller turns tens of times in one, a drone in flight does not keep still for one.
+# Blocks of rows: an idle propeller turns tens of times in one, a drone in flight does not keep
+# still for one.
 BLOCK_S = 0.25
-# At rest, over a block. Real logs at rest (Betaflight, Crazyflie; propellers off or idle) show rates of at
-# most 0.016 rad/s and a specific force within 3 % of 1 g that varies by 0.045 g.
+# At rest, over a block. Real logs at rest (Betaflight, Crazyflie; propellers off or idle) show
+# rates of at most 0.016 rad/s and a specific force within 3 % of 1 g that varies by 0.045 g.
 MAX_RATE = 0.1  # rad/s, mean and standard deviation: bias of a gyroscope, and vibration
 MAX_FORCE_ERROR = 0.1  # g, of the mean: scale error of an accelerometer
 MAX_FORCE_STD = 0.1  # g: vibration
 MAX_REST_SPEED = 0.3  # m/s, where there is no accelerometer: drift of an estimator
 MAX_DRIFT_SPEED = 1.0  # m/s, where there is one: a velocity from satellites wanders while it stands
 LEVEL_FORCE_ERROR = 0.2  # g: what moves with less thrusts about its weight
-# Of the thrust command that hovers: below LOW, a craft at rest stands; next to such rows, up to SPOOLING, it
-# still does. Thrust grows about with the square of a command, so that LOW carries a quarter of the weight.
+# Of the thrust command that hovers: below LOW, a craft at rest stands; next to such rows, up to
+# SPOOLING, it still does. Thrust grows about with the square of a command, so that LOW carries a
+# quarter of the weight.
 LOW, SPOOLING = 0.5, 0.8
-STANDING_QUANTILE = 0.95  # of the commands at rest: a craft that rests at a command hovers at no less
+# of the commands at rest: a craft that rests at a command hovers at no less
+STANDING_QUANTILE = 0.95
 MIN_REST_S = 1.0  # without thrust, drag of 1 g +- 10 % lasts for 0.2 s, except in a steady descent
 MIN_HOVER = 0.01  # of the command's range: below it, the commands tell nothing
-# A descent on drag: m/s of fall gained at low thrust before; drones descend at 8 m/s (ducted whoops) or more.
+# A descent on drag: m/s of fall gained at low thrust before; drones descend at 8 m/s (ducted
+# whoops) or more.
 MIN_FALL_SPEED = 4.0
 MAX_FALL_S, FALL_STEP_S = 10.0, 0.01  # s: how far back a fall is integrated, in which steps
 MAX_FALL_FORCE = 2.0  # g: a descent builds up smoothly, what hits the ground shows more
@@ -43,8 +49,8 @@ MAX_FALL_FORCE = 2.0  # g: a descent builds up smoothly, what hits the ground sh
 class _Blocks(NamedTuple):
     """Means over blocks of about ``BLOCK_S``; (num_blocks,) each, but for ``of_row``, (num_rows,) int.
 
-    throttle: thrust command as a fraction of its range. is_at_rest: still at 1 g. is_level: moving at about 1
-    g. is_start: the first of a segment.
+    throttle: thrust command as a fraction of its range. is_at_rest: still at 1 g. is_level: moving
+    at about 1 g. is_start: the first of a segment.
     """
 
     of_row: np.ndarray
@@ -57,8 +63,8 @@ class _Blocks(NamedTuple):
 def find_ground(logs: Sequence[FlightLog]) -> list[np.ndarray]:
     """Return which rows of each log are on the ground, (num_rows,) bool.
 
-    A log that never leaves the ground is on it in all rows. Logs without rates or attitude, or without
-    accelerometer, velocity and position, show nothing.
+    A log that never leaves the ground is on it in all rows. Logs without rates or attitude, or
+    without accelerometer, velocity and position, show nothing.
 
     Args:
         logs: logs of one craft, which together tell the thrust command that hovers.
@@ -66,7 +72,9 @@ def find_ground(logs: Sequence[FlightLog]) -> list[np.ndarray]:
     blocks = [_blocks_of(log) for log in logs]
     hover = _hover_throttle([known for known in blocks if known is not None])
     return [
-        np.zeros(len(log), bool) if known is None or hover < MIN_HOVER else _ground_rows(log, known, hover)
+        np.zeros(len(log), bool)
+        if known is None or hover < MIN_HOVER
+        else _ground_rows(log, known, hover)
         for log, known in zip(logs, blocks, strict=True)
     ]
 
@@ -175,8 +183,8 @@ def _runs(is_in: np.ndarray, is_start: np.ndarray) -> list[tuple[int, int]]:
 def _is_descent(log: FlightLog, blocks: _Blocks, is_low: np.ndarray, start: int, end: int) -> bool:
     """Return whether the craft gained speed downwards, without a hit, before it came to rest at 1 g.
 
-    is_low: blocks at low thrust, (num_blocks,) bool; the fall is within the run of them that leads to rest.
-    start, end: the blocks at rest.
+    is_low: blocks at low thrust, (num_blocks,) bool; the fall is within the run of them that leads
+    to rest. start, end: the blocks at rest.
     """
     if "f" not in log or "w" not in log:
         return False  # the velocity told already
@@ -187,7 +195,10 @@ def _is_descent(log: FlightLog, blocks: _Blocks, is_low: np.ndarray, start: int,
         first -= 1  # thrust may end within this block
     row, last, stop = np.searchsorted(blocks.of_row, [first, start, end])
     row += np.searchsorted(log.time[row:last], log.time[last] - MAX_FALL_S)
-    if last - row < 2 or np.linalg.norm(log["f"][row:last], axis=1).max() > MAX_FALL_FORCE * GRAVITY:
+    if (
+        last - row < 2
+        or np.linalg.norm(log["f"][row:last], axis=1).max() > MAX_FALL_FORCE * GRAVITY
+    ):
         return False
     at_rest = log["f"][last:stop].mean(axis=0)
     up = at_rest / np.linalg.norm(at_rest)

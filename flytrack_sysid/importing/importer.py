@@ -44,9 +44,9 @@ LEAST_THRUST = -0.9  # command: what flies uses more than a twentieth of its thr
 class Imported(NamedTuple):
     """The result of an import.
 
-    log: a segment per flight, numbered from 0. sources: the file of each segment. craft: by files and
-    mapping. offsets: between the sensors' clocks. notes: what was left out. problems: what in the log cannot
-    be true of a flight; ``fit`` would refuse it.
+    log: a segment per flight, numbered from 0. sources: the file of each segment. craft: by files
+    and mapping. offsets: between the sensors' clocks. notes: what was left out. problems: what in
+    the log cannot be true of a flight; ``fit`` would refuse it.
     """
 
     log: FlightLog
@@ -69,7 +69,14 @@ class Imported(NamedTuple):
         ]
         clocks = [offset.describe() for offset in self.offsets]
         problems = [f"warning: {problem}" for problem in self.problems]
-        lines = [*segments, *self.notes, describe(self.log), self.craft.describe(), *clocks, *problems]
+        lines = [
+            *segments,
+            *self.notes,
+            describe(self.log),
+            self.craft.describe(),
+            *clocks,
+            *problems,
+        ]
         return "\n".join(lines)
 
     def save_details(self, path: str | Path) -> None:
@@ -82,7 +89,9 @@ class Imported(NamedTuple):
             "notes": self.notes,
             "problems": self.problems,
         }
-        write_atomically(Path(path), (json.dumps(document, indent=2, allow_nan=False) + "\n").encode())
+        write_atomically(
+            Path(path), (json.dumps(document, indent=2, allow_nan=False) + "\n").encode()
+        )
 
 
 def import_log(
@@ -93,13 +102,14 @@ def import_log(
 ) -> Imported:
     """Return measured flights as one flight log in SI units and our frames, a segment each.
 
-    paths: one file or several. format: of ``FORMATS``. mapping: a mapping file, or the name of a shipped
-    one; CSV, uSD logs and bags need it, other formats use its ``rows`` and ``craft``. align: correct
-    significant offsets between the sensors' clocks (``flytrack_sysid.clocks``) instead of only
-    reporting them. Voltages that neither files nor mapping state are those of the log, where all are above 0.
+    paths: one file or several. format: of ``FORMATS``. mapping: a mapping file, or the name of a
+    shipped one; CSV, uSD logs and bags need it, other formats use its ``rows`` and ``craft``.
+    align: correct significant offsets between the sensors' clocks (``flytrack_sysid.clocks``)
+    instead of only reporting them. Voltages that neither files nor mapping state are those of the
+    log, where all are above 0.
 
-    Raises:
-        LogError: a file that cannot be read or used; the message names file and field, found and expected.
+    Raises: LogError: a file that cannot be read or used; the message names file and field, found
+        and expected.
     """
     files = [Path(path) for path in ([paths] if isinstance(paths, (str, Path)) else paths)]
     if format not in READERS:
@@ -117,7 +127,9 @@ def import_log(
     log = _concatenate([flight.log for flight in flights], sources)
     log, offsets = align_clocks(log, align)
     craft = _common_craft(flights, sources)
-    log = replace(log, origin="measured", stated_voltage_v=None if "v_bat" in log else craft.voltage_v)
+    log = replace(
+        log, origin="measured", stated_voltage_v=None if "v_bat" in log else craft.voltage_v
+    )
     if craft.voltage_v is None and "v_bat" in log and log["v_bat"].min() > 0.0:
         craft = craft._replace(voltage_v=(float(log["v_bat"].min()), float(log["v_bat"].max())))
     step_s = float(np.median(usual_step(log)))
@@ -136,7 +148,8 @@ def _parts(flight: ImportedFlight) -> list[ImportedFlight]:
     parts = []
     for count, number in enumerate(numbers, start=1):
         part = replace(
-            log.select(log.segment == number), source=f"{log.source}, part {count} of {len(numbers)}"
+            log.select(log.segment == number),
+            source=f"{log.source}, part {count} of {len(numbers)}",
         )
         parts.append(flight._replace(log=part, notes=flight.notes if count == 1 else ()))
     return parts
@@ -150,7 +163,9 @@ def _flights_in_the_air(
     Raises LogError if nothing flies in any of them.
     """
     in_the_air, left_out, notes = list[ImportedFlight](), list[str](), list[str]()
-    for (path, flight), is_ground in zip(read, find_ground([flight.log for _, flight in read]), strict=True):
+    for (path, flight), is_ground in zip(
+        read, find_ground([flight.log for _, flight in read]), strict=True
+    ):
         log, source = flight.log, flight.log.source
         is_used = _is_selected(path, log, mapping)
         if flight.is_landed is not None:
@@ -162,7 +177,9 @@ def _flights_in_the_air(
             left_out.append(f"{source}: nothing flies: on the ground in all {num_used} rows")
             continue
         elif log["u"][is_used, 3].max() < LEAST_THRUST:
-            left_out.append(f"{source}: nothing flies: the thrust command never exceeds 5 % of its range")
+            left_out.append(
+                f"{source}: nothing flies: the thrust command never exceeds 5 % of its range"
+            )
             continue
         else:
             kept = is_used & ~is_ground
@@ -252,7 +269,9 @@ def _concatenate(logs: list[FlightLog], sources: list[str]) -> FlightLog:
     for log, source in zip(logs, sources, strict=True):
         if set(log.channels) != set(first.channels):
             different = ", ".join(sorted(set(log.channels) ^ set(first.channels)))
-            raise LogError(f"{source}: channels {different}: not in both this file and {sources[0]}")
+            raise LogError(
+                f"{source}: channels {different}: not in both this file and {sources[0]}"
+            )
     return replace(
         first,
         time=np.concatenate([log.time for log in logs]),

@@ -1,8 +1,8 @@
 """Mapping files: what the columns of a log are, which rows to use, and what is known of the craft.
 
-TOML. Every table and field is described in docs/real_logs.md; ``rows``, ``craft`` and ``motors.as_thrust``
-apply to logs of every format. Columns are those of a CSV file, variables of a Crazyflie's uSD log, fields of
-topics.
+TOML. Every table and field is described in docs/real_logs.md; ``rows``, ``craft`` and
+``motors.as_thrust`` apply to logs of every format. Columns are those of a CSV file, variables of a
+Crazyflie's uSD log, fields of topics.
 """
 
 from collections.abc import Callable
@@ -47,9 +47,9 @@ NineNames = tuple[Text, Text, Text, Text, Text, Text, Text, Text, Text]
 class Channel(NamedTuple):
     """A channel of the log in a table of columns: where it is from and how it is converted.
 
-    table: of the mapping, for messages. name: of ``CHANNELS``, or t, or as in ``commands_of``. columns: of
-    the file. convert: from the file's table to the channel's columns, (num_rows, n), SI units and our frames.
-    is_optional: it is left out where the file has none of the columns.
+    table: of the mapping, for messages. name: of ``CHANNELS``, or t, or as in ``commands_of``.
+    columns: of the file. convert: from the file's table to the channel's columns, (num_rows, n), SI
+    units and our frames. is_optional: it is left out where the file has none of the columns.
     """
 
     table: str
@@ -70,9 +70,10 @@ class Manifest(Fields):
 class UsedRows(Fields):
     """Which rows to use: every n-th from ``from_s`` to ``to_s`` after the first; a manifest limits them.
 
-    above_m: only the longest stretch of rows that are that much higher than the first. ranges_s: only what is
-    in one of these, s after the first row; all if none. logs: numbers, from 1, of the logs in a file that
-    holds several; all if none. on_ground: whether rows on the ground are used, too.
+    above_m: only the longest stretch of rows that are that much higher than the first. ranges_s:
+    only what is in one of these, s after the first row; all if none. logs: numbers, from 1, of the
+    logs in a file that holds several; all if none. on_ground: whether rows on the ground are used,
+    too.
     """
 
     every: Count = 1
@@ -86,7 +87,9 @@ class UsedRows(Fields):
 
     def __post_init__(self) -> None:
         if any(low >= high for low, high in self.ranges_s or ()):
-            raise ValueError(f"ranges_s: found {quote_value(self.ranges_s)}, expected the lower one first")
+            raise ValueError(
+                f"ranges_s: found {quote_value(self.ranges_s)}, expected the lower one first"
+            )
         check_different("logs", self.logs or ())
 
 
@@ -99,7 +102,9 @@ class CraftFields(Fields):
 
     def __post_init__(self) -> None:
         if self.voltage_v is not None and self.voltage_v[0] >= self.voltage_v[1]:
-            raise ValueError(f"voltage_v: found {list(self.voltage_v)}, expected the lower one first")
+            raise ValueError(
+                f"voltage_v: found {list(self.voltage_v)}, expected the lower one first"
+            )
 
 
 class ScaledFields(Fields, kw_only=True):
@@ -133,8 +138,8 @@ class SignedFields(ScaledFields, kw_only=True):
 class CsvFile(ScaledFields):
     """One of several CSV files of a log, with a clock of its own.
 
-    file: pattern of its name, in the folder of the log. time: the column of its times, which begin at
-    ``offset_s`` of the log's clock.
+    file: pattern of its name, in the folder of the log. time: the column of its times, which begin
+    at ``offset_s`` of the log's clock.
     """
 
     file: Text
@@ -197,9 +202,13 @@ class Command(Fields):
 
         def scale(found: Table) -> np.ndarray:
             values = found.matrix(self.columns)
-            is_past = ((values < least) | (values > most)) & (not self.clip)  # else ``commands_of`` clips
+            is_past = ((values < least) | (values > most)) & (
+                not self.clip
+            )  # else ``commands_of`` clips
             for row, stick in np.argwhere(is_past)[:1]:
-                text = f"found {values[row, stick]:g}, expected {low[stick]:g} to {high[stick]:g} by "
+                text = (
+                    f"found {values[row, stick]:g}, expected {low[stick]:g} to {high[stick]:g} by "
+                )
                 text += "command.low and command.high; clip = true limits it"
                 raise found.error(row, quote_name(self.columns[stick]), text)
             return 2.0 * (values - low) / (high - low) - 1.0
@@ -250,10 +259,14 @@ class Attitude(SignedFields):
 
     def channels(self, table: str) -> list[Channel]:
         """Return the channel of quaternions."""
-        given = [columns for columns in (self.quaternion, self.euler, self.matrix) if columns is not None]
+        given = [
+            columns for columns in (self.quaternion, self.euler, self.matrix) if columns is not None
+        ]
         is_scaled = (self.unit, self.scale, self.signs) != (None, None, UNSIGNED)
         if len(given) != 1 or (self.euler is None and is_scaled):
-            raise ValueError("expected quaternion, with its order, or euler, with its unit, or matrix")
+            raise ValueError(
+                "expected quaternion, with its order, or euler, with its unit, or matrix"
+            )
         check_different("euler, matrix or quaternion", given[0])
         rotate = self._rotate()
         is_body_turned = TURNED["body"][choose("body", self.body, TURNED["body"])]
@@ -381,8 +394,12 @@ class Motors(RateGainFields):
     def channels(self, table: str) -> list[Channel]:
         """Return the channel of outputs, 0 to 1, if there are columns."""
         low, high = self.low, self.high
-        if self.torque_n_m is not None and {len(row) for row in self.torque_n_m} != {len(self.columns)}:
-            raise ValueError(f"torque_n_m: found {quote_value(self.torque_n_m)}, expected a row an axis")
+        if self.torque_n_m is not None and {len(row) for row in self.torque_n_m} != {
+            len(self.columns)
+        }:
+            raise ValueError(
+                f"torque_n_m: found {quote_value(self.torque_n_m)}, expected a row an axis"
+            )
         if not self.columns:
             return []
         check_different("columns", self.columns)
@@ -504,7 +521,9 @@ def _merged(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for name, value in change.items():
         old = merged.get(name)
-        merged[name] = {**old, **value} if isinstance(old, dict) and isinstance(value, dict) else value
+        merged[name] = (
+            {**old, **value} if isinstance(old, dict) and isinstance(value, dict) else value
+        )
     return merged
 
 

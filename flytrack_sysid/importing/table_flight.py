@@ -23,7 +23,9 @@ RECORDED = "recorded"  # column of the times of recording, s, by one clock for a
 BASES = ("w", "q", "p")  # the rows are those of the first that is there
 
 
-def channels_in(source: str, headers: Sequence[Iterable[str]], mapping: Mapping) -> list[tuple[Channel, int]]:
+def channels_in(
+    source: str, headers: Sequence[Iterable[str]], mapping: Mapping
+) -> list[tuple[Channel, int]]:
     """Return the channels that a log has, and the table of each, by the tables' column names.
 
     Raises LogError for columns that the mapping wants and no table has, or one has several times.
@@ -38,10 +40,16 @@ def channels_in(source: str, headers: Sequence[Iterable[str]], mapping: Mapping)
         if fitting:
             found.append((channel, fitting[0]))
         elif not (channel.is_optional and not any(map(any, counts))):
-            nearest = max(range(len(counts)), key=lambda number: sum(map(bool, counts[number])), default=None)
+            nearest = max(
+                range(len(counts)), key=lambda number: sum(map(bool, counts[number])), default=None
+            )
             count = counts[nearest] if nearest is not None else [0] * len(channel.columns)
-            column, times = next((c, n) for c, n in zip(channel.columns, count, strict=True) if n != 1)
-            listed = ", ".join(map(quote_name, dict.fromkeys(itertools.chain(*names))))[:LONGEST_LIST]
+            column, times = next(
+                (c, n) for c, n in zip(channel.columns, count, strict=True) if n != 1
+            )
+            listed = ", ".join(map(quote_name, dict.fromkeys(itertools.chain(*names))))[
+                :LONGEST_LIST
+            ]
             where = f"{source}: column {quote_name(column)}: found {times} times among {listed}"
             raise LogError(f"{where}; expected once by {mapping.source}: {channel.table}")
     return found
@@ -50,13 +58,15 @@ def channels_in(source: str, headers: Sequence[Iterable[str]], mapping: Mapping)
 def read_csv(path: Path, mapping: Mapping) -> ImportedFlight:
     """Return the flight in a CSV file with a header, by a mapping; SI units and our frames.
 
-    path: of a folder, if the mapping has several files. Raises LogError, whose message names file, row, line
-    and column.
+    path: of a folder, if the mapping has several files. Raises LogError, whose message names file,
+    row, line and column.
     """
     if mapping.files:
         return _read_files(path, mapping)
     if path.is_dir():
-        raise LogError(f"{path}: found a folder, expected a file, or files.NAME in {mapping.source}")
+        raise LogError(
+            f"{path}: found a folder, expected a file, or files.NAME in {mapping.source}"
+        )
     check_kind(path, "csv", "text with commas, or such compressed by gzip", (EMPTY, GZIP, UNKNOWN))
     with open_csv(path, mapping.delimiter) as rows:
         header = [name.strip() for name in next(rows, [])]
@@ -80,7 +90,9 @@ def read_csv(path: Path, mapping: Mapping) -> ImportedFlight:
 def _read_files(folder: Path, mapping: Mapping) -> ImportedFlight:
     """Return the flight in several CSV files of a folder, by a mapping whose columns are ``file:column``."""
     if not folder.is_dir():
-        raise LogError(f"{folder}: found no folder, expected one with the files of {mapping.source}: files")
+        raise LogError(
+            f"{folder}: found no folder, expected one with the files of {mapping.source}: files"
+        )
     wanted: dict[str, dict[str, None]] = {}
     for channel in mapping.channels:
         for column in channel.columns:
@@ -95,7 +107,9 @@ def _read_files(folder: Path, mapping: Mapping) -> ImportedFlight:
         file = mapping.files[name]
         paths = sorted(folder.glob(file.file))
         if len(paths) != 1:
-            listed = ", ".join(quote_name(path.name) for path in sorted(folder.iterdir()))[:LONGEST_LIST]
+            listed = ", ".join(quote_name(path.name) for path in sorted(folder.iterdir()))[
+                :LONGEST_LIST
+            ]
             found = f"found {len(paths)} files of the name {quote_name(file.file)} among {listed}"
             raise LogError(f"{folder}: {found}; expected one by {mapping.source}: files.{name}")
         tables.append(_read_file(paths[0], name, file, list(fields), mapping))
@@ -109,9 +123,7 @@ def _read_file(path: Path, name: str, file: CsvFile, fields: list[str], mapping:
         for column in (file.time, *fields):
             if header.count(column) != 1:
                 listed = ", ".join(map(quote_name, header))[:LONGEST_LIST]
-                found = (
-                    f"{path}: column {quote_name(column)}: found {header.count(column)} times among {listed}"
-                )
+                found = f"{path}: column {quote_name(column)}: found {header.count(column)} times among {listed}"
                 raise LogError(f"{found}; expected once by {mapping.source}: files.{name}")
         table = read_columns(path, rows, header, dict.fromkeys((file.time, *fields)))
     columns = {f"{name}:{field}": table.columns[field] for field in fields}
@@ -123,26 +135,37 @@ def flight_of_topics(source: str, topics: Sequence[Table], mapping: Mapping) -> 
     """Return the flight in tables that have clocks and rates of their own, each with a column of times.
 
     Rows are the samples of the body rates, else of the attitude or the position: other sensors are
-    interpolated, commands held. There are no rows where a channel has a gap of more than three of its usual
-    steps.
+    interpolated, commands held. There are no rows where a channel has a gap of more than three of
+    its usual steps.
     """
     samples, clocks, latencies_s, said = {}, {}, {}, list[str]()
     for channel, number in channels_in(source, [topic.columns for topic in topics], mapping):
         topic = topics[number]
         if channel.name == "t":
-            raise LogError(f"{mapping.source}: time: found a table, expected none: the log has its own times")
+            raise LogError(
+                f"{mapping.source}: time: found a table, expected none: the log has its own times"
+            )
         is_finite = np.isfinite(topic.matrix(channel.columns)).all(axis=1)
         if not is_finite.any():
-            raise LogError(f"{source}: {channel.table}: found no row of finite numbers, expected some")
-        clock = read_clock(source, channel.table, np.where(is_finite, topic.columns[TIMESTAMP], np.nan))
+            raise LogError(
+                f"{source}: {channel.table}: found no row of finite numbers, expected some"
+            )
+        clock = read_clock(
+            source, channel.table, np.where(is_finite, topic.columns[TIMESTAMP], np.nan)
+        )
         said += [text for text in clock.describe(channel.table) if text not in said]
         kept = topic.select(clock.is_used)
-        clocks[channel.name], samples[channel.name] = clock, Samples(clock.times, channel.convert(kept))
+        clocks[channel.name], samples[channel.name] = (
+            clock,
+            Samples(clock.times, channel.convert(kept)),
+        )
         if RECORDED in topic.columns:
             latencies_s[channel.name] = float(np.median(kept.columns[RECORDED] - clock.times))
     base_name = next((name for name in BASES if name in samples), None)
     if base_name is None:
-        raise LogError(f"{source}: {mapping.source}: rates: missing; attitude or position may replace them")
+        raise LogError(
+            f"{source}: {mapping.source}: rates: missing; attitude or position may replace them"
+        )
     for name, latency_s in latencies_s.items():
         early_s = latency_s - latencies_s.get(base_name, latency_s)
         if abs(early_s) > MAX_LATENCY_S:
@@ -166,10 +189,16 @@ def flight_of_topics(source: str, topics: Sequence[Table], mapping: Mapping) -> 
 
 
 def _flight(
-    table: Table, time: np.ndarray, max_gap_s: float, values: dict[str, np.ndarray], mapping: Mapping
+    table: Table,
+    time: np.ndarray,
+    max_gap_s: float,
+    values: dict[str, np.ndarray],
+    mapping: Mapping,
 ) -> ImportedFlight:
     """Return the flight of converted channels; longer steps than the gap begin a new segment."""
-    commands, notes = commands_of(table.source, time, values, mapping.rules, mapping.craft.max_rate_deg_s)
+    commands, notes = commands_of(
+        table.source, time, values, mapping.rules, mapping.craft.max_rate_deg_s
+    )
     columns = columns_of(time, {**values, "u": commands})
     columns["segment"] = number_segments(time, max_gap_s)
     return ImportedFlight(log_of_table(table._replace(columns=columns)), mapping.craft, notes)

@@ -1,7 +1,7 @@
 """PX4 logs (``.ulg``), read by pyulog: NED and FRD converted to our frames, topics put on one time base.
 
-Rows are the samples of the body rates; other sensors are interpolated between their own samples, setpoints
-are held. There are no rows where a topic has a gap of more than three of its usual steps.
+Rows are the samples of the body rates; other sensors are interpolated between their own samples,
+setpoints are held. There are no rows where a topic has a gap of more than three of its usual steps.
 """
 
 from pathlib import Path
@@ -14,14 +14,27 @@ from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, re
 from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, vector_from
 from flytrack_sysid.log import LogError
-from flytrack_sysid.log_table import COMMAND_MARGIN, LARGEST_NORM_ERROR, Table, columns_of, log_of_table
+from flytrack_sysid.log_table import (
+    COMMAND_MARGIN,
+    LARGEST_NORM_ERROR,
+    Table,
+    columns_of,
+    log_of_table,
+)
 from flytrack_sysid.resample import Samples, on_one_base, slow_channels
-from flytrack_sysid.timestamps import MAX_LATENCY_S, Clock, number_segments, put_on_one_line, read_clock
+from flytrack_sysid.timestamps import (
+    MAX_LATENCY_S,
+    Clock,
+    number_segments,
+    put_on_one_line,
+    read_clock,
+)
 
 LARGEST_BYTES = 2**29  # the decoder may take time and memory in proportion
 FIRST_BYTES = b"ULog\x01\x12\x35"
 MICROSECOND = UNITS["time"]["us"]
-# Full stick in acro mode, and the limit of other modes, deg/s; a setpoint stays below the larger one.
+# Full stick in acro mode, and the limit of other modes, deg/s; a setpoint stays below the larger
+# one.
 RATE_PARAMETERS = (
     ("MC_ACRO_R_MAX", "MC_ROLLRATE_MAX"),
     ("MC_ACRO_P_MAX", "MC_PITCHRATE_MAX"),
@@ -41,9 +54,15 @@ OTHER_VEHICLES = {
 }
 AIRFRAMES = {4: "a helicopter", 13: HEXACOPTER, 14: OCTOCOPTER, 15: "a tricopter"}
 AIRFRAMES |= dict.fromkeys(range(19, 26), VTOL)
-FRAMES = {**dict.fromkeys((6, 7, 11), HEXACOPTER), **dict.fromkeys((8, 9, 12), OCTOCOPTER), 13: VTOL}
+FRAMES = {
+    **dict.fromkeys((6, 7, 11), HEXACOPTER),
+    **dict.fromkeys((8, 9, 12), OCTOCOPTER),
+    13: VTOL,
+}
 
-Source = tuple[str, tuple[str, ...]]  # a topic and its fields, in the order of the channel's columns
+Source = tuple[
+    str, tuple[str, ...]
+]  # a topic and its fields, in the order of the channel's columns
 
 
 def _indexed(topic: str, field: str, size: int) -> Source:
@@ -53,8 +72,14 @@ def _indexed(topic: str, field: str, size: int) -> Source:
 BATTERY_FIELDS = ("voltage_v",)
 # The first one in the log is used; later ones are of older firmware.
 SOURCES: dict[str, tuple[Source, ...]] = {
-    "w": (_indexed("vehicle_angular_velocity", "xyz", 3), _indexed("sensor_combined", "gyro_rad", 3)),
-    "f": (_indexed("vehicle_acceleration", "xyz", 3), _indexed("sensor_combined", "accelerometer_m_s2", 3)),
+    "w": (
+        _indexed("vehicle_angular_velocity", "xyz", 3),
+        _indexed("sensor_combined", "gyro_rad", 3),
+    ),
+    "f": (
+        _indexed("vehicle_acceleration", "xyz", 3),
+        _indexed("sensor_combined", "accelerometer_m_s2", 3),
+    ),
     "q": (_indexed("vehicle_attitude", "q", 4),),
     "p": (("vehicle_local_position", ("x", "y", "z")),),
     "v": (("vehicle_local_position", ("vx", "vy", "vz")),),
@@ -73,8 +98,8 @@ EVENTS = ("vehicle_land_detected",)  # topics that are published when something 
 def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
     """Return the flight in a PX4 log: commands, rates, attitude, and the other channels that it has.
 
-    docs/real_logs.md says which topics the channels are of. Raises LogError for what is no ULog, or lacks
-    rates, attitude or rate setpoints at any one time.
+    docs/real_logs.md says which topics the channels are of. Raises LogError for what is no ULog, or
+    lacks rates, attitude or rate setpoints at any one time.
     """
     if mapping.rules.motors_as_thrust:
         raise LogError(
@@ -95,7 +120,9 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
         ours["v_bat"] = samples["v_bat"]
     channels, is_known = on_one_base(ours, base)
     if not is_known.any():
-        raise LogError(f"{path}: found no time at which all of {', '.join(ours)} are known, expected some")
+        raise LogError(
+            f"{path}: found no time at which all of {', '.join(ours)} are known, expected some"
+        )
     is_landed = None
     if "landed" in samples:
         times, landed = samples["landed"]
@@ -106,7 +133,9 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
     columns["segment"] = number_segments(base[is_known], clocks["w"].max_gap_s)
     num_rows = len(clocks["w"].is_used)
     used = f"{is_known.sum()} of {num_rows} samples of the rates have all other topics around them"
-    notes = tuple(f"{path}: {text}" for text in [used, *said, *_airframe(parameters), *slow_channels(ours)])
+    notes = tuple(
+        f"{path}: {text}" for text in [used, *said, *_airframe(parameters), *slow_channels(ours)]
+    )
     return ImportedFlight(log_of_table(Table(str(path), columns)), craft, notes, is_landed)
 
 
@@ -117,15 +146,18 @@ def _airframe(parameters: dict[str, float]) -> list[str]:
         if kind:
             return [not_a_quadcopter(f"{kind} ({name} {parameters[name]:.0f})")]
     num_rotors = int(parameters.get("CA_ROTOR_COUNT", 0))
-    return [not_a_quadcopter(f"{num_rotors} rotors (CA_ROTOR_COUNT)")] if num_rotors not in (0, 4) else []
+    return (
+        [not_a_quadcopter(f"{num_rotors} rotors (CA_ROTOR_COUNT)")]
+        if num_rotors not in (0, 4)
+        else []
+    )
 
 
 def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, Clock], dict[str, float], list[str]]:
     """Read the topics of a log.
 
-    Returns:
-        The samples by channel, on one time line; the clocks by channel; the log's parameters; and what was
-        found wrong.
+    Returns: The samples by channel, on one time line; the clocks by channel; the log's parameters;
+        and what was found wrong.
     """
     read_log_file(path, LARGEST_BYTES, FIRST_BYTES, "a PX4 log (ULog)", len(FIRST_BYTES))
     fields: dict[str, list[str]] = {}
@@ -134,7 +166,9 @@ def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, Clock], dict[str,
     notes, arrays = decode(str(path), "ulog", path, fields)
     vehicle = OTHER_VEHICLES.get(int(notes["parameters"].get("MAV_TYPE", 0)))
     if vehicle:
-        raise LogError(f"{path}: found a log of {vehicle} (MAV_TYPE), expected one of a multicopter")
+        raise LogError(
+            f"{path}: found a log of {vehicle} (MAV_TYPE), expected one of a multicopter"
+        )
     topics: dict[str, dict[int, dict[str, np.ndarray]]] = {}
     for (topic, instance, field), values in zip(notes["fields"], arrays, strict=True):
         topics.setdefault(topic, {}).setdefault(instance, {})[field] = values
@@ -163,7 +197,9 @@ def _best_instance(
 ) -> tuple[Samples, Clock, list[str]] | None:
     """Return ``_samples_of`` the instance of a topic that has most valid ones; of equal ones the first."""
     found = [_samples_of(path, name, topic, fields) for topic in instances.values()]
-    return max((one for one in found if one is not None), key=lambda one: len(one[0].times), default=None)
+    return max(
+        (one for one in found if one is not None), key=lambda one: len(one[0].times), default=None
+    )
 
 
 def _samples_of(
@@ -201,9 +237,13 @@ def _attitude(path: Path, samples: Samples) -> Samples:
     times, quat = samples
     is_unit = abs(np.linalg.norm(quat, axis=1) - 1.0) <= LARGEST_NORM_ERROR
     if not is_unit.any():
-        raise LogError(f"{path}: topic vehicle_attitude: q: found no unit quaternion, expected norm 1")
+        raise LogError(
+            f"{path}: topic vehicle_attitude: q: found no unit quaternion, expected norm 1"
+        )
     attitude = Rotation.from_quat(quat[is_unit], scalar_first=True)
-    return Samples(times[is_unit], quaternion_from(attitude, is_body_turned=True, is_world_turned=True))
+    return Samples(
+        times[is_unit], quaternion_from(attitude, is_body_turned=True, is_world_turned=True)
+    )
 
 
 def _commands(setpoints: np.ndarray, full_stick: np.ndarray) -> np.ndarray:
@@ -218,7 +258,9 @@ def _check_full_stick(path: Path, commands: np.ndarray, full_stick: np.ndarray) 
     if largest.max() > 1.0 + COMMAND_MARGIN:
         asked = ", ".join(f"{value:.4g}" for value in largest * full_stick)
         known = ", ".join(f"{value:.4g}" for value in full_stick)
-        needed = ", ".join(f"{value:.0f}" for value in np.ceil(np.maximum(largest, 1.0) * full_stick))
+        needed = ", ".join(
+            f"{value:.0f}" for value in np.ceil(np.maximum(largest, 1.0) * full_stick)
+        )
         found = f"roll, pitch, yaw: found setpoints of up to {asked} deg/s"
         expected = f"expected at most full stick, {known} deg/s"
         advice = f"in a mapping, craft.max_rate_deg_s = [{needed}] raises it"

@@ -1,7 +1,7 @@
 """Conversion of units and frames to ours.
 
-Ours: SI units; world z up, body x forward, y left, z up; quaternions (w, x, y, z), body to world. A world
-with z up is ours whichever way its x points (north, east, or where the drone stood).
+Ours: SI units; world z up, body x forward, y left, z up; quaternions (w, x, y, z), body to world. A
+world with z up is ours whichever way its x points (north, east, or where the drone stood).
 """
 
 import numpy as np

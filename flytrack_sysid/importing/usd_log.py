@@ -2,9 +2,9 @@
 
 Little-endian: a byte 0xBC, version and number of event types (uint16 each); of each type its number
 (uint16), its name, its number of variables (uint16) and their names with a struct format, as in
-``gyro.x(f)``; names end in a zero byte. Then records: number of the type, time (version 1: uint32, ms;
-version 2: uint64, us), values; a CRC-32 ends the file. Source: bitcraze/crazyflie-firmware, docs and
-tools/usdlog.
+``gyro.x(f)``; names end in a zero byte. Then records: number of the type, time (version 1: uint32,
+ms; version 2: uint64, us), values; a CRC-32 ends the file. Source: bitcraze/crazyflie-firmware,
+docs and tools/usdlog.
 """
 
 import struct
@@ -52,9 +52,7 @@ def read_usd(path: Path, mapping: Mapping) -> ImportedFlight:
     flight = flight_of_topics(str(path), topics, mapping)
     if is_whole:
         return flight
-    note = (
-        f"{path}: damaged or cut off: the checksum is wrong; the first {end} of {len(content)} bytes are used"
-    )
+    note = f"{path}: damaged or cut off: the checksum is wrong; the first {end} of {len(content)} bytes are used"
     return flight._replace(notes=(note, *flight.notes))
 
 
@@ -103,8 +101,12 @@ def _find_records(content: bytes, place: int, end: int, events: dict[int, _Event
 def _table(path: Path, content: bytes, event: _Event, stamp_s: float, wanted: set[str]) -> Table:
     """Return the wanted variables of an event's records, and their times, s."""
     size = event.layout.itemsize
-    rows = np.frombuffer(content, np.uint8)[np.add.outer(np.array(event.starts, int), np.arange(size))]
+    rows = np.frombuffer(content, np.uint8)[
+        np.add.outer(np.array(event.starts, int), np.arange(size))
+    ]
     records = rows.reshape(-1, size).view(event.layout)[:, 0]
     with np.errstate(invalid="ignore"):  # damaged numbers may be NaN of the signalling kind
-        columns = {name: records[name].astype(float) for name in event.layout.names or () if name in wanted}
+        columns = {
+            name: records[name].astype(float) for name in event.layout.names or () if name in wanted
+        }
     return Table(str(path), {**columns, TIMESTAMP: records[TIMESTAMP] * stamp_s})

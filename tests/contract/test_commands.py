@@ -19,9 +19,13 @@ from tests.support.pages import ROOT, commands
 from tests.support.slow import slow_but
 
 PAGES = ("README.md", "docs/quick_start.md")
-LINES = sorted({line for page in PAGES for line in commands((ROOT / page).read_text(encoding="utf-8"))})
+LINES = sorted(
+    {line for page in PAGES for line in commands((ROOT / page).read_text(encoding="utf-8"))}
+)
 # A flag, what it takes, and its help: two spaces or a new line part them.
-ENTRY = re.compile(r"^ *((?:-\w, )?--[a-z].*?)(?: {2,}|\n)(.*?)(?=^ *(?:-\w, )?--[a-z]|\Z)", re.M | re.S)
+ENTRY = re.compile(
+    r"^ *((?:-\w, )?--[a-z].*?)(?: {2,}|\n)(.*?)(?=^ *(?:-\w, )?--[a-z]|\Z)", re.M | re.S
+)
 WITHOUT = """
 import sys
 from importlib.machinery import PathFinder
@@ -52,7 +56,9 @@ def help_of(*arguments: str) -> str:
 def test_a_command_of_the_docs_and_its_flags_exist(line: str) -> None:
     words = shlex.split(line)
     if words[0] == "make":
-        assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+        assert re.search(
+            rf"^{words[1]}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE
+        )
     elif words[0] == "flytrack" and words[1] in COMMANDS:
         flags = [word for word in words if word.startswith("--")]
         text = help_of(words[1])
@@ -64,17 +70,29 @@ def test_a_command_of_the_docs_and_its_flags_exist(line: str) -> None:
 @pytest.mark.parametrize("name", [*COMMANDS, "", "firmware build"])
 def test_every_flag_says_what_it_does(name: str) -> None:
     entries = ENTRY.findall(help_of(*name.split()))
-    bare = [flag for flag, text in entries if not re.search(r"[a-z]{2}", re.sub(r"\([^()]*\)", "", text))]
+    bare = [
+        flag
+        for flag, text in entries
+        if not re.search(r"[a-z]{2}", re.sub(r"\([^()]*\)", "", text))
+    ]
     assert not bare and "None" not in help_of(*name.split()), bare
     assert entries or name == "firmware" or "cannot be shown" in help_of(name)
 
 
 @pytest.mark.parametrize(
     "name",
-    slow_but(["demo", "train", "collect"], [name for name, command in COMMANDS.items() if command.extra]),
+    slow_but(
+        ["demo", "train", "collect"], [name for name, command in COMMANDS.items() if command.extra]
+    ),
 )
-def test_without_its_extra_a_command_helps_and_says_what_to_install(name: str, tmp_path: Path) -> None:
-    words = {"fit": ["log", "--out", "o"], "validate": ["m", "l", "--out", "o"], "plan": ["d", "--out", "o"]}
+def test_without_its_extra_a_command_helps_and_says_what_to_install(
+    name: str, tmp_path: Path
+) -> None:
+    words = {
+        "fit": ["log", "--out", "o"],
+        "validate": ["m", "l", "--out", "o"],
+        "plan": ["d", "--out", "o"],
+    }
     words |= {"collect": ["--out", "o"], "diagnose": ["log", "--out", "o"]}
     words |= {"import": ["f", "--format", "csv", "--out", "o"]}
     blocked = "tqdm,matplotlib,rerun,optax,distrax,onnx,safetensors,mlflow,pygame"
@@ -92,9 +110,13 @@ def test_without_its_extra_a_command_helps_and_says_what_to_install(name: str, t
 def test_the_list_of_commands_is_quick_and_the_version_that_of_the_package(capsys) -> None:
     started = time.perf_counter()
     code = "import sys; from flytrack.cli import main\ntry: main(['--help'])\nfinally: print([*sys.modules])"
-    shown = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True).stdout
+    shown = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True
+    ).stdout
     assert time.perf_counter() - started < 5.0  # 0.1 s, on a machine that does nothing else
-    assert all(f"\n    {name} " in shown and command.summary in shown for name, command in COMMANDS.items())
+    assert all(
+        f"\n    {name} " in shown and command.summary in shown for name, command in COMMANDS.items()
+    )
     assert "'argparse'" in shown and not re.search(r"'(jax|numpy|tyro)'", shown)
     with pytest.raises(SystemExit, match="2"):
         main(["land"])

@@ -23,7 +23,14 @@ REFERENCE = {
 }
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 FAST = "environment.md"  # one page's examples run in the fast tests
-RUN = ("wrappers.md", "effects.md", "gymnasium.md", "pictures.md", "identification.md", "real_logs.md")
+RUN = (
+    "wrappers.md",
+    "effects.md",
+    "gymnasium.md",
+    "pictures.md",
+    "identification.md",
+    "real_logs.md",
+)
 RUN = (FAST, *RUN, "diagnosis.md", "quick_start.md", "faq.md")
 
 
@@ -66,5 +73,7 @@ def test_page_of_a_track_has_the_headings_of_its_gates(name: str) -> None:
     track = load_track(name)
     forward = np.stack(build_course(track).gates.forward, axis=-1)[:, :2]
     headings = np.deg2rad([heading_deg for _, _, heading_deg, _ in gate_rows(track)])
-    np.testing.assert_allclose(forward, np.stack([np.cos(headings), np.sin(headings)], -1), atol=1e-5)
+    np.testing.assert_allclose(
+        forward, np.stack([np.cos(headings), np.sin(headings)], -1), atol=1e-5
+    )
     assert BLOCK.search(track_page(name)) and (DOCS / "tracks" / f"{name}.png").is_file()

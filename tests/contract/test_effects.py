@@ -43,7 +43,9 @@ OVER_EFFECTS = pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: eff
 
 # A loop is unstable towards the ends of its ranges, and nothing of it acts without a craft.
 SHOWING = {"center_x": 0.05, "center_y": 0.05, "gyro_late_s": 0.002, "d_yaw": 5.0, "d_max_yaw": 8.0}
-RACER = BetaflightLoop(20.0, 21.0, 2.0, 2.0, 0.02, 0.5, **SHOWING, thrust_linear=20.0, throttle_boost=10.0)
+RACER = BetaflightLoop(
+    20.0, 21.0, 2.0, 2.0, 0.02, 0.5, **SHOWING, thrust_linear=20.0, throttle_boost=10.0
+)
 
 
 def inside_ranges(effect: Effect, fraction: float) -> Any:
@@ -51,11 +53,14 @@ def inside_ranges(effect: Effect, fraction: float) -> Any:
     neutral = effect.parameters()
     if "respond" in effect.hooks and fraction > 0.0:
         return RACER
-    values = (n + fraction * (r.high - n) for n, r in zip(neutral, effect.ranges.values(), strict=True))
+    values = (
+        n + fraction * (r.high - n) for n, r in zip(neutral, effect.ranges.values(), strict=True)
+    )
     return effect.parameters(*values)
 
 
-# A loop takes the place of lags, so that it is alone; others that act at one stage are in different groups.
+# A loop takes the place of lags, so that it is alone; others that act at one stage are in different
+# groups.
 WITHOUT_LOOP = [effect for effect in EFFECTS if "respond" not in effect.hooks]
 GROUPS = {"all": EFFECTS, "loop": [effect for effect in EFFECTS if "respond" in effect.hooks]}
 GROUPS |= {f"every fifth from {first}": WITHOUT_LOOP[first::5] for first in range(5)}
@@ -67,7 +72,9 @@ def test_neutral_equals_absent_bit_for_bit(group: str) -> None:
     assert jax.tree.structure(with_neutral) != jax.tree.structure(NOMINAL)
     for seed in range(2):
         drone, commands = random_drone(seed), random_commands(seed, NUM_STEPS)
-        np.testing.assert_array_equal(fly(drone, commands, with_neutral), fly(drone, commands, NOMINAL))
+        np.testing.assert_array_equal(
+            fly(drone, commands, with_neutral), fly(drone, commands, NOMINAL)
+        )
 
 
 @OVER_EFFECTS
@@ -81,7 +88,9 @@ def test_declaration_is_consistent(effect: Effect) -> None:
     for name, bounds in effect.ranges.items():
         value = getattr(neutral, name)
         assert bounds.low <= value <= bounds.high and bounds.low < bounds.high and bounds.unit
-        assert all(bounds.low <= probe <= bounds.high for probe in effect.search.probes.get(name, ()))
+        assert all(
+            bounds.low <= probe <= bounds.high for probe in effect.search.probes.get(name, ())
+        )
         if name in effect.notable:
             assert effect.notable[name] > 0.0 and value + effect.notable[name] <= bounds.high
     for stage, channel in (("gyro", "w"), ("accelerometer", "f"), ("battery", "v_bat")):
@@ -103,15 +112,23 @@ def test_probes_show_the_effect(effect: Effect) -> None:
     for name, values in effect.search.probes.items():
         for value in values:
             start = effect.parameters() if "respond" not in effect.hooks else RACER
-            assert not np.array_equal(flown(start._replace(**{name: value}), full_stick, drone), plain)
+            assert not np.array_equal(
+                flown(start._replace(**{name: value}), full_stick, drone), plain
+            )
 
 
-# Components of the state and of the sensors' readings after one step that an effect at this stage may change.
+# Components of the state and of the sensors' readings after one step that an effect at this stage
+# may change.
 GYRO, ACCELEROMETER, POSE = {*range(21, 24)}, {*range(24, 27)}, {*range(27, 37)}
 FORCE = {*range(0, 9), *range(27, 33)} | ACCELEROMETER
 TURN = {*range(9, 16), *range(33, 37)} | GYRO
 CHANGES = {"command": set(range(37)) - {20}, "rates": TURN, "thrust": FORCE, "air": FORCE}
-CHANGES |= {"lag": CHANGES["command"], "respond": CHANGES["command"], "force": FORCE, "battery": {20}}
+CHANGES |= {
+    "lag": CHANGES["command"],
+    "respond": CHANGES["command"],
+    "force": FORCE,
+    "battery": {20},
+}
 CHANGES |= {"gyro": GYRO, "accelerometer": ACCELEROMETER, "pose": POSE}
 
 
@@ -119,7 +136,9 @@ CHANGES |= {"gyro": GYRO, "accelerometer": ACCELEROMETER, "pose": POSE}
 def test_changes_what_its_stages_may_and_nothing_else(effect: Effect) -> None:
     drone = random_drone(0)._replace(applied=Action(0.3, -0.2, 0.1, 0.5))
     # What sensors read never changes the flight; other effects change more in later steps.
-    falling = held(30 if effect.acts_on == ("sensor",) else 1, roll=0.9, pitch=-0.8, yaw=0.7, thrust=-0.5)
+    falling = held(
+        30 if effect.acts_on == ("sensor",) else 1, roll=0.9, pitch=-0.8, yaw=0.7, thrust=-0.5
+    )
     difference = flown(inside_ranges(effect, 0.8), falling, drone) != flown((), falling, drone)
     changed = set(np.flatnonzero(difference.any(axis=0)).tolist())
     allowed = set().union(*(CHANGES[stage] for stage in effect.stages))
@@ -128,7 +147,9 @@ def test_changes_what_its_stages_may_and_nothing_else(effect: Effect) -> None:
 
 
 @jax.jit
-def final_and_slope(effects: tuple[Any, ...], change: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
+def final_and_slope(
+    effects: tuple[Any, ...], change: tuple[Any, ...]
+) -> tuple[jax.Array, jax.Array]:
     """Return the last row of a short flight, (37,), and its derivative along a change of the parameters."""
     drone, commands = random_drone(1), 0.9 * random_commands(1, 14)
 
@@ -171,7 +192,9 @@ def test_gradients_are_finite_and_right(effect: Effect, fraction: float) -> None
 
 
 @pytest.mark.parametrize(
-    "effect", [effect for effect in EFFECTS if "rates" in effect.hooks], ids=lambda effect: effect.name
+    "effect",
+    [effect for effect in EFFECTS if "rates" in effect.hooks],
+    ids=lambda effect: effect.name,
 )
 def test_rates_of_a_start_stay_while_its_sticks_are_held(effect: Effect) -> None:
     drone, parameters = random_drone(5), inside_ranges(effect, 0.5)
@@ -190,9 +213,17 @@ steady_rates = jax.jit(start_rates)
 @pytest.mark.parametrize(
     ("parameters", "dt", "expected"),
     [
-        (CommandDelay(0.05), 0.01, r"command_delay\.delay_s: found 0.05, expected 0 to 0.04 s at steps of"),
+        (
+            CommandDelay(0.05),
+            0.01,
+            r"command_delay\.delay_s: found 0.05, expected 0 to 0.04 s at steps of",
+        ),
         (CommandDelay(np.nan), 0.01, r"found nan, expected 0 to "),
-        (ImuLatency(0.03), 0.005, r"imu_latency\.latency_s: found 0.03, expected 0 to 0.02 s at steps"),
+        (
+            ImuLatency(0.03),
+            0.005,
+            r"imu_latency\.latency_s: found 0.03, expected 0 to 0.02 s at steps",
+        ),
     ],
 )
 def test_parameters_out_of_range_are_refused(parameters: Any, dt: float, expected: str) -> None:
@@ -202,7 +233,9 @@ def test_parameters_out_of_range_are_refused(parameters: Any, dt: float, expecte
 
 
 def test_effects_stand_in_the_order_of_the_list_and_replace_their_like() -> None:
-    model = NOMINAL.with_effects(LinearDrag(0.1), CommandDelay(0.01)).with_effects(Wind(1.0), LinearDrag(0.2))
+    model = NOMINAL.with_effects(LinearDrag(0.1), CommandDelay(0.01)).with_effects(
+        Wind(1.0), LinearDrag(0.2)
+    )
     assert model.effects == (CommandDelay(0.01), Wind(1.0), LinearDrag(0.2))
     assert model.effect("linear_drag") == LinearDrag(0.2)
     assert model.effect("thrust_scale") == ThrustScale(1.0)  # absent is neutral
@@ -217,5 +250,7 @@ def test_what_is_no_effect_is_refused() -> None:
 
 
 def test_the_packed_step_refuses_a_memory() -> None:
-    with pytest.raises(ValueError, match=r"params\.effects: found one with a memory, expected none"):
+    with pytest.raises(
+        ValueError, match=r"params\.effects: found one with a memory, expected none"
+    ):
         step(pack(drone_with()), jnp.zeros(4), DT, NOMINAL.with_effects(CommandDelay(0.0)))

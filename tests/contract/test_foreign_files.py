@@ -38,9 +38,24 @@ from tests.support.slow import slow_but
 from tests.support.written_logs import read_mapping
 
 CPU_S, LONGEST_MESSAGE, NUM_FILES, NUM_SLOW_FILES = 10.0, 2000, 60, 3
-TOKENS = (b"nan", b"1e999", b"-1", b"null", b'"', b"\n", b"\0", b"\xff", b",", b"[" * 2000, b"9" * 5000)
+TOKENS = (
+    b"nan",
+    b"1e999",
+    b"-1",
+    b"null",
+    b'"',
+    b"\n",
+    b"\0",
+    b"\xff",
+    b",",
+    b"[" * 2000,
+    b"9" * 5000,
+)
 SETTINGS = b"total_timesteps = 2e6\nhidden_sizes = [64, 64]\nlearning_rate = 3e-4\n"
-STATES, ACTIONS = np.tile(black_boxes.start(), (12, 1)), np.random.default_rng(0).uniform(-1.0, 1.0, (12, 4))
+STATES, ACTIONS = (
+    np.tile(black_boxes.start(), (12, 1)),
+    np.random.default_rng(0).uniform(-1.0, 1.0, (12, 4)),
+)
 
 
 class Trap:
@@ -90,7 +105,11 @@ def hostile_arrays(content: bytes) -> list[bytes]:
     """Return archives with pickles, arrays of other sizes than declared, and bombs."""
     arrays = dict(np.load(io.BytesIO(content)))
     name = next(iter(arrays))
-    odd = (np.array([print], object), np.zeros(2**27, np.int8), np.full(8, 2**31 - 1, np.int32).view("<U1"))
+    odd = (
+        np.array([print], object),
+        np.zeros(2**27, np.int8),
+        np.full(8, 2**31 - 1, np.int32).view("<U1"),
+    )
     header = npz(arrays).replace(b"'shape': (", b"'shape': (9")
     version = content.replace(b"\x93NUMPY\x01", b"\x93NUMPY\x02")
     unannounced = io.BytesIO()
@@ -103,13 +122,27 @@ def hostile_arrays(content: bytes) -> list[bytes]:
 
 def hostile_texts(content: bytes) -> list[bytes]:
     """Return texts that are very long, nested deeply, or have keys of very many parts."""
-    dots, nested = b"\n".join(b"a%d" % number + b".a" * 999 + b" = 1" for number in range(100)), b"[" * 10**5
-    return [content + b" " * 2**26, content + b"x" * 2**22, nested, b"a = " + nested, dots, b"9" * 10**5]
+    dots, nested = (
+        b"\n".join(b"a%d" % number + b".a" * 999 + b" = 1" for number in range(100)),
+        b"[" * 10**5,
+    )
+    return [
+        content + b" " * 2**26,
+        content + b"x" * 2**22,
+        nested,
+        b"a = " + nested,
+        dots,
+        b"9" * 10**5,
+    ]
 
 
 def hostile_gzips(_: bytes) -> list[bytes]:
     """Return compressed files that unpack to 256 MiB, or have 100,000 parts."""
-    return [gzip.compress(b"0," * 2**27, 1), gzip.compress(b"\n" * 2**28, 1), gzip.compress(b"") * 100_000]
+    return [
+        gzip.compress(b"0," * 2**27, 1),
+        gzip.compress(b"\n" * 2**28, 1),
+        gzip.compress(b"") * 100_000,
+    ]
 
 
 def import_mapped(path: Path, form: str) -> Any:
@@ -149,11 +182,17 @@ KINDS = {
     "flight log, .csv": Kind(".csv", save_log, sysid.load_log, LogError, hostile_texts),
     "script": Kind(".npz", save_script, sysid.load_script, sysid.ScriptError, hostile_arrays),
     "reference": Kind(".npz", REFERENCE, load_reference, ReferenceFileError, hostile_arrays),
-    "import mapping": Kind(".toml", read_mapping("csv").encode(), load_mapping, LogError, hostile_texts),
+    "import mapping": Kind(
+        ".toml", read_mapping("csv").encode(), load_mapping, LogError, hostile_texts
+    ),
     "imported CSV": Kind(".csv", CSV, load_csv, LogError, hostile_texts),
-    "imported CSV, gzip": Kind(".csv.gz", gzip.compress(CSV, mtime=0), load_csv, LogError, hostile_gzips),
+    "imported CSV, gzip": Kind(
+        ".csv.gz", gzip.compress(CSV, mtime=0), load_csv, LogError, hostile_gzips
+    ),
     "imported PX4 log": Kind(".ulg", foreign_logs.ulog(), load_ulog, LogError, is_slow=True),
-    "imported Betaflight log": Kind(".bbl", foreign_logs.betaflight(), load_blackbox, LogError, is_slow=True),
+    "imported Betaflight log": Kind(
+        ".bbl", foreign_logs.betaflight(), load_blackbox, LogError, is_slow=True
+    ),
     "imported ArduPilot log": Kind(
         ".bin",
         foreign_logs.small_dataflash(1.0 + 0.01 * np.arange(30)),
@@ -166,7 +205,11 @@ KINDS = {
     "training settings": Kind(".toml", SETTINGS, read_config_file, ConfigError, hostile_texts),
     "checkpoint": Kind(CHAMPION.suffix, CHAMPION.read_bytes(), load_checkpoint, CheckpointError),
     "black box": Kind(
-        ".bin", black_boxes.SHIPPED.read_bytes(), blackbox.load, blackbox.BlackBoxError, is_slow=True
+        ".bin",
+        black_boxes.SHIPPED.read_bytes(),
+        blackbox.load,
+        blackbox.BlackBoxError,
+        is_slow=True,
     ),
 }
 SLOW = {"imported CSV, gzip", "black box"}  # seconds for the crafted files
@@ -183,7 +226,12 @@ def damaged(draw: st.DrawFn, valid: bytes) -> bytes:
         start = draw(st.integers(0, len(content)))
         end = min(start + draw(st.integers(0, 40)), len(content))
         part = content[start:end]
-        new = draw(st.sampled_from(TOKENS) | st.binary(max_size=8) | st.just(part * 2) | st.just(part[::-1]))
+        new = draw(
+            st.sampled_from(TOKENS)
+            | st.binary(max_size=8)
+            | st.just(part * 2)
+            | st.just(part[::-1])
+        )
         content = content[:start] + new + (content[end:] if draw(st.integers(0, 9)) else b"")
     return gzip.compress(content, 1) if is_packed else content
 
@@ -199,7 +247,9 @@ def damaged_arrays(draw: st.DrawFn, valid: bytes) -> bytes:
     changed.flat[draw(st.integers(0, other.size - 1))] = draw(st.floats())
     odd = [changed, other[:-1], other[None], other.astype(np.int8), np.float64(1.0)]
     new = draw(st.none() | st.sampled_from(odd))
-    return npz(arrays if new is None else {**arrays, draw(st.sampled_from([name, "../other"])): new})
+    return npz(
+        arrays if new is None else {**arrays, draw(st.sampled_from([name, "../other"])): new}
+    )
 
 
 def loaded_or_refused(kind: Kind, path: Path) -> bool:
@@ -256,14 +306,19 @@ def test_damaged_and_hostile_files_are_loaded_or_refused(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_no_such_file_is_refused(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_such_file_is_refused(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     contents = {
         "garbage": b"\x80\x01\xff garbage",
         "pickle": pickle.dumps(Trap()),
         "cut": KINDS[kind].content(tmp_path)[:40],
     }
-    paths = [Path(name + KINDS[kind].suffix) for name in ("missing", "folder", "pipe", "device", *contents)]
+    paths = [
+        Path(name + KINDS[kind].suffix)
+        for name in ("missing", "folder", "pipe", "device", *contents)
+    ]
     paths[1].mkdir()
     os.mkfifo(paths[2])
     paths[3].symlink_to("/dev/zero")
@@ -274,7 +329,9 @@ def test_what_is_no_such_file_is_refused(kind: str, tmp_path: Path, monkeypatch:
             KINDS[kind].load(path)
 
 
-def test_compressed_logs_are_read_and_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compressed_logs_are_read_and_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(log_file, "PACKED_BYTES", 50_000)
     text, mapping = CSV, tmp_path / "map.toml"
     mapping.write_text(read_mapping("csv"))

@@ -40,7 +40,9 @@ CRASH = np.full(4, np.nan, np.float32)  # an action that ends the episode
 
 def make_vector(env_id: str = BASE, num_envs: int = 3, **arguments: Any) -> Any:
     """Return the vector environment of an id."""
-    return gymnasium.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **arguments)
+    return gymnasium.make_vec(
+        env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **arguments
+    )
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +57,9 @@ def still(params: EnvParams) -> EnvParams:
 # --- Registration and the protocol --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("case", slow_but(CHECKED, sorted({*CHECKED, *((one, ()) for one in IDS)})), ids=str)
+@pytest.mark.parametrize(
+    "case", slow_but(CHECKED, sorted({*CHECKED, *((one, ()) for one in IDS)})), ids=str
+)
 def test_checker_of_gymnasium_gives_no_warning(case: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     env_id, missing = case
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
@@ -76,7 +80,10 @@ def test_ids_are_registered_once_and_without_a_second_time_limit(env_id: str) ->
     while isinstance(env, gymnasium.Wrapper):
         assert not isinstance(env, TimeLimit)
         env = env.env
-    assert np.isfinite(env.observation_space.low).all() and np.isfinite(env.observation_space.high).all()
+    assert (
+        np.isfinite(env.observation_space.low).all()
+        and np.isfinite(env.observation_space.high).all()
+    )
 
 
 def test_single_environment_agrees_with_gymnax(env: FlyTrack, still: EnvParams) -> None:
@@ -86,7 +93,9 @@ def test_single_environment_agrees_with_gymnax(env: FlyTrack, still: EnvParams) 
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (12, 4)).astype(np.float32)
     actions[:, 3] = 0.5  # off the ground
     for index, action in enumerate(actions):
-        _, state, reward, terminated, truncated, info = env.step(key, state, jnp.asarray(action), still)
+        _, state, reward, terminated, truncated, info = env.step(
+            key, state, jnp.asarray(action), still
+        )
         observation, *outcome, own_info = single.step(action)
         np.testing.assert_allclose(observation, info["final_observation"], atol=2e-5)
         np.testing.assert_allclose(outcome[0], reward, atol=2e-5)
@@ -124,17 +133,28 @@ NEXT_STEP, SAME_STEP = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP
         *((mode, wrappers.RecordEpisodeStatistics) for mode in (NEXT_STEP, SAME_STEP)),
         (NEXT_STEP, wrappers.NormalizeObservation),
         (NEXT_STEP, wrappers.FlattenObservation),
-        (NEXT_STEP, partial(wrappers.RescaleObservation, min_obs=np.float32(-1), max_obs=np.float32(1))),
-        (NEXT_STEP, partial(wrappers.TransformObservation, func=lambda observation: 2 * observation)),
+        (
+            NEXT_STEP,
+            partial(wrappers.RescaleObservation, min_obs=np.float32(-1), max_obs=np.float32(1)),
+        ),
+        (
+            NEXT_STEP,
+            partial(wrappers.TransformObservation, func=lambda observation: 2 * observation),
+        ),
         (NEXT_STEP, partial(wrappers.DtypeObservation, dtype=np.float64)),
     ],
 )
-@pytest.mark.filterwarnings("ignore:overflow encountered in cast")  # of the limits, in DtypeObservation
+@pytest.mark.filterwarnings(
+    "ignore:overflow encountered in cast"
+)  # of the limits, in DtypeObservation
 def test_vector_environment_returns_what_gymnasiums_own_does(
     mode: AutoresetMode, wrapper: Any, still: EnvParams
 ) -> None:
     make = partial(gymnasium.make, BASE, params=still)
-    plain = (make_vector(params=still, autoreset_mode=mode), SyncVectorEnv([make] * 3, autoreset_mode=mode))
+    plain = (
+        make_vector(params=still, autoreset_mode=mode),
+        SyncVectorEnv([make] * 3, autoreset_mode=mode),
+    )
     assert plain[0].metadata["autoreset_mode"] is plain[0].autoreset_mode is mode
     ours, theirs = map(wrapper, plain)
     assert ours.observation_space == theirs.observation_space
@@ -160,7 +180,9 @@ def test_vector_seeds() -> None:
     seeds, crash = [20, 21, 22], np.tile(CRASH, (3, 1))
     observations, _ = env.reset(seed=20)
     np.testing.assert_array_equal(observations, env.reset(seed=seeds)[0])
-    np.testing.assert_allclose(observations, [single.reset(seed=seed)[0] for seed in seeds], atol=1e-6)
+    np.testing.assert_allclose(
+        observations, [single.reset(seed=seed)[0] for seed in seeds], atol=1e-6
+    )
     env.reset(seed=20)
     after = env.step(crash)[0]
     env.reset(seed=20)
@@ -192,7 +214,12 @@ def test_copies_fly_on_alike_and_apart(is_vector: bool) -> None:
 
 # --- Options of reset ---------------------------------------------------------------------------
 
-POSE = {"position": (15.0, 2.5, 1.2), "yaw_deg": 180.0, "velocity": [-9.0, 0.0, 1.0], "battery_v": 22.5}
+POSE = {
+    "position": (15.0, 2.5, 1.2),
+    "yaw_deg": 180.0,
+    "velocity": [-9.0, 0.0, 1.0],
+    "battery_v": 22.5,
+}
 
 
 @pytest.mark.parametrize("is_vector", [False, True])
@@ -200,7 +227,18 @@ def test_options_set_the_start_of_one_episode(is_vector: bool) -> None:
     env = make_vector() if is_vector else gymnasium.make(BASE)
     observation = np.atleast_2d(env.reset(seed=0, options=POSE)[0])
     # Gate 0 at (12.5, 2, 1.35) is flown towards -x.
-    expected = [-2.5 / 3, -0.5 / 3, -0.15 / 3, 9 / 5, 0.0, 1 / 5, *np.eye(3).ravel(), *[0.0] * 6, -1.0, -0.5]
+    expected = [
+        -2.5 / 3,
+        -0.5 / 3,
+        -0.15 / 3,
+        9 / 5,
+        0.0,
+        1 / 5,
+        *np.eye(3).ravel(),
+        *[0.0] * 6,
+        -1.0,
+        -0.5,
+    ]
     np.testing.assert_allclose(observation[:, :23], [expected] * len(observation), atol=1e-5)
     following = np.atleast_2d(env.reset()[0])
     assert (abs(following[:, 22] + 0.5) > 1e-3).all()
@@ -222,7 +260,10 @@ def test_bad_options_are_refused_and_change_nothing(options: Any, message: str) 
 
 
 def test_arguments_reach_the_environment(params: EnvParams) -> None:
-    beside = {"position": (-0.05, 4.0, 2.0), "velocity": (10.0, 0.0, 0.0)}  # past a gate, outside its frame
+    beside = {
+        "position": (-0.05, 4.0, 2.0),
+        "velocity": (10.0, 0.0, 0.0),
+    }  # past a gate, outside its frame
     beside["track"] = track_of_row([10.0 * index for index in range(8)])
     for arguments, is_end in (({"missed_gate": "fly_on"}, False), ({}, True)):
         env = gymnasium.make(BASE, **arguments)
@@ -249,7 +290,9 @@ def test_wrong_use_is_refused() -> None:
             type(each)(BASE, render_mode="ansi")
     with pytest.raises(ValueError, match="num_envs: found 0"):
         make_vector(num_envs=0)
-    with pytest.raises(ValueError, match="autoreset_mode: found 'Disabled', expected 'NextStep' or"):
+    with pytest.raises(
+        ValueError, match="autoreset_mode: found 'Disabled', expected 'NextStep' or"
+    ):
         make_vector(autoreset_mode=AutoresetMode.DISABLED)
 
 

@@ -57,7 +57,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         save_log(folder / f"{name}.npz", one)
     save_model(folder / "model.json", nominal_parameters(), {})
     for every in ("x", 0):
-        learnt_from = {"data": {"file": "log.npz", "sha256": log.sha256}, "split": {"held_out_every": every}}
+        learnt_from = {
+            "data": {"file": "log.npz", "sha256": log.sha256},
+            "split": {"held_out_every": every},
+        }
         save_model(folder / f"held_out_{every}.json", nominal_parameters(), learnt_from)
     return folder
 

@@ -47,7 +47,10 @@ def test_every_id_follows_gymnaxs_protocol(env_id: str) -> None:
         env.step, key, begun[1], action, params
     )
     assert (observation, state) == begun and info["final_observation"] == observation
-    assert (observation.shape, observation.dtype) == (env.observation_space(params).shape, np.float32)
+    assert (observation.shape, observation.dtype) == (
+        env.observation_space(params).shape,
+        np.float32,
+    )
     assert reward == jax.ShapeDtypeStruct((), np.float32)
     assert terminated == truncated == jax.ShapeDtypeStruct((), bool)
     assert {*CAUSES, *RACE, "terminated", "truncated"} < info.keys()
@@ -78,12 +81,22 @@ WRONG_CALLS = {
     "env_id: found 'FlyTrack-v9', expected one of .*FlyTrack-v0": lambda: make("FlyTrack-v9"),
     "argument 'trak'; did you mean 'track'": lambda: gymnax.make("FlyTrack-v0", trak="split_s"),
     "argument 'wind'; expected one of track, .*reward": lambda: make("FlyTrack-v0", wind=3),
-    "argument 'rende'; did you mean 'render_mode'": lambda: gymnasium.make("FlyTrack-v0", rende="human"),
-    "argument 'reset_mode'; did you mean 'auto": lambda: gymnasium.make_vec("FlyTrack-v0", reset_mode=1),
-    "key: found 0, expected a key of JAX, such as jax.random.key": lambda: make("FlyTrack-v0").reset(0),
+    "argument 'rende'; did you mean 'render_mode'": lambda: gymnasium.make(
+        "FlyTrack-v0", rende="human"
+    ),
+    "argument 'reset_mode'; did you mean 'auto": lambda: gymnasium.make_vec(
+        "FlyTrack-v0", reset_mode=1
+    ),
+    "key: found 0, expected a key of JAX, such as jax.random.key": lambda: make(
+        "FlyTrack-v0"
+    ).reset(0),
     "key: found Array.*, expected a key of JAX": lambda: make("FlyTrack-v0").reset(jnp.zeros(2)),
-    "key: found keys of shape .1,.*jax.vmap": lambda: make("FlyTrack-v0").reset(jax.random.key(0)[None]),
-    "gymnax: found version 0.0.9, expected 1.0 or newer: pip install": lambda: check_gymnax("0.0.9"),
+    "key: found keys of shape .1,.*jax.vmap": lambda: make("FlyTrack-v0").reset(
+        jax.random.key(0)[None]
+    ),
+    "gymnax: found version 0.0.9, expected 1.0 or newer: pip install": lambda: check_gymnax(
+        "0.0.9"
+    ),
 }
 
 
@@ -104,7 +117,8 @@ def digest(env_id: str) -> str:
     return hashlib.sha256(b"".join(rows)).hexdigest()
 
 
-# The plain one runs every time: wrappers have fast tests of their own, and each id takes seconds to compile.
+# The plain one runs every time: wrappers have fast tests of their own, and each id takes seconds to
+# compile.
 @pytest.mark.parametrize("env_ids", slow_but([BASE], [BASE, tuple(ENVIRONMENTS)[1:]]))
 def test_identical_seeds_fly_identically_in_another_process(env_ids: tuple[str, ...]) -> None:
     code = f"from tests.contract.test_registration import digest; print(*map(digest, {env_ids!r}))"
@@ -142,15 +156,21 @@ def test_gradients_are_those_of_finite_differences(env_id: str) -> None:
     np.testing.assert_allclose(found, expected, rtol=0.02, atol=2e-3)
 
 
-def test_transition_gradients_are_detached_unless_asked_for(env: FlyTrack, params: EnvParams) -> None:
+def test_transition_gradients_are_detached_unless_asked_for(
+    env: FlyTrack, params: EnvParams
+) -> None:
     """In double precision, of a smooth scalar of observation, reward and next state, in action and speed."""
 
     def differentiable(env: FlyTrack, state: EnvState) -> Callable[..., jax.Array]:
         def scalar(action: jax.Array, speed: jax.Array) -> jax.Array:
             drone = env.drone(state)
             plant = state.plant._replace(drone=drone._replace(vel_w=drone.vel_w._replace(y=speed)))
-            observation, after, reward, *_ = env.step_env(None, state._replace(plant=plant), action, params)
-            squares = jnp.sum(observation**2) + sum(leaf**2 for leaf in jax.tree.leaves(after.plant))
+            observation, after, reward, *_ = env.step_env(
+                None, state._replace(plant=plant), action, params
+            )
+            squares = jnp.sum(observation**2) + sum(
+                leaf**2 for leaf in jax.tree.leaves(after.plant)
+            )
             return squares + 10.0 * env.transition_gradients_enabled * reward
 
         return scalar
@@ -158,7 +178,9 @@ def test_transition_gradients_are_detached_unless_asked_for(env: FlyTrack, param
     action, speed = np.array([0.2, -0.3, 0.4, 0.1]), np.array(1.5)
     with jax.enable_x64(True):
         state = env.begin(drone_at((15.0, 2.5, 1.0), (-5.0, 1.0, 0.5)), 0, params)
-        state = jax.tree.map(lambda leaf: leaf.astype(float) if leaf.dtype == jnp.float32 else leaf, state)
+        state = jax.tree.map(
+            lambda leaf: leaf.astype(float) if leaf.dtype == jnp.float32 else leaf, state
+        )
         detached = jax.jit(jax.grad(differentiable(env, state), argnums=(0, 1)))(action, speed)
         scalar = jax.jit(differentiable(env.with_transition_gradients(), state))
         gradient = jax.jit(jax.grad(scalar, argnums=(0, 1)))(action, speed)

@@ -14,7 +14,14 @@ from flytrack_sysid.diagnosis.identifiability import LANES_PER_MANOEUVRE, next_f
 from flytrack_sysid.diagnosis.lanes import LANE_S
 from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, HEIGHTS
 from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights_of, hover_action
-from flytrack_sysid.script_file import Script, ScriptError, check_script, load_script, save_script, script_of
+from flytrack_sysid.script_file import (
+    Script,
+    ScriptError,
+    check_script,
+    load_script,
+    save_script,
+    script_of,
+)
 from tests.support.black_boxes import SHIPPED
 from tests.support.handout_plant import HandoutPlant
 
@@ -32,7 +39,9 @@ def test_every_manoeuvre_can_be_flown_and_says_how():
     assert all(one.how.endswith(".") and len(one.how) > 20 for one in MANOEUVRES.values())
     assert FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S == LANES_PER_MANOEUVRE * LANE_S
     flights = script.commands.reshape(-1, FLIGHT_STEPS * 4)
-    assert len(np.unique(np.hstack([script.starts, flights]), axis=0)) == len(flights), "no flight twice"
+    assert len(np.unique(np.hstack([script.starts, flights]), axis=0)) == len(flights), (
+        "no flight twice"
+    )
 
 
 def test_hover_of_a_model():
@@ -88,12 +97,17 @@ def test_bad_scripts_are_refused(tmp_path, message):
 
 
 def asked(*pairs: tuple[str, str]) -> dict[str, Any]:
-    return {"schema": 1, "not_identifiable": [{"effect": effect, "fly": fly} for effect, fly in pairs]}
+    return {
+        "schema": 1,
+        "not_identifiable": [{"effect": effect, "fly": fly} for effect, fly in pairs],
+    }
 
 
 def test_a_diagnosis_asks_for_flights(tmp_path):
     path = tmp_path / "diagnosis.json"
-    path.write_text(json.dumps(asked(("gyro_scale", "spins"), ("wind", "headings"), ("imu_offset", "spins"))))
+    path.write_text(
+        json.dumps(asked(("gyro_scale", "spins"), ("wind", "headings"), ("imu_offset", "spins")))
+    )
     found = next_flight(path, nominal_parameters())
     assert found.reasons == {"headings": ("wind",), "spins": ("gyro_scale", "imu_offset")}
     assert found.script.kinds == ("headings",) * 8 + ("spins",) * 8
@@ -107,7 +121,10 @@ def test_a_diagnosis_asks_for_flights(tmp_path):
         ({"schema": 9, "not_identifiable": []}, "schema: found 9, expected 1"),
         ({"schema": 1}, "not_identifiable: found NoneType, expected a list"),
         (asked(), "not_identifiable: found nothing that another flight would settle"),
-        (asked(("wind", "headings"), ("wind", "loop")), r"not_identifiable\[1\]: fly: found 'loop'"),
+        (
+            asked(("wind", "headings"), ("wind", "loop")),
+            r"not_identifiable\[1\]: fly: found 'loop'",
+        ),
     ],
 )
 def test_what_is_no_diagnosis_is_refused(tmp_path, content, message):
@@ -128,5 +145,7 @@ def test_commands_plan_and_collect(tmp_path, capsys):
     main(["collect", "--black-box", str(SHIPPED), "--script", script, "--out", str(log)])
     assert load_log(log)["p"][:, 2].max() < HEIGHTS[0]
     with pytest.raises(SystemExit):
-        main(["collect", "--black-box", "x", "--script", script, "--minutes", "3", "--out", str(log)])
+        main(
+            ["collect", "--black-box", "x", "--script", script, "--minutes", "3", "--out", str(log)]
+        )
     assert "not allowed together" in capsys.readouterr().err

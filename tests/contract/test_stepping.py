@@ -16,10 +16,12 @@ from tests.support.slow import slow_but
 from tests.support.stepping import WAYS, XLA_FLAGS, flight, inputs
 
 PLAIN, EVERY_WRAPPER, SEVERAL_DRONES = "FlyTrack-v0", "FlyTrackRobust-v0", "FlyTrackDuel-v0"
-# Types and promotion are asked of every id without compiling it. Flights cost a compilation or more each:
-# they are of one id of each kind.
+# Types and promotion are asked of every id without compiling it. Flights cost a compilation or more
+# each: they are of one id of each kind.
 OVER_IDS = pytest.mark.parametrize("env_id", slow_but([PLAIN], (*ENVIRONMENTS, *RACES)))
-OVER_KINDS = pytest.mark.parametrize("env_id", slow_but([PLAIN], (PLAIN, EVERY_WRAPPER, SEVERAL_DRONES)))
+OVER_KINDS = pytest.mark.parametrize(
+    "env_id", slow_but([PLAIN], (PLAIN, EVERY_WRAPPER, SEVERAL_DRONES))
+)
 
 
 @OVER_IDS

@@ -34,7 +34,9 @@ ROWS = {"commanded": 8, "applied": 4}
 
 def test_every_public_wrapper_is_tried() -> None:
     exported = [getattr(wrappers, name) for name in wrappers.__all__]
-    public = {one for one in exported if isinstance(one, type) and issubclass(one, wrappers.Wrapper)}
+    public = {
+        one for one in exported if isinstance(one, type) and issubclass(one, wrappers.Wrapper)
+    }
     assert public - {wrappers.Wrapper} < {type(make(FlyTrack())) for make in MAKERS.values()}
 
 
@@ -45,7 +47,9 @@ def reasons_against(name: str, inside: tuple[str, ...]) -> list[str]:
     if name == "log":
         return []
     if any(other in OTHER_STEP for other in inside):
-        return ["found (LegacyStep|LogWrapper) inside, expected FlyTrack or a wrapper that acts before"]
+        return [
+            "found (LegacyStep|LogWrapper) inside, expected FlyTrack or a wrapper that acts before"
+        ]
     is_late = name == "delay" and "commanded" in inside
     return ["both have the name"] * (name in inside) + [
         "the history would hold the delayed commands"
@@ -87,9 +91,13 @@ def test_randomising_what_is_baked_in_is_refused() -> None:
 )
 def test_parameters_of_another_environment_are_refused(wrapper: Any) -> None:
     env, others = wrapped(wrapper), FlyTrack().default_params
-    with pytest.raises(ValueError, match=rf"params\.wrappers: found \[\], expected \['{env.key}'\]"):
+    with pytest.raises(
+        ValueError, match=rf"params\.wrappers: found \[\], expected \['{env.key}'\]"
+    ):
         env.reset(jax.random.key(0), others)
-    with pytest.raises(ValueError, match=rf"params\.wrappers: found \[\], expected '{env.key}' among them"):
+    with pytest.raises(
+        ValueError, match=rf"params\.wrappers: found \[\], expected '{env.key}' among them"
+    ):
         env.own_params(others)
     unknown = others.replace(wrappers={env.key: env.own_defaults(), "nois": wrappers.NoiseParams()})
     with pytest.raises(ValueError, match=r"params\.wrappers: found \[.*'nois'.*\], expected"):
@@ -116,11 +124,17 @@ class SixValues:
         return action, state, state, action > 0.0, action > 1.0, {"truncated": action > 1.0}
 
 
-@pytest.mark.parametrize("clone", [copy.copy, copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+@pytest.mark.parametrize(
+    "clone", [copy.copy, copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))]
+)
 def test_legacy_step_joins_the_flags_and_survives_copies(clone: Any) -> None:
     env = clone(wrappers.LegacyStep(SixValues()))
     _, _, reward, done, info = env.step(None, 3.0, jnp.array([-1.0, 0.5, 2.0]))
     assert float(reward) == 3.0 and env.name == "six"
-    assert done.tolist() == [False, True, True] and info["truncated"].tolist() == [False, False, True]
+    assert done.tolist() == [False, True, True] and info["truncated"].tolist() == [
+        False,
+        False,
+        True,
+    ]
     with pytest.raises(AttributeError):
         getattr(env, "no_such_" + "attribute")

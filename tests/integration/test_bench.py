@@ -43,7 +43,9 @@ def test_the_suite_is_what_its_seed_draws(tmp_path):
     for name in drawn.TRACK_SEEDS:
         rows = [load_track(folder / "v1" / f"{name}.toml").rows() for folder in (tmp_path, FOLDER)]
         np.testing.assert_allclose(*rows, rtol=1e-12, atol=1e-12)
-    suites = [json.loads((folder / "v1.json").read_text())["tasks"] for folder in (tmp_path, FOLDER)]
+    suites = [
+        json.loads((folder / "v1.json").read_text())["tasks"] for folder in (tmp_path, FOLDER)
+    ]
     for again, task in zip(*suites, strict=True):
         assert all(again[name] == task[name] for name in ("id", "track", "optimal_lap_s"))
         assert jax.tree.structure(again["craft"]) == jax.tree.structure(task["craft"])
@@ -95,7 +97,9 @@ def test_no_more_data_is_flown_than_allowed(small):
 def test_the_interval_covers_the_spread_of_seeds():
     flown = {str(task): [{"score": value} for value in row] for task, row in enumerate(SPREAD)}
     found = results.summary(flown, "score")
-    assert found["interquartile_mean"] == pytest.approx(np.sort(SPREAD, axis=None)[3:9].mean(), abs=1e-6)
+    assert found["interquartile_mean"] == pytest.approx(
+        np.sort(SPREAD, axis=None)[3:9].mean(), abs=1e-6
+    )
     low, high = found["ci95"]
     assert low < found["interquartile_mean"] < high and 0.02 < high - low < 0.2
     assert results.summary({"one": [{"score": 0.5}]}, "score")["ci95"] is None

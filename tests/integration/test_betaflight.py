@@ -49,7 +49,9 @@ def plant() -> Iterator[Betaflight]:
 
 def starts(number: int = 3, volts: float = 23.0) -> np.ndarray:
     rng = np.random.default_rng(0)
-    found = [start_state(rng, volts, -0.2, tilt_deg=20.0 * row, speed=2.0 * row) for row in range(number)]
+    found = [
+        start_state(rng, volts, -0.2, tilt_deg=20.0 * row, speed=2.0 * row) for row in range(number)
+    ]
     return np.array(found, np.float32)
 
 
@@ -58,7 +60,9 @@ def sticks(number: int = 3, steps: int = 80) -> np.ndarray:
     return np.repeat(rng.uniform(-1, 1, (number, steps // 8, 4)), 8, axis=1).astype(np.float32)
 
 
-def fly_compiled(plant: Plant, rows: np.ndarray, commands: np.ndarray, model: Any = MODEL) -> np.ndarray:
+def fly_compiled(
+    plant: Plant, rows: np.ndarray, commands: np.ndarray, model: Any = MODEL
+) -> np.ndarray:
     """Return the states (number, steps, 21) after each command, by the plant's own steps."""
     return np.asarray(jax.jit(jax.vmap(partial(flown_by, plant, model)))(rows, commands))
 
@@ -86,8 +90,14 @@ def test_noise_of_the_gyro_is_of_the_seed_and_filtered():
 
 def test_sick_motors_sag_and_settings_show():
     sick = Body(health=(0.9, 1.0, 1.0, 1.0), resistance_ohm=0.02, full_current_a=80.0)
-    rows, commands = starts(1, volts=24.0), np.tile([[[0.0, 0.0, 0.0, 1.0]]], (1, 60, 1)).astype(np.float32)
-    with Betaflight({"motor_output_limit": 80}, sick) as limited, Betaflight(body=Body()) as healthy:
+    rows, commands = (
+        starts(1, volts=24.0),
+        np.tile([[[0.0, 0.0, 0.0, 1.0]]], (1, 60, 1)).astype(np.float32),
+    )
+    with (
+        Betaflight({"motor_output_limit": 80}, sick) as limited,
+        Betaflight(body=Body()) as healthy,
+    ):
         weak, strong = limited.fly(rows, commands)[0], healthy.fly(rows, commands)[0]
     assert weak[-1, ACCELERATION][2] < 0.8 * strong[-1, ACCELERATION][2]
     assert strong[-1, BATTERY] - weak[-1, BATTERY] == pytest.approx(0.02 * 80 * 0.8**3, rel=0.15)
@@ -98,21 +108,32 @@ def test_sick_motors_sag_and_settings_show():
     [("ACTUAL", 7, 67, 30), ("BETAFLIGHT", 100, 70, 40), ("QUICK", 90, 67, 30)],
 )
 def test_a_held_stick_turns_as_the_models_curve_says(rates_type, rc_rate, rate, expo):
-    rates = {"rates_type": rates_type, "roll_rc_rate": rc_rate, "roll_srate": rate, "roll_expo": expo}
+    rates = {
+        "rates_type": rates_type,
+        "roll_rc_rate": rc_rate,
+        "roll_srate": rate,
+        "roll_expo": expo,
+    }
     held = np.zeros((3, 60, 4), np.float32)
     held[:, :, 0] = np.array([[0.3], [-0.6], [0.9]])
     with Betaflight(rates) as curved:
         model, flown = curved.nominal_model(), curved.fly(starts(3), held)
     curve = model.effects[0]
-    bent = [effect_of(curve).hooks["command"](curve, None, Action(*u), None).roll for u in held[:, 0]]
+    bent = [
+        effect_of(curve).hooks["command"](curve, None, Action(*u), None).roll for u in held[:, 0]
+    ]
     expected = np.deg2rad(model.max_rate[0]) * np.array(bent)
-    np.testing.assert_allclose(flown[:, 40:, RATES][..., 0].mean(axis=1), expected, rtol=0.01, atol=0.01)
+    np.testing.assert_allclose(
+        flown[:, 40:, RATES][..., 0].mean(axis=1), expected, rtol=0.01, atol=0.01
+    )
 
 
 def test_settings_are_read_back():
     dump = "feature -AIRMODE\nprofile 1\nset p_roll = 60\nrateprofile 2\nset rates_type = ACTUAL\n"
     with Betaflight(dump + "set roll_srate = 80\n") as plant:
-        found = [plant.value(name) for name in ("p_roll", "roll_srate", "feature AIRMODE", "nonsense")]
+        found = [
+            plant.value(name) for name in ("p_roll", "roll_srate", "feature AIRMODE", "nonsense")
+        ]
         assert found == ["60", "80", "OFF", ""] and plant.full_stick_deg_s[0] == 800.0
         values = plant.firmware.values
     masters = {name: value for (scope, _, name), value in values.items() if scope == "master"}
@@ -123,14 +144,18 @@ def test_settings_are_read_back():
 
 
 def test_refused_settings_are_named():
-    with pytest.raises(FirmwareError, match=r"the firmware refused roll_srate, p_rol, feature WINGS; skip="):
+    with pytest.raises(
+        FirmwareError, match=r"the firmware refused roll_srate, p_rol, feature WINGS; skip="
+    ):
         Betaflight({"p_rol": 60, "roll_srate": 10_000, "feature wings": True, "p_pitch": 50})
     with Betaflight({"p_rol": 60, "p_pitch": 50}, skip=["p_ro*"]) as plant:
         assert plant.value("p_pitch") == "50"
 
 
 def test_collected_log_and_blackbox_are_the_same_flight(tmp_path):
-    pytest.importorskip("orangebox", reason="orangebox is not installed: pip install 'flytrack[logs]'")
+    pytest.importorskip(
+        "orangebox", reason="orangebox is not installed: pip install 'flytrack[logs]'"
+    )
     body = Body(drain_v_per_min=5.0)
     with Betaflight({"blackbox_high_resolution": True}, body, blackbox=tmp_path / "box") as plant:
         log = collect(plant, minutes=1.0, seed=0)
@@ -199,7 +224,9 @@ def test_craft_that_cannot_arm_says_why():
 
 
 def test_page_runs_and_check_is_repeatable(tmp_path, monkeypatch):
-    pytest.importorskip("orangebox", reason="orangebox is not installed: pip install 'flytrack[logs]'")
+    pytest.importorskip(
+        "orangebox", reason="orangebox is not installed: pip install 'flytrack[logs]'"
+    )
     assert "the same twice" in check()
     names = run_examples((DOCS / "firmware.md").read_text(encoding="utf-8"), tmp_path, monkeypatch)
     assert len(names["log"]) > 3000 and len(names["flown"]) > 200
@@ -211,12 +238,15 @@ def known_model(plant: Betaflight) -> ModelParameters:
     craft = (body.arm_m[1] / body.inertia[0], body.arm_m[0] / body.inertia[1])
     turn = (body.torque_m / body.inertia[2], body.rotor_inertia / body.inertia[2], body.lag_up_s)
     loop = model.effect("betaflight_loop")._replace(
-        **dict(zip(BetaflightLoop._fields[:5], (*craft, *turn), strict=True)), precession=0.0025 / 0.0035
+        **dict(zip(BetaflightLoop._fields[:5], (*craft, *turn), strict=True)),
+        precession=0.0025 / 0.0035,
     )
     factor = (23.0 / body.full_v) ** body.volt_exponent
     per_volt = body.volt_exponent * factor / 23.0
     most, at_rest = 4.0 * body.max_thrust_n, factor - 23.0 * per_volt
-    bend = np.array([0.5275**2, 2.0 * 0.5275 * 0.4725, 0.4725**2])  # of the square of the motors' command
+    bend = np.array(
+        [0.5275**2, 2.0 * 0.5275 * 0.4725, 0.4725**2]
+    )  # of the square of the motors' command
     coeffs = most * np.array([*(at_rest * bend[:2]), factor * bend[2], 0.0, *(per_volt * bend[:2])])
     return model._replace(thrust_coeffs=coeffs).with_effects(loop)
 
@@ -234,7 +264,11 @@ def test_loop_with_the_numbers_of_the_body_flies_as_the_firmware_does(plant):
 
 def test_what_was_changed_is_named_and_a_matched_set_up_has_no_name() -> None:
     logs = {}
-    for name, body in (("before", Body()), ("same", Body()), ("weak", Body(health=(1.0, 0.85, 1.0, 1.0)))):
+    for name, body in (
+        ("before", Body()),
+        ("same", Body()),
+        ("weak", Body(health=(1.0, 0.85, 1.0, 1.0))),
+    ):
         with Betaflight(body=body) as flown:
             logs[name], model = collect(flown, 1.0, len(logs), 1.0), known_model(flown)
     before = logs["before"]

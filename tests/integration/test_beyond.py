@@ -21,7 +21,9 @@ SECONDS = 60.0
 BUMP_MS, WIDTH_MS = 6.0, 1.0
 
 
-PEAK = hidden.Outside("airspeed", ("airspeed",), "force", 2.0, {"speed_ms": BUMP_MS, "width_ms": WIDTH_MS})
+PEAK = hidden.Outside(
+    "airspeed", ("airspeed",), "force", 2.0, {"speed_ms": BUMP_MS, "width_ms": WIDTH_MS}
+)
 LOAD = hidden.Outside("payload", ("airspeed",), "force", 1.5, {"string_m": 0.6})
 
 
@@ -66,7 +68,9 @@ def test_a_law_is_found_with_its_numbers(tmp_path: Path) -> None:
 
 def test_nothing_is_learnt_beside_a_law_of_another_log() -> None:
     truth, log, _ = flights(71)
-    too_small = Term("force", "air", (Factor("airspeed", "bump", (BUMP_MS, WIDTH_MS)),), (-0.1,), (0.0,))
+    too_small = Term(
+        "force", "air", (Factor("airspeed", "bump", (BUMP_MS, WIDTH_MS)),), (-0.1,), (0.0,)
+    )
     found = diagnose(log, model_of(truth).with_effects(LearnedLaw(1.0, 0.0, Law((too_small,)))))
     assert found.verdict == "unexplained" and found.learned is None
     assert any("learned_law from another log" in warning for warning in found.warnings)
@@ -87,7 +91,9 @@ def test_a_load_on_a_string_stays_unexplained() -> None:
     assert found.learned is None or share_removed(found, clean) > 0.0
 
 
-def test_a_thrust_curve_says_where_it_could_be_motors_that_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thrust_curve_says_where_it_could_be_motors_that_warm_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(beyond, "SEED", 59)
     truth, log, _ = beyond.flown_plant("heating", 1)
     warm = diagnose(log, model_of(truth))

@@ -50,7 +50,9 @@ def test_champion_is_a_small_policy_of_the_model_of_its_reference():
     assert champion.training is None and CHAMPION.stat().st_size < MOST_BYTES
     model = model_from_json(champion.meta["model"], "champion")
     assert model_digest(model) == model_digest(load_model(MODEL))
-    assert model_digest(model) == model_digest(shipped_reference("flytrack", "flying", "black_box").model)
+    assert model_digest(model) == model_digest(
+        shipped_reference("flytrack", "flying", "black_box").model
+    )
 
 
 def first_lap_s(env, network, params):
@@ -65,7 +67,11 @@ def test_a_policy_gets_faster_and_is_not_changed_itself():
     slower = jax.tree.map(lambda leaf: leaf * (1.0 - OFF), champion.params)
     kept = jax.tree.map(np.array, slower)
     found = polish(
-        env, Policy(champion.network, slower), 0, SHORT, report=lambda *counts: reports.append(counts)
+        env,
+        Policy(champion.network, slower),
+        0,
+        SHORT,
+        report=lambda *counts: reports.append(counts),
     )
     before, after = (first_lap_s(env, champion.network, params) for params in (slower, found))
     assert after < before - 0.005
@@ -76,7 +82,9 @@ def test_a_policy_gets_faster_and_is_not_changed_itself():
 def test_a_policy_that_does_not_race_is_refused():
     champion = load_checkpoint(CHAMPION)
     lost = jax.tree.map(jnp.zeros_like, champion.params)
-    with pytest.raises(ValueError, match=r"found none of 8 flights that passed 8 gates within 4\.6 s"):
+    with pytest.raises(
+        ValueError, match=r"found none of 8 flights that passed 8 gates within 4\.6 s"
+    ):
         polish(simulated_env(champion), Policy(champion.network, lost), 0, SHORT)
 
 

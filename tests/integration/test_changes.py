@@ -35,7 +35,9 @@ def before():
 
 
 def test_what_both_logs_lack_is_no_cause(before) -> None:
-    found = diagnose_change(flown(BOTH, CHANGED_S, 1), before, model_of(BASE), motion=Motion.CONTINUOUS)
+    found = diagnose_change(
+        flown(BOTH, CHANGED_S, 1), before, model_of(BASE), motion=Motion.CONTINUOUS
+    )
     assert found.verdict == "consistent" and found.causes == () and not found.unexplained.flagged
 
 
@@ -71,7 +73,9 @@ def test_a_cause_that_begins_in_flight_is_named_with_its_onset():
         low, high = cause.parameters[name].ci95
         assert low <= true <= high
     assert f"motor_imbalance from {cause.onset_s.value:.1f} ± " in text_of(found)
-    assert found.as_json()["causes"][0]["onset_s"]["value"] == pytest.approx(cause.onset_s.value, rel=1e-5)
+    assert found.as_json()["causes"][0]["onset_s"]["value"] == pytest.approx(
+        cause.onset_s.value, rel=1e-5
+    )
     assert any("as at the end of the log" in warning for warning in found.warnings)
     assert found.extended.effect("motor_imbalance").roll == pytest.approx(ROLL, rel=0.3)
 

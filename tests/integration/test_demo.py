@@ -32,7 +32,9 @@ def test_demo_writes_everything(tmp_path: Path) -> None:
         main(arguments)  # it does not overwrite a run
 
 
-def test_density_is_time_per_flight_in_bins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_density_is_time_per_flight_in_bins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     figures: list[Figure] = []
     monkeypatch.setattr(monitor, "png_of", lambda figure, dpi: figures.append(figure) or b"png")
     positions = np.array([[10.02, 10.03, 1.0]] * 40 + [[10.02, 10.13, 2.0]] * 8 + [[1e3, 0.0, 1.0]])

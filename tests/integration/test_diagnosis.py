@@ -29,7 +29,8 @@ from flytrack_sysid.log import FlightLog
 from tests.support.slow import slow_but
 
 SEED = int(os.environ.get("FLYTRACK_TEST_SEED", "11"))  # of plants that a case draws
-# Every other block is held out, and all but the simulator move finely: all logs share one compiled program.
+# Every other block is held out, and all but the simulator move finely: all logs share one compiled
+# program.
 SECONDS, BLOCK_S = 20.0, 5.0
 LATE_S, SPIKES = 0.0164, 12
 DRAG = {"d_x": 0.4, "d_y": 0.4, "d_z": 0.2}
@@ -69,7 +70,9 @@ def _known(number: int, spikes: int = 0, **fields: Any) -> Case:
     """Return a flight of a plant that no seed changes, with some outliers of the velocity."""
     rng = np.random.default_rng([3, number])
     case = _flown(replace(_drawn(np.random.default_rng(3)), **fields), rng)
-    case.log["v"][rng.choice(len(case.log), spikes, replace=False)] += rng.normal(0.0, 2.0, (spikes, 3))
+    case.log["v"][rng.choice(len(case.log), spikes, replace=False)] += rng.normal(
+        0.0, 2.0, (spikes, 3)
+    )
     return case
 
 
@@ -81,7 +84,8 @@ def _in_training_only(rng: Rng) -> Case:
     segment = _blocks(parts[0])
     is_still = segment[:, None] % 2 == 1
     channels = {
-        name: np.where(is_still, parts[1][name], values) for name, values in parts[0].channels.items()
+        name: np.where(is_still, parts[1][name], values)
+        for name, values in parts[0].channels.items()
     }
     return _measured(still, FlightLog(parts[0].time, channels, segment), rng)
 
@@ -97,7 +101,11 @@ def _wind_in_hover(rng: Rng) -> Case:
             sketch.add(speed)
 
     truth, way = _drawn(rng), rng.uniform(-np.pi, np.pi)
-    wind = {"a_x": HOVER_WIND * float(np.cos(way)), "a_y": HOVER_WIND * float(np.sin(way)), "a_z": 0.0}
+    wind = {
+        "a_x": HOVER_WIND * float(np.cos(way)),
+        "a_y": HOVER_WIND * float(np.sin(way)),
+        "a_z": 0.0,
+    }
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(pilot, "cycle", hover)
         return _flown(replace(truth, effects={"wind": wind}), rng)
@@ -131,12 +139,16 @@ def _broken(rng: Rng, channel: str, value: float) -> Case:
 CASES: Mapping[str, Callable[[Rng], Case]] = {
     "clean": lambda rng: _known(0),
     "drag": lambda rng: _known(1, effects={"linear_drag": DRAG}),
-    "outside": lambda rng: _known(2, outside=draw_outside(np.random.default_rng(4), "heading", 2.0)),
+    "outside": lambda rng: _known(
+        2, outside=draw_outside(np.random.default_rng(4), "heading", 2.0)
+    ),
     "late": lambda rng: _known(3, SPIKES, mocap_late_s=LATE_S),
     "training_only": _in_training_only,
     "wind_in_hover": _wind_in_hover,
     # Without tilt, the thrust map runs so far away that slopes say nothing of wind.
-    "wind_in_another_hover": lambda rng: _wind_in_hover(np.random.default_rng([12, *b"wind_in_hover"])),
+    "wind_in_another_hover": lambda rng: _wind_in_hover(
+        np.random.default_rng([12, *b"wind_in_hover"])
+    ),
     "tau": lambda rng: _changed("tau", 0.6, rng),
     "mass": lambda rng: _changed("mass", 0.2, rng),
     "simulated": _simulated,
@@ -173,10 +185,17 @@ def test_every_log_is_diagnosed_or_refused(name, diagnosed) -> None:
         return
     one = json.loads(json.dumps(found.as_json(), allow_nan=False))
     assert one["schema"] == 1
-    assert one["verdict"] in ("consistent", "causes_found", "unexplained", "causes_found+unexplained")
+    assert one["verdict"] in (
+        "consistent",
+        "causes_found",
+        "unexplained",
+        "causes_found+unexplained",
+    )
     assert ("causes_found" in one["verdict"]) == bool(one["causes"])
     assert ("unexplained" in one["verdict"]) == one["unexplained"]["flagged"]
-    assert one["unexplained"]["flagged"] == bool(one["unexplained"]["depends_on"] or one["beyond_the_list"])
+    assert one["unexplained"]["flagged"] == bool(
+        one["unexplained"]["depends_on"] or one["beyond_the_list"]
+    )
     for cause in one["causes"]:
         assert cause["parameters"], f"{cause['effect']} has no size"
         assert cause["channel"] in CHANNELS
@@ -200,7 +219,9 @@ def test_every_log_is_diagnosed_or_refused(name, diagnosed) -> None:
 
 # Of the one with drag, the fast test sees that nothing else is named.
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "motion"), [("clean", Motion.CONTINUOUS), ("simulated", Motion.HANDOUT)])
+@pytest.mark.parametrize(
+    ("name", "motion"), [("clean", Motion.CONTINUOUS), ("simulated", Motion.HANDOUT)]
+)
 def test_a_clean_plant_is_consistent_with_its_model(name, motion, diagnosed) -> None:
     _, found = diagnosed(name)
     assert found.causes == () and found.verdict == "consistent" and found.warnings == ()
@@ -214,16 +235,24 @@ def test_a_hidden_effect_is_found_and_measured(diagnosed) -> None:
 
 
 @pytest.mark.slow
-def test_late_motion_capture_is_named_and_corrected_and_outliers_told(diagnosed, tmp_path: Path) -> None:
+def test_late_motion_capture_is_named_and_corrected_and_outliers_told(
+    diagnosed, tmp_path: Path
+) -> None:
     case, found = diagnosed("late")
     (cause,) = found.causes
     low, high = cause.parameters["latency_s"].ci95
-    assert cause.effect == "mocap_latency" and cause.heldout_gain > 0.0 and found.verdict == "causes_found"
+    assert (
+        cause.effect == "mocap_latency"
+        and cause.heldout_gain > 0.0
+        and found.verdict == "causes_found"
+    )
     assert abs(cause.parameters["latency_s"].value - LATE_S) < 1e-3 and high - low < 2e-3
     assert found.extended.motion is Motion.CONTINUOUS
     write_diagnosis(tmp_path, found, case.log)
     assert load_model(tmp_path / "extended_model.json").effect("mocap_latency").latency_s > 0.0
-    assert set(found.outliers) == {"velocity"} and abs(found.outliers["velocity"].rows - SPIKES) <= 2
+    assert (
+        set(found.outliers) == {"velocity"} and abs(found.outliers["velocity"].rows - SPIKES) <= 2
+    )
     (warning,) = found.warnings
     assert warning.startswith("outliers") and "rows of velocity" in warning
     assert diagnosed("clean")[1].outliers == {}
@@ -239,7 +268,9 @@ def test_what_no_list_has_is_flagged_and_not_named(diagnosed) -> None:
 def test_the_extended_model_can_be_flown(diagnosed, tmp_path: Path) -> None:
     case, found = diagnosed("drag")
     write_diagnosis(tmp_path, found, case.log)
-    assert json.loads((tmp_path / "diagnosis.json").read_text()) == json.loads(json.dumps(found.as_json()))
+    assert json.loads((tmp_path / "diagnosis.json").read_text()) == json.loads(
+        json.dumps(found.as_json())
+    )
     assert (tmp_path / "report.html").stat().st_size > 0
     model = load_model(tmp_path / "extended_model.json")
     assert any(type(one) is LinearDrag for one in model.effects)
@@ -269,7 +300,9 @@ def test_a_hover_cannot_tell_wind_from_tilt(name, diagnosed) -> None:
 @pytest.mark.slow
 def test_other_base_parameters_are_named_and_measured(diagnosed) -> None:
     case, found = diagnosed("tau")
-    by_name = dict(zip(("tau_roll", "tau_pitch", "tau_yaw", "tau_thrust"), case.truth.tau, strict=True))
+    by_name = dict(
+        zip(("tau_roll", "tau_pitch", "tau_yaw", "tau_thrust"), case.truth.tau, strict=True)
+    )
     assert {cause.effect for cause in found.causes} == set(by_name)
     for cause in found.causes:
         assert is_within(by_name[cause.effect], cause.parameters[cause.effect]), cause

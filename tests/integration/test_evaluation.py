@@ -56,12 +56,16 @@ def raced(on_rails, checkpoint):
     """The same flights, in batches, the last one not full."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(flights_module, "BATCH", 4)
-        return race_many(on_rails, checkpoint.policy, start_keys(0, NUM_FLIGHTS), NUM_STEPS, NUM_LAPS)
+        return race_many(
+            on_rails, checkpoint.policy, start_keys(0, NUM_FLIGHTS), NUM_STEPS, NUM_LAPS
+        )
 
 
 def test_lap_times_are_those_of_the_rails(flights, raced):
     battery_v = np.asarray(flights.states)[:, 0, BATTERY]
-    paces = np.where(battery_v < FAILS_BELOW_V, 0.0, Rails.pace(battery_v))  # 0 where a flight falls
+    paces = np.where(
+        battery_v < FAILS_BELOW_V, 0.0, Rails.pace(battery_v)
+    )  # 0 where a flight falls
     is_good = paces > 0.0
     assert 0 < is_good.sum() < NUM_FLIGHTS  # else this test would see one kind only
     np.testing.assert_array_equal(raced.is_complete(), is_good)
@@ -84,13 +88,19 @@ def test_every_step_kept_or_not_is_the_same_flight(flights, raced):
 def test_command_flies_many(flown_by, checkpoint_path, tmp_path, monkeypatch, capsys, flights):
     flown = []
     fly = evaluate.Report.fly
-    monkeypatch.setattr(evaluate.Report, "fly", lambda self: flown.extend([fly(self), self]) or flown[0])
-    if flown_by == "black box":  # one program less to compile: single flights are those of test_commands
+    monkeypatch.setattr(
+        evaluate.Report, "fly", lambda self: flown.extend([fly(self), self]) or flown[0]
+    )
+    if (
+        flown_by == "black box"
+    ):  # one program less to compile: single flights are those of test_commands
         monkeypatch.setattr(
             evaluate.Report, "_fly_first", lambda *_: jax.tree.map(lambda leaf: leaf[0], flights)
         )
     out, file = tmp_path / "flight.npy", tmp_path / "new" / "report.json"
-    more = ["--episodes", 2, "--plants", 3] if flown_by == "plants" else ["--episodes", 6, "--laps", 1]
+    more = (
+        ["--episodes", 2, "--plants", 3] if flown_by == "plants" else ["--episodes", 6, "--laps", 1]
+    )
     where = ["--checkpoint", checkpoint_path, "--out", out, "--json", file]
     run("eval", *where, "--steps", 120, "--track", "split_s", "--ghost", *more)
     outcomes, rollout = flown[0], flown[1].rollout
@@ -111,7 +121,9 @@ def test_command_flies_many(flown_by, checkpoint_path, tmp_path, monkeypatch, ca
         assert len(set(outcomes.steps[::2].tolist())) > 1  # the plants differ
     else:
         assert report["optimal"]["model"] == "black_box" and report["plants"] is None
-        assert report["success"]["high"] == pytest.approx(0.390334, abs=1e-5)  # Wilson's, of none of 6
+        assert report["success"]["high"] == pytest.approx(
+            0.390334, abs=1e-5
+        )  # Wilson's, of none of 6
 
 
 def keys_of(value):
@@ -142,8 +154,15 @@ def test_a_single_flight_as_json_and_docs_name_every_key(
             place = found.series(drone, "Transform3D:translation")
             np.testing.assert_allclose(place, load_rollout(out)[0][:, POSITION])
     assert "interval" not in text and report["success"] is None and report["ghost"] is None
-    np.testing.assert_allclose(report["first_flight"]["lap_times_s"], raced.lap_times_s[index], atol=1e-5)
-    assert [line.split(":")[0] for line in text.splitlines()][:4] == ["flown", "gates", "lap times", "ended"]
+    np.testing.assert_allclose(
+        report["first_flight"]["lap_times_s"], raced.lap_times_s[index], atol=1e-5
+    )
+    assert [line.split(":")[0] for line in text.splitlines()][:4] == [
+        "flown",
+        "gates",
+        "lap times",
+        "ended",
+    ]
     drawn = checkpoint_env.draw_plants(0, 3, nominal_parameters()).drawn
     plants = summarize_plants(drawn, np.ones((3, 1), bool))
     text = (ROOT / "docs" / "baseline.md").read_text()
@@ -152,14 +171,25 @@ def test_a_single_flight_as_json_and_docs_name_every_key(
 
 
 def test_plants_are_drawn_from_the_ranges_around_the_model():
-    known = (LinearDrag(0.4, 0.4, 0.2), CommandDelay(0.03), ThrustScale(0.9), QuadraticDrag(0.01, shared=0.0))
+    known = (
+        LinearDrag(0.4, 0.4, 0.2),
+        CommandDelay(0.03),
+        ThrustScale(0.9),
+        QuadraticDrag(0.01, shared=0.0),
+    )
     model = nominal_parameters().with_effects(*known)
     plants = checkpoint_env.draw_plants(3, 200, model)
     for name, bounds in checkpoint_env.RANGES.items():
         drawn = plants.drawn[name]
-        assert bounds[0] <= drawn.min() and drawn.max() <= bounds[1] and np.ptp(drawn) > 0.5 * np.ptp(bounds)
+        assert (
+            bounds[0] <= drawn.min()
+            and drawn.max() <= bounds[1]
+            and np.ptp(drawn) > 0.5 * np.ptp(bounds)
+        )
     found = plants.models
-    np.testing.assert_allclose(found.effect("thrust_scale").factor, 0.9 * plants.drawn["thrust_scale"], 1e-6)
+    np.testing.assert_allclose(
+        found.effect("thrust_scale").factor, 0.9 * plants.drawn["thrust_scale"], 1e-6
+    )
     np.testing.assert_allclose(found.effect("linear_drag").d_x, np.float32(0.4))
     np.testing.assert_allclose(
         found.effect("command_delay").delay_s, 0.03 + plants.drawn["command_delay_s"], 1e-6
@@ -182,7 +212,10 @@ def test_what_breaks_the_policy_shows_in_its_thirds():
     shares = {name: [r["plants"]["share"] for r in rows if r["quantity"] == name] for name in drawn}
     assert shares["command_delay_s"] == [1.0, 1.0, 0.0]
     assert all(min(shares[name]) > 0.3 for name in set(drawn) - {"command_delay_s"})
-    assert {row["flights_share"] for row in rows if row["quantity"] == "command_delay_s"} == {1.0, 0.5}
+    assert {row["flights_share"] for row in rows if row["quantity"] == "command_delay_s"} == {
+        1.0,
+        0.5,
+    }
     assert len(rows) == 12
     assert len(summarize_plants({"wind_m_s": np.ones(1)}, np.ones((1, 1), bool))["by_thirds"]) == 1
 
@@ -194,6 +227,8 @@ def test_ids_that_draw_models_fly_the_one_that_is_given(checkpoint):
     ranges, given = params.wrappers[DomainRandomization.key], env.default_params.model
     found = sample_model(jnp.uint32(5), given, ranges)
     assert type(found.effects[0]) is LinearDrag and len(found.effects) == 1
-    chex.assert_trees_all_close(found._replace(tau=np.stack(found.tau)), given, rtol=1e-6, atol=1e-6)
+    chex.assert_trees_all_close(
+        found._replace(tau=np.stack(found.tau)), given, rtol=1e-6, atol=1e-6
+    )
     plain = make("FlyTrackNoisy-v0").default_params
     assert checkpoint_env.with_model_as_given(plain) is plain

@@ -1,7 +1,7 @@
 """Plants with hidden effects: equations, motion, flights and logs. A diagnosis is graded on them.
 
-Fine motion is that of SciPy's integrator on the same differential equations; the plants that a policy races
-on, in JAX, fly as those in plain floats.
+Fine motion is that of SciPy's integrator on the same differential equations; the plants that a
+policy races on, in JAX, fly as those in plain floats.
 """
 
 from dataclasses import replace
@@ -63,14 +63,18 @@ def open_loop(truth: hidden.Truth, count: int = 150, start: Start = START) -> di
 def test_ground_effect_fades_with_the_height() -> None:
     low = START._replace(pos_w=(0.0, 0.0, 0.3))
     own = open_loop(base(ground_effect={"gain": 0.5, "height_m": 0.3}), 1, low)["f"]
-    np.testing.assert_allclose(own, open_loop(base(), 1, low)["f"] * [1.0, 1.0, 1.0 + 0.5 * np.exp(-1.0)])
+    np.testing.assert_allclose(
+        own, open_loop(base(), 1, low)["f"] * [1.0, 1.0, 1.0 + 0.5 * np.exp(-1.0)]
+    )
 
 
 # Laws that the package has as well are flown against its own (tests/unit/test_effect_laws.py).
 def test_an_accelerometer_off_the_centre_feels_the_turn() -> None:
     clean, moved = (flown(base(**own), seconds=4.0) for own in ({}, {"imu_offset": ARM}))
     arm, rates = np.array(list(ARM.values())), clean["w"][1:]
-    expected = np.cross(rates, np.cross(rates, arm)) + np.cross(np.diff(clean["w"], axis=0) / 0.01, arm)
+    expected = np.cross(rates, np.cross(rates, arm)) + np.cross(
+        np.diff(clean["w"], axis=0) / 0.01, arm
+    )
     np.testing.assert_allclose(moved["f"][1:] - clean["f"][1:], expected, atol=1e-9)
     assert np.abs(expected).max() > 0.1
 
@@ -78,17 +82,23 @@ def test_an_accelerometer_off_the_centre_feels_the_turn() -> None:
 @pytest.mark.parametrize("motion", hidden.MOTIONS)
 def test_a_flight_controller_shapes_the_sticks_before_the_lag(motion: str) -> None:
     def settled(stick: float, **effects: dict[str, float]) -> np.ndarray:
-        plant = HiddenDrone(replace(base(**effects), motion=motion), START, np.random.default_rng(0))
+        plant = HiddenDrone(
+            replace(base(**effects), motion=motion), START, np.random.default_rng(0)
+        )
         for _ in range(200):
             plant.step((stick, -stick, stick, -0.2))
         return plant.felt.rates_b / np.radians([618.0, -618.0, 120.0])
 
     lost = {"roll": 0.2, "pitch": 0.1, "yaw": 0.05}
     np.testing.assert_allclose(settled(1.0, rate_saturation=lost), [0.8, 0.9, 0.95])
-    np.testing.assert_allclose(settled(0.5, rate_expo=lost), 0.5 - 0.375 * np.array([0.2, 0.1, 0.05]))
+    np.testing.assert_allclose(
+        settled(0.5, rate_expo=lost), 0.5 - 0.375 * np.array([0.2, 0.1, 0.05])
+    )
     # Of a step by the whole stick: the setpoint rises evenly, and the lag follows it tau later.
     slow = {"roll_s": 0.3, "pitch_s": 0.2, "yaw_s": 0.4}
-    plant = HiddenDrone(replace(base(rate_slew_limit=slow), motion=motion), START, np.random.default_rng(0))
+    plant = HiddenDrone(
+        replace(base(rate_slew_limit=slow), motion=motion), START, np.random.default_rng(0)
+    )
     for _ in range(18):
         plant.step((1.0, 1.0, 1.0, -0.2))
     tau, times_s = np.array(base().tau[:3]), np.array(list(slow.values()))
@@ -121,7 +131,9 @@ def test_the_same_seed_gives_the_same_plant_and_log() -> None:
 def test_noise_has_its_standard_deviation_tails_and_colour(noise: str, clean: FlightLog) -> None:
     logs = [hidden.measure(clean, noise, np.random.default_rng(seed)) for seed in range(8)]
     rows = [np.searchsorted(clean.time, log.time - 1e-9) for log in logs]
-    assert np.mean([len(log) for log in logs]) / len(clean) == pytest.approx(1.0 - LOST_ROWS, abs=0.003)
+    assert np.mean([len(log) for log in logs]) / len(clean) == pytest.approx(
+        1.0 - LOST_ROWS, abs=0.003
+    )
     for name in "pvfw":
         errors = [log[name] - clean[name][kept] for log, kept in zip(logs, rows, strict=True)]
         assert np.std(np.concatenate(errors)) == pytest.approx(STD[name], rel=0.1)
@@ -154,7 +166,11 @@ def derivative(
     asked += np.array([0.01 * thrust, -0.005 * thrust, 0.05 * change[3]])
     attitude = Rotation.from_quat(quat, scalar_first=True)
     air_b = attitude.inv().apply(vel_w)
-    force_b = [0.0, 0.0, thrust] - np.array([0.3, 0.2, 0.1]) * air_b - 0.02 * thrust * air_b * [1.0, 1.0, 0.0]
+    force_b = (
+        [0.0, 0.0, thrust]
+        - np.array([0.3, 0.2, 0.1]) * air_b
+        - 0.02 * thrust * air_b * [1.0, 1.0, 0.0]
+    )
     w, axis = quat[0], quat[1:]
     spin = 0.5 * np.concatenate([[-axis @ rates], w * rates + np.cross(axis, rates)])
     damping, lag_s = np.array([0.6, 0.8, 0.5]), np.array([0.02, 0.025, 0.015])
@@ -170,7 +186,9 @@ def integrated(own: hidden.Truth) -> dict[str, np.ndarray]:
     times = np.unique(np.round([0.0, *rows, *(rows + DELAY_S), *felt_s, *tracked_s], 9))
     times = times[times <= rows[-1] + 1e-9]
     quat = [np.cos(0.35), 0.0, 0.0, np.sin(0.35)]
-    x = np.concatenate([START.pos_w, np.zeros(3), quat, np.zeros(3), [START.thrust_stick], np.zeros(6)])
+    x = np.concatenate(
+        [START.pos_w, np.zeros(3), quat, np.zeros(3), [START.thrust_stick], np.zeros(6)]
+    )
     found: dict[str, list] = {name: [] for name in FINE_ERRORS}
     for begin, end in pairwise(times):
         number = int(np.floor((0.5 * (begin + end) - DELAY_S) / STEP_S))
@@ -181,7 +199,9 @@ def integrated(own: hidden.Truth) -> dict[str, np.ndarray]:
 
         x = solve_ivp(slope, (begin, end), x, "DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
         if np.abs(felt_s - end).min() < 1e-8:
-            for name, value in zip("fw", (derivative(own, end, x, acting)[1], x[14:17]), strict=True):
+            for name, value in zip(
+                "fw", (derivative(own, end, x, acting)[1], x[14:17]), strict=True
+            ):
                 found[name].append(value)
             found["slope"].append(x[17:])
         if np.abs(tracked_s - end).min() < 1e-8:
@@ -225,17 +245,23 @@ def test_late_motion_capture_and_effects_that_begin_in_the_log(motion: str) -> N
     assert with_onset.time[np.argmax(begun)] == pytest.approx(sudden.onset_s, abs=0.02)
 
 
-def check_flight(truth: hidden.Truth, without: hidden.Truth | None, rng: np.random.Generator) -> None:
+def check_flight(
+    truth: hidden.Truth, without: hidden.Truth | None, rng: np.random.Generator
+) -> None:
     """Compare both flights; that without what is tested, if any, has to differ."""
     commands = np.repeat(rng.uniform(-1.0, 1.0, (LOOP_STEPS // 4, 4)), 4, axis=0).astype(np.float32)
     expected = flown_in_floats(truth, commands)["x"]
     start = jnp.asarray(state_of(HiddenDrone(truth, LOW_START, rng)), jnp.float32)
     found = flown_by(HiddenPlant(truth), nominal_parameters(), start, commands)
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-4)
-    assert without is None or np.abs(expected - flown_in_floats(without, commands)["x"]).max() > 1e-3
+    assert (
+        without is None or np.abs(expected - flown_in_floats(without, commands)["x"]).max() > 1e-3
+    )
 
 
-@pytest.mark.parametrize("names", slow_but([(), EFFECTS], [(), EFFECTS, *((name,) for name in EFFECTS)]))
+@pytest.mark.parametrize(
+    "names", slow_but([(), EFFECTS], [(), EFFECTS, *((name,) for name in EFFECTS)])
+)
 def test_the_flight_is_that_in_plain_floats(names):
     rng = np.random.default_rng(len(names))
     base = hidden.draw_base(rng)

@@ -42,7 +42,9 @@ def test_the_log_is_what_the_plant_did(log, fly_black_box):
 
 def test_the_log_has_a_segment_per_flight_and_is_noisy_on_request(log, flights):
     starts = log["p"][log.is_start()]
-    assert len(starts) == len(np.unique(log.segment)) == 3  # of four that were flown: 11 s are enough
+    assert (
+        len(starts) == len(np.unique(log.segment)) == 3
+    )  # of four that were flown: 11 s are enough
     assert np.ptp(starts[:, 0]) > 0.01  # each flight from a start of its own
     noisy = log_of_flights(flights, 0.01, 3, 11.0, 1.0)
     assert "uprev" not in noisy and "f" in noisy and len(noisy) < len(log)

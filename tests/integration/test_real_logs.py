@@ -16,15 +16,26 @@ pytestmark = pytest.mark.slow
 WINDOW_S = 0.3
 LEE = {"cf_lee_standard": (182, 183), "cf_lee_upgraded": (29, 45, 108, 113, 115, 119, 202, 203)}
 # Log 30 ends in a crash. Logs 182 and 183 hardly accelerate, and their velocity is a slow estimate.
-NANOBENCH = ("B10_lissajous_fast_rep1", "B2_circle_fast_rep1", "B3_figure8_fast_rep1", "B3_figure8_slow_rep1")
-NANOBENCH += ("B5_helix_fast_rep1", "B7_oval_fast_rep1", "B8_star_fast_rep1", "B9_trefoil_fast_rep14")
+NANOBENCH = (
+    "B10_lissajous_fast_rep1",
+    "B2_circle_fast_rep1",
+    "B3_figure8_fast_rep1",
+    "B3_figure8_slow_rep1",
+)
+NANOBENCH += (
+    "B5_helix_fast_rep1",
+    "B7_oval_fast_rep1",
+    "B8_star_fast_rep1",
+    "B9_trefoil_fast_rep14",
+)
 NANOBENCH += ("B9_trefoil_medium_rep12",)
 
 
 def check(imported: Imported, least: float, tolerance: float) -> None:
     """Assert that gyroscope and attitude, accelerometer and velocity, velocity and position agree over 0.3 s.
 
-    A rate and the change it should show are at least so correlated, and of one size but for a tolerance.
+    A rate and the change it should show are at least so correlated, and of one size but for a
+    tolerance.
     """
     log = imported.log
     assert imported.problems == ()
@@ -39,7 +50,10 @@ def check(imported: Imported, least: float, tolerance: float) -> None:
     assert pairs
     windows = windows_of(log, WINDOW_S)
     for change, rate in pairs:
-        shown, measured = windows.change_of(change) / windows.durations[:, None], windows.mean_of(log, rate)
+        shown, measured = (
+            windows.change_of(change) / windows.durations[:, None],
+            windows.mean_of(log, rate),
+        )
         shown, measured = shown - shown.mean(axis=0), measured - measured.mean(axis=0)
         sizes = np.linalg.norm(shown), np.linalg.norm(measured)
         assert np.sum(shown * measured) / (sizes[0] * sizes[1]) > least
@@ -75,7 +89,9 @@ def test_nanobench(name):
 
 
 def test_rate_commands_of_learned_policies():
-    imported = import_log(sorted(shared(CRAZYFLIE).glob("seed*.csv.gz")), "csv", "crazyflie_phoenix")
+    imported = import_log(
+        sorted(shared(CRAZYFLIE).glob("seed*.csv.gz")), "csv", "crazyflie_phoenix"
+    )
     check(imported, 0.9, 0.15)
     log = imported.log
     for axis in range(3):  # it turns as commanded, 50 ms later
@@ -86,7 +102,9 @@ def test_angle_commands_without_a_gyroscope():
     imported = import_log(sorted(shared("cf_utias_angle").glob("*.gz")), "csv", "crazyflie_fmpc")
     check(imported, 0.95, 0.05)
     log = imported.log
-    pitch_rates = np.gradient(Rotation.from_quat(log["q"], scalar_first=True).as_euler("ZYX")[:, 1], 0.02)
+    pitch_rates = np.gradient(
+        Rotation.from_quat(log["q"], scalar_first=True).as_euler("ZYX")[:, 1], 0.02
+    )
     assert np.corrcoef(log["u"][:-3, 1], pitch_rates[3:])[0, 1] > 0.7  # 60 ms later
 
 
@@ -111,7 +129,12 @@ def test_px4():
 # --- The diagnosis of a Crazyflie ---------------------------------------------------------------------
 
 AS_GOOD = 1.02  # times another model's error
-PARTS = ("seed00053_log2", "seed00067_log1", "seed00066_log1", "seed00052_log3")  # 23 s of four policies
+PARTS = (
+    "seed00053_log2",
+    "seed00067_log1",
+    "seed00066_log1",
+    "seed00052_log3",
+)  # 23 s of four policies
 NEEDS_ACCELEROMETER = {"accelerometer_bias", "accelerometer_scale", "imu_offset"}
 
 
@@ -127,9 +150,13 @@ def test_what_the_nominal_crazyflie_certainly_lacks_is_named(crazyflie):
     assert crazyflie.verdict.startswith("causes_found")
     causes = {cause.effect: cause for cause in crazyflie.causes}
     thrust = causes.get("thrust_curve", causes.get("thrust_scale"))
-    assert thrust is not None and thrust.heldout_gain > 0.0  # the nominal one hovers at another stick
+    assert (
+        thrust is not None and thrust.heldout_gain > 0.0
+    )  # the nominal one hovers at another stick
     assert not NEEDS_ACCELEROMETER & set(causes)
-    assert json.loads(json.dumps(crazyflie.as_json(), allow_nan=False))["verdict"] == crazyflie.verdict
+    assert (
+        json.loads(json.dumps(crazyflie.as_json(), allow_nan=False))["verdict"] == crazyflie.verdict
+    )
 
 
 def test_the_extended_crazyflie_flies_better_where_it_was_not_fitted(crazyflie):

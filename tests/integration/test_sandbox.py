@@ -86,7 +86,9 @@ def trials(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
     return seen
 
 
-def test_a_black_box_is_tried_once_and_the_shipped_one_never(trials: list[bytes], tmp_path: Path) -> None:
+def test_a_black_box_is_tried_once_and_the_shipped_one_never(
+    trials: list[bytes], tmp_path: Path
+) -> None:
     assert hashlib.sha256(SHIPPED.read_bytes()).hexdigest() == blackbox.SHIPPED_SHA256
     load(SHIPPED)
     assert trials == []
@@ -130,14 +132,18 @@ def calling(x: jax.Array, u: jax.Array) -> jax.Array:
         (calling, "found a call of my callback, expected a pure function that calls nothing"),
     ],
 )
-def test_hostile_black_boxes_are_refused(step: Callable[..., Any], message: str, tmp_path: Path) -> None:
+def test_hostile_black_boxes_are_refused(
+    step: Callable[..., Any], message: str, tmp_path: Path
+) -> None:
     checks = [export.DisabledSafetyCheck.custom_call("my callback")]
     path = write_artifact(tmp_path / "a.bin", step, disabled_checks=checks)
     with pytest.raises(BlackBoxError, match=rf"^{path}: .*({message})"):
         load(path, limits=ResourceLimits(cpu_s=1) if step is endless else ResourceLimits())
 
 
-def test_a_trusted_file_is_not_tried_and_may_call_lapack(trials: list[bytes], tmp_path: Path) -> None:
+def test_a_trusted_file_is_not_tried_and_may_call_lapack(
+    trials: list[bytes], tmp_path: Path
+) -> None:
     box = load(write_artifact(tmp_path / "a.bin", solving), limits=None)
     assert trials == []
     np.testing.assert_allclose(box.step_vector(np.zeros(21), np.zeros(4))[:4], 1.0, rtol=1e-5)

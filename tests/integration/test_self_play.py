@@ -29,7 +29,9 @@ def test_a_widened_policy_gives_new_rows_no_weight():
     wide = widen_params(START.params, 36)
     seen = np.asarray(jax.random.normal(jax.random.key(0), (5, 36)))
     action = START.network.act(wide, (), seen)[1]
-    np.testing.assert_allclose(action, START.network.act(START.params, (), seen[:, :29])[1], atol=1e-6)
+    np.testing.assert_allclose(
+        action, START.network.act(START.params, (), seen[:, :29])[1], atol=1e-6
+    )
 
 
 def test_each_member_of_a_pool_flies_its_share_of_the_races():
@@ -55,15 +57,21 @@ def test_self_play_keeps_what_the_champion_can_and_prints_its_wins(tmp_path, cap
     )
     main(settings)
     *_, in_front, behind = capsys.readouterr().out.splitlines()
-    assert in_front.startswith("16 races from in front of flytrack: finishes ") and "wins" in in_front
+    assert (
+        in_front.startswith("16 races from in front of flytrack: finishes ") and "wins" in in_front
+    )
     assert behind.startswith("16 races from behind flytrack: finishes ") and "collisions" in behind
     learner = load_checkpoint(tmp_path / "final.safetensors")
     opponent = widen_params(START.params, 36)
     keys = jax.random.split(jax.random.key(1), 16)
-    assert summarize(*fly_races(RACE, START.network, learner.params, opponent, 0, keys)).finishes > 0.8
+    assert (
+        summarize(*fly_races(RACE, START.network, learner.params, opponent, 0, keys)).finishes > 0.8
+    )
 
 
 def test_a_pool_that_does_not_divide_the_environments_is_refused():
     settings = Settings(num_past=2)
-    with pytest.raises(ValueError, match="num_past: found 2, expected a pool, of one more, that divides"):
+    with pytest.raises(
+        ValueError, match="num_past: found 2, expected a pool, of one more, that divides"
+    ):
         next(train(START, RACE, START.config, settings))

@@ -39,19 +39,33 @@ def test_artifact_of_other_parameters_is_identified_and_flies(folder):
     _, params = gymnax.make("FlyTrack-v0", model=str(folder / "model.json"))
     np.testing.assert_array_equal(params.model.tau, model.tau)
     provenance = load_provenance(folder / "model.json")
-    assert provenance["data"] == {"file": "data.npz", "sha256": load_log(folder / "data.npz").sha256}
+    assert provenance["data"] == {
+        "file": "data.npz",
+        "sha256": load_log(folder / "data.npz").sha256,
+    }
     interval = provenance["intervals_95"]["tau_yaw"]
     assert interval["low"] <= interval["value"] <= interval["high"] and interval["unit"] == "s"
     assert np.shape(provenance["correlation"]["matrix"]) == (11, 11)
 
 
 def test_report_is_of_the_held_out_part_or_of_all_of_another_log(folder, capsys, tmp_path):
-    log, report = load_log(folder / "data.npz"), json.loads((folder / "report/validation.json").read_text())
+    log, report = (
+        load_log(folder / "data.npz"),
+        json.loads((folder / "report/validation.json").read_text()),
+    )
     assert 0.2 * len(log) < report["judged_rows"] < 0.3 * len(log)
     names = {path.name for path in (folder / "report").iterdir()}
-    assert {"validation.html", "validation.txt", "validation.json", "steps.png", "thrust.png"} <= names
+    assert {
+        "validation.html",
+        "validation.txt",
+        "validation.json",
+        "steps.png",
+        "thrust.png",
+    } <= names
     shown = f"{report['one_step']['channels']['v']['mse']:.3g}"
-    assert all(shown in (folder / "report" / f"validation.{kind}").read_text() for kind in ("txt", "html"))
+    assert all(
+        shown in (folder / "report" / f"validation.{kind}").read_text() for kind in ("txt", "html")
+    )
     save_log(tmp_path / "other.csv", log.without("a"))
     run("validate", folder / "model.json", tmp_path / "other.csv", "--out", tmp_path / "report")
     assert "all rows are judged" in capsys.readouterr().out
@@ -77,7 +91,9 @@ def in_place(x, u):
 """
 
 
-def test_functions_of_the_working_folder_are_flown_and_may_change_their_arguments(tmp_path, monkeypatch):
+def test_functions_of_the_working_folder_are_flown_and_may_change_their_arguments(
+    tmp_path, monkeypatch
+):
     (tmp_path / "my_robot.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
     log = collect(load_plant("my_robot:in_place"), minutes=1.0)

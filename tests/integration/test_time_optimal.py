@@ -26,14 +26,21 @@ def test_the_symbolic_step_is_the_simulators() -> None:
     for effect in EFFECTS:
         if effect.memory is None:  # no memory
             neutral = effect.parameters()._asdict()
-            sizes = {name: neutral[name] + effect.notable.get(name, 0.0) * rng.uniform() for name in neutral}
+            sizes = {
+                name: neutral[name] + effect.notable.get(name, 0.0) * rng.uniform()
+                for name in neutral
+            }
             model = model.with_effects(effect.parameters(**sizes))
     traced = symbolic.step_function(model)
     with jax.enable_x64(True):
         exact = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
         simulated = jax.jit(lambda x, u, dt: step(x, u, dt, exact))
         for _ in range(100):
-            x, u, dt = rng.normal(size=STATE_SIZE), rng.uniform(-1.0, 1.0, 4), rng.uniform(0.002, 0.04)
+            x, u, dt = (
+                rng.normal(size=STATE_SIZE),
+                rng.uniform(-1.0, 1.0, 4),
+                rng.uniform(0.002, 0.04),
+            )
             x[QUATERNION] /= np.linalg.norm(x[QUATERNION])
             x[16:20], x[BATTERY] = rng.uniform(-1.0, 1.0, 4), rng.uniform(22.0, 24.0)
             np.testing.assert_allclose(
@@ -64,7 +71,10 @@ def test_its_commands_fly_in_the_simulator(path: Path) -> None:
     found = references.load_reference(path)
     track = load_track(found.track)
     assert path.stem == f"{found.track}_{found.model_name}_{found.kind}"
-    assert found.track_sha256 == references.track_digest(track) and found.found["status"] == "Solve_Succeeded"
+    assert (
+        found.track_sha256 == references.track_digest(track)
+        and found.found["status"] == "Solve_Succeeded"
+    )
     flown = replay(found, track)
     assert time_optimal.is_verified(found, flown)
     assert flown.time_s == pytest.approx(found.time_s, abs=1e-4)
@@ -91,7 +101,10 @@ def rewritten(path: Path, **changes: Any) -> Path:
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"states": np.zeros((3, STATE_SIZE))}, r"states: found shape \(3, 21\), expected \(385, 21\)"),
+        (
+            {"states": np.zeros((3, STATE_SIZE))},
+            r"states: found shape \(3, 21\), expected \(385, 21\)",
+        ),
         ({"commands": np.full((384, 4), np.nan)}, "commands: .*finite"),
         ({"version": 2}, "version: found 2, expected 1"),
         ({"kind": "hovering"}, "kind: found 'hovering', expected flying or standing"),

@@ -8,7 +8,12 @@ from flytrack_env.rollout import load_rollout
 from tests.support.pages import ROOT
 from tests.support.ppo_runs import BATCH, DEAD_URI, SEED, assert_same_end
 
-METRICS = {"race/episode_return", "ppo/policy_loss", "ppo/explained_variance", "race/episode_gates_passed"}
+METRICS = {
+    "race/episode_return",
+    "ppo/policy_loss",
+    "ppo/explained_variance",
+    "race/episode_gates_passed",
+}
 METRICS |= {"race/episode_crash", "race/evaluation_success", "race/evaluation_ended_time_limit"}
 METRICS |= {"race/gate_distance_m", "ppo/learning_rate", "time/steps_per_second"}
 
@@ -25,17 +30,23 @@ def only_run(uri):
 
 
 def history(client, run, name):
-    return [(metric.step, metric.value) for metric in client.get_metric_history(run.info.run_id, name)]
+    return [
+        (metric.step, metric.value) for metric in client.get_metric_history(run.info.run_id, name)
+    ]
 
 
 def reports_of(caplog):
     return [record.getMessage() for record in caplog.records if record.name == tracking.__name__]
 
 
-def test_everything_is_recorded_once_though_the_run_was_cut_off(trainer, tmp_path, monkeypatch, capsys):
+def test_everything_is_recorded_once_though_the_run_was_cut_off(
+    trainer, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(monitor, "NUM_STEPS", 20)
     uri = tracking.local_uri(tmp_path)
-    options = Options(2 * BATCH, evaluate_every=4 * BATCH, evaluation_episodes=2, tracking_uri="local")
+    options = Options(
+        2 * BATCH, evaluate_every=4 * BATCH, evaluation_episodes=2, tracking_uri="local"
+    )
     trainer.train(tmp_path, SEED, options)
     client, run = only_run(uri)
     page = f"http://127.0.0.1:5000/#/experiments/{run.info.experiment_id}/runs/{run.info.run_id}"
@@ -49,9 +60,15 @@ def test_everything_is_recorded_once_though_the_run_was_cut_off(trainer, tmp_pat
     assert {name for name in run.data.metrics if f"`{name}`" not in page} == set()
     before = history(client, run, "ppo/policy_loss")
     assert [step for step, _ in before] == [2 * BATCH, 4 * BATCH, 6 * BATCH, 7 * BATCH]
-    assert [step for step, _ in history(client, run, "race/evaluation_success")] == [4 * BATCH, 7 * BATCH]
+    assert [step for step, _ in history(client, run, "race/evaluation_success")] == [
+        4 * BATCH,
+        7 * BATCH,
+    ]
     names = {file.path for file in client.list_artifacts(run.info.run_id, "evaluation")}
-    assert {f"evaluation/position_density_{7 * BATCH}.png", f"evaluation/rollout_{4 * BATCH}.npy"} <= names
+    assert {
+        f"evaluation/position_density_{7 * BATCH}.png",
+        f"evaluation/rollout_{4 * BATCH}.npy",
+    } <= names
     assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 5
     states, actions = load_rollout(tmp_path / "evaluation" / f"rollout_{7 * BATCH}.npy")
     assert states.shape[1] + actions.shape[1] == 25

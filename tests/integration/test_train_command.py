@@ -26,8 +26,12 @@ def call(*arguments):
 def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
     path = tmp_path / "run.toml"
     path.write_text("total_timesteps = 2e7\nlearning_rate = 1e-3\nhidden_sizes = [32, 32]\n")
-    settings, _ = read("--config", path, "--learning-rate", 2e-3, "--no-affine-shuffle", "--num-envs", 512)
-    expected = Config(20_000_000, 512, learning_rate=2e-3, hidden_sizes=(32, 32), affine_shuffle=False)
+    settings, _ = read(
+        "--config", path, "--learning-rate", 2e-3, "--no-affine-shuffle", "--num-envs", 512
+    )
+    expected = Config(
+        20_000_000, 512, learning_rate=2e-3, hidden_sizes=(32, 32), affine_shuffle=False
+    )
     assert settings.hyperparameters == expected
     settings, _ = read("--total-timesteps", "4e6", "--hidden-sizes", 8, 8, "--reward", "progress=2")
     assert settings.hyperparameters == Config(4_000_000, hidden_sizes=(8, 8))
@@ -47,7 +51,9 @@ def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
         ),
     ],
 )
-def test_what_does_not_fit_a_run_is_refused(whole, tmp_path, monkeypatch, capsys, arguments, message):
+def test_what_does_not_fit_a_run_is_refused(
+    whole, tmp_path, monkeypatch, capsys, arguments, message
+):
     monkeypatch.chdir(tmp_path)
     assert call("--no-tracking", "--resume", whole[0], *arguments, "--out", "out") == 2
     assert message in capsys.readouterr().err

@@ -16,7 +16,12 @@ import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint, monitor
-from baselines.purejaxrl_ppo.checkpoint import check_same_run, checkpoints_in, newest_intact, save_checkpoint
+from baselines.purejaxrl_ppo.checkpoint import (
+    check_same_run,
+    checkpoints_in,
+    newest_intact,
+    save_checkpoint,
+)
 from baselines.purejaxrl_ppo.training import DivergedError, Options, Run, Stopped, Trainer
 from tests.support.pages import ROOT
 from tests.support.ppo_runs import BATCH, CONFIG, EVERY_OTHER_UPDATE, SEED, assert_same_end
@@ -57,7 +62,9 @@ def test_a_complete_run_is_left_alone_and_no_run_is_overwritten(trainer, whole, 
 def test_the_newest_intact_checkpoint_is_taken(trainer, whole, tmp_path, caplog):
     shutil.copytree(whole[0], tmp_path / "cut_off")
     cut_off, newest = tmp_path / "cut_off", step_path(tmp_path / "cut_off", 6)
-    (cut_off / "final.safetensors").write_bytes((whole[0] / "final.safetensors").read_bytes()[:-100])
+    (cut_off / "final.safetensors").write_bytes(
+        (whole[0] / "final.safetensors").read_bytes()[:-100]
+    )
     content = bytearray(newest.read_bytes())
     content[len(content) // 2] ^= 1
     newest.write_bytes(content)
@@ -65,7 +72,9 @@ def test_the_newest_intact_checkpoint_is_taken(trainer, whole, tmp_path, caplog)
         trainer.train(tmp_path / "resumed", SEED, resume=cut_off)
     reports = [record.getMessage() for record in caplog.records]
     assert len(reports) == 2 and "final.safetensors" in reports[0] and newest.name in reports[1]
-    assert all("damaged" in report and "the checkpoint before it is used" in report for report in reports)
+    assert all(
+        "damaged" in report and "the checkpoint before it is used" in report for report in reports
+    )
     assert_same_end(tmp_path / "resumed" / "final.safetensors", whole[0] / "final.safetensors")
 
 
@@ -87,7 +96,11 @@ def test_another_machine_or_software_is_a_warning(whole, caplog):
     assert caplog.text == ""
     other = {"software": {"jax": "0.1.0"}, "machine": {"threads": 1000}}
     check_same_run(checkpoint._replace(meta=checkpoint.meta | other), checkpoint.meta)
-    for message in ("software.jax: found '0.1.0'", "machine.threads: found 1000", "perhaps not bit for bit"):
+    for message in (
+        "software.jax: found '0.1.0'",
+        "machine.threads: found 1000",
+        "perhaps not bit for bit",
+    ):
         assert message in caplog.text
 
 
@@ -104,7 +117,9 @@ def test_a_complete_run_is_extended(whole, tmp_path, capsys):
     (tmp_path / "two" / "final.safetensors").unlink()
     longer.train(tmp_path / "two", SEED, EVERY_OTHER_UPDATE, tmp_path / "two")
     assert_same_end(tmp_path / "two" / "final.safetensors", final.path)
-    with pytest.raises(CheckpointError, match=f"steps: found {10 * BATCH}, expected at most {7 * BATCH}"):
+    with pytest.raises(
+        CheckpointError, match=f"steps: found {10 * BATCH}, expected at most {7 * BATCH}"
+    ):
         Trainer(CONFIG, "FlyTrackRobust-v0").train(tmp_path / "one", SEED, resume=tmp_path / "one")
 
 
@@ -128,13 +143,20 @@ def test_a_diverged_run_ends_at_once_and_no_checkpoint_has_it(trainer, tmp_path,
     with pytest.raises(DivergedError) as caught:
         trainer.train(tmp_path, SEED, EVERY_OTHER_UPDATE)
     last_good = step_path(tmp_path, 2)
-    for part in (f"steps {2 * BATCH} and {4 * BATCH}", "not finite", str(last_good), "--learning-rate"):
+    for part in (
+        f"steps {2 * BATCH} and {4 * BATCH}",
+        "not finite",
+        str(last_good),
+        "--learning-rate",
+    ):
         assert part in str(caught.value)
     assert newest_intact(tmp_path).path == last_good
 
 
 @pytest.mark.parametrize("broken", slow_but(["fly_many"], ["fly_many", "draw_position_density"]))
-def test_an_evaluation_that_fails_does_not_end_the_training(trainer, tmp_path, monkeypatch, caplog, broken):
+def test_an_evaluation_that_fails_does_not_end_the_training(
+    trainer, tmp_path, monkeypatch, caplog, broken
+):
     def fail(*arguments):
         raise RuntimeError("out of paint\nand more")
 
@@ -144,7 +166,8 @@ def test_an_evaluation_that_fails_does_not_end_the_training(trainer, tmp_path, m
     trainer.train(tmp_path, SEED, Options(evaluate_every=100 * BATCH, evaluation_episodes=2))
     assert (tmp_path / "final.safetensors").exists()
     assert (
-        f"after {7 * BATCH} steps" in caplog.text and "out of paint and more; training goes on" in caplog.text
+        f"after {7 * BATCH} steps" in caplog.text
+        and "out of paint and more; training goes on" in caplog.text
     )
 
 

@@ -43,7 +43,14 @@ def test_black_box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_flight_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = run_examples(tutorial("flight_log"), tmp_path, monkeypatch)
-    assert len(names["log"]) > 2500 and set(names["log"].channels) == {"u", "q", "v", "w", "f", "v_bat"}
+    assert len(names["log"]) > 2500 and set(names["log"].channels) == {
+        "u",
+        "q",
+        "v",
+        "w",
+        "f",
+        "v_bat",
+    }
     assert load_model(tmp_path / "model.json").tau[:3] == pytest.approx([0.04] * 3, rel=0.02)
     assert names["errors"].one_step.channels["f"].nrmse > 0.2  # the model lacks the drag
     assert {cause.effect for cause in names["diagnosis"].causes} == {"linear_drag", "thrust_curve"}
@@ -53,7 +60,10 @@ def test_flight_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_better_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = run_examples(tutorial("better_policy"), tmp_path, monkeypatch)
-    loop, errors = names["loop"], names["errors_of"](names["found"].extended, names["loop"].held_out)
+    loop, errors = (
+        names["loop"],
+        names["errors_of"](names["found"].extended, names["loop"].held_out),
+    )
     assert errors.position_m["0.5"] < loop.before.errors.position_m["0.5"]
     assert loop.after.errors.position_m["0.5"] < loop.before.errors.position_m["0.5"]
     files = {path.name for path in (tmp_path / "loop").iterdir()}

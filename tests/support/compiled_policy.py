@@ -10,7 +10,17 @@ import numpy as np
 from baselines.purejaxrl_ppo.export import ExportedPolicy
 from flytrack_env.state import ACTION_SIZE, BATTERY, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 
-FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Wconversion", "-O2", "-shared", "-fPIC")
+FLAGS = (
+    "-std=c99",
+    "-pedantic",
+    "-Wall",
+    "-Wextra",
+    "-Werror",
+    "-Wconversion",
+    "-O2",
+    "-shared",
+    "-fPIC",
+)
 BEYOND = 1.2  # times the limits of the observation, so that clipping is compared too
 LOOPS = """
 #include "policy.h"
@@ -44,7 +54,9 @@ class CompiledPolicy:
     def act(self, states: Any, gates: Any, past: Any = ()) -> np.ndarray:
         """Return actions (N, 4) of states (N, 21), gates (N,) and, if it reads them, past actions (N, P)."""
         actions = np.empty((len(states), ACTION_SIZE), np.float32)
-        self._call("act", len(states), np.float32(states), np.int32(gates), np.float32(past), actions)
+        self._call(
+            "act", len(states), np.float32(states), np.int32(gates), np.float32(past), actions
+        )
         return actions
 
     def next_gates(self, before: Any, after: Any, gates: Any) -> np.ndarray:
@@ -60,8 +72,13 @@ class CompiledPolicy:
         return applied
 
     def _call(self, name: str, *arguments: Any) -> None:
-        kept = [np.ascontiguousarray(value) if np.ndim(value) else int(value) for value in arguments]
-        given = [value if isinstance(value, int) else ctypes.c_void_p(value.ctypes.data) for value in kept]
+        kept = [
+            np.ascontiguousarray(value) if np.ndim(value) else int(value) for value in arguments
+        ]
+        given = [
+            value if isinstance(value, int) else ctypes.c_void_p(value.ctypes.data)
+            for value in kept
+        ]
         getattr(self.functions, name)(*given)
 
 
@@ -72,7 +89,9 @@ def states_in_box(policy: ExportedPolicy, count: int, seed: int) -> tuple[np.nda
     reach = BEYOND * policy.limits / policy.factors
     rows = rng.uniform(-reach, reach, (count, reach.size)) + policy.offsets
     states = np.zeros((count, STATE_SIZE))
-    states[:, POSITION] = policy.centres[gates] + np.einsum("nij,ni->nj", policy.frames[gates], rows[:, :3])
+    states[:, POSITION] = policy.centres[gates] + np.einsum(
+        "nij,ni->nj", policy.frames[gates], rows[:, :3]
+    )
     states[:, VELOCITY] = np.einsum("nij,ni->nj", policy.frames[gates], rows[:, 3:6])
     attitudes = rng.normal(size=(count, 4))
     states[:, QUATERNION] = attitudes / np.linalg.norm(attitudes, axis=1, keepdims=True)

@@ -25,7 +25,8 @@ FAILS_BELOW_V, FAILS_AT_S = 23.6, 2.0
 class Rails(Plant):
     """A plant that flies the time-optimal start and laps, whatever the command.
 
-    The lower its battery, the slower it is, by ``pace``; one that is low indeed falls to the ground.
+    The lower its battery, the slower it is, by ``pace``; one that is low indeed falls to the
+    ground.
     """
 
     def __init__(self) -> None:
@@ -33,7 +34,9 @@ class Rails(Plant):
         laps = (standing, flying, flying, flying)
         ends_s = np.cumsum([lap.time_s for lap in laps])
         own_s = [lap.dt_s * np.arange(len(lap.commands)) - lap.time_s for lap in laps]
-        self.time_s = np.concatenate([end + times for end, times in zip(ends_s, own_s, strict=True)])
+        self.time_s = np.concatenate(
+            [end + times for end, times in zip(ends_s, own_s, strict=True)]
+        )
         self.positions = np.concatenate([lap.states[:-1, POSITION] for lap in laps])
 
     @staticmethod
@@ -66,11 +69,15 @@ def write_checkpoint(
     memory_size: int = 0,
 ) -> Path:
     """Write a policy that has learned nothing, with all that a checkpoint tells."""
-    env = make(env_id, track=track, model=nominal_parameters().with_effects(LinearDrag(0.3, 0.3, 0.1)))
+    env = make(
+        env_id, track=track, model=nominal_parameters().with_effects(LinearDrag(0.3, 0.3, 0.1))
+    )
     config = Config(hidden_sizes=hidden_sizes, memory_size=memory_size)
     size = env.observation_space().shape[0]
     params = make_network(config).init(jax.random.key(5), jnp.zeros((1, size)))
-    uneven = jax.tree.map(lambda leaf: 0.1 * jnp.cos(jnp.arange(leaf.size)).reshape(leaf.shape), params)
+    uneven = jax.tree.map(
+        lambda leaf: 0.1 * jnp.cos(jnp.arange(leaf.size)).reshape(leaf.shape), params
+    )
     params = jax.tree.map(jnp.add, params, uneven)
     save_checkpoint(path, params, config, describe_run(env, env_id, track, config, seed=0))
     return path

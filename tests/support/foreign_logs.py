@@ -36,15 +36,23 @@ class UlogWriter:
         return struct.pack("<B", len(text)) + text.encode()
 
     def add(
-        self, name: str, fields: list[tuple[str, str, int]], rows: list[tuple[Any, ...]], instance: int = 0
+        self,
+        name: str,
+        fields: list[tuple[str, str, int]],
+        rows: list[tuple[Any, ...]],
+        instance: int = 0,
     ) -> None:
         """Add a topic: fields are (type, name, array size or 0), rows flat with the time in us first."""
         fields = [("uint64_t", "timestamp", 0), *fields]
-        text = "".join(f"{kind}{f'[{size}]' if size else ''} {field};" for kind, field, size in fields)
+        text = "".join(
+            f"{kind}{f'[{size}]' if size else ''} {field};" for kind, field, size in fields
+        )
         if not instance:
             self.definitions += self.message("F", f"{name}:{text}".encode())
         pattern = "<" + "".join(ULOG_TYPES[kind] * max(size, 1) for kind, _, size in fields)
-        self.data += self.message("A", struct.pack("<BH", instance, self.num_topics) + name.encode())
+        self.data += self.message(
+            "A", struct.pack("<BH", instance, self.num_topics) + name.encode()
+        )
         for row in rows:
             content = struct.pack("<H", self.num_topics) + struct.pack(pattern, *row)
             self.data += self.message("D", content)
@@ -74,7 +82,9 @@ def topics() -> dict[str, tuple[list, list]]:
     """Return the topics of a log of a drone with its nose east, turning, pulling up; fields and rows."""
     slow = TIMES_US[::5]
     place = constant((1.0, 2.0, -3.0, 4.0, 5.0, -6.0), slow)
-    setpoints = constant((*np.deg2rad([360.0, 90.0, -45.0]), 0.0, 0.0, -0.75), slow)  # half of the full stick
+    setpoints = constant(
+        (*np.deg2rad([360.0, 90.0, -45.0]), 0.0, 0.0, -0.75), slow
+    )  # half of the full stick
     return {
         "vehicle_angular_velocity": ([("float", "xyz", 3)], constant((0.1, 0.2, 0.3))),
         "vehicle_acceleration": ([("float", "xyz", 3)], constant((0.5, 0.25, -9.75))),
@@ -113,13 +123,20 @@ def blackbox(rows: np.ndarray, names: list[str], headers: dict[str, str]) -> byt
     text = "".join(f"H {name}:{value}\n" for name, value in lines.items()).encode()
     frames = b"".join(
         b"I"
-        + b"".join(_variable_bytes(int(value), bool(sign)) for value, sign in zip(row, signed, strict=True))
+        + b"".join(
+            _variable_bytes(int(value), bool(sign)) for value, sign in zip(row, signed, strict=True)
+        )
         for row in rows
     )
     return text + frames + b"E\xffEnd of log\x00"
 
 
-BLACKBOX_NAMES = ["loopIteration", "time", *(f"setpoint[{axis}]" for axis in range(4)), "vbatLatest"]
+BLACKBOX_NAMES = [
+    "loopIteration",
+    "time",
+    *(f"setpoint[{axis}]" for axis in range(4)),
+    "vbatLatest",
+]
 BLACKBOX_NAMES += [f"{sensor}[{axis}]" for sensor in ("gyroADC", "accSmooth") for axis in range(3)]
 
 
@@ -127,7 +144,11 @@ def blackbox_frames(num_rows: int = 200) -> np.ndarray:
     """Return frames of a steady turn, the throttle rising, at 2 kHz."""
     row = [0, 0, 511, -333, 250, 0, 2410, 100, -50, 25, 1024, -512, 2048]
     found, count = np.tile(row, (num_rows, 1)), np.arange(num_rows)
-    found[:, 0], found[:, 1], found[:, 5] = count, 5_000_000 + 500 * count, np.linspace(0, 1000, num_rows)
+    found[:, 0], found[:, 1], found[:, 5] = (
+        count,
+        5_000_000 + 500 * count,
+        np.linspace(0, 1000, num_rows),
+    )
     return found
 
 
@@ -138,10 +159,17 @@ def usd_log(
     stamp, per_s = {1: ("I", 1e3), 2: ("Q", 1e6)}[version]
     header, records = struct.pack("<BHH", 0xBC, version, len(events)), []
     for number, (name, (variables, rows)) in enumerate(events.items()):
-        header += struct.pack("<H", number) + name.encode() + b"\0" + struct.pack("<H", len(variables))
-        header += b"".join(f"{variable}({kind})".encode() + b"\0" for variable, kind in variables.items())
+        header += (
+            struct.pack("<H", number) + name.encode() + b"\0" + struct.pack("<H", len(variables))
+        )
+        header += b"".join(
+            f"{variable}({kind})".encode() + b"\0" for variable, kind in variables.items()
+        )
         for time, *row in rows:
-            values = [v if kind in "efd" else int(v) for kind, v in zip(variables.values(), row, strict=True)]
+            values = [
+                v if kind in "efd" else int(v)
+                for kind, v in zip(variables.values(), row, strict=True)
+            ]
             content = struct.pack(
                 f"<H{stamp}{''.join(variables.values())}", number, round(time * per_s), *values
             )
@@ -153,7 +181,9 @@ def usd_log(
 
 def usd() -> bytes:
     """Return a small uSD log that the mapping "usd" fits."""
-    variables = dict.fromkeys(("roll", "pitch", "yaw", "thrust", "gyro.x", "gyro.y"), "f") | {"gyro.z": "h"}
+    variables = dict.fromkeys(("roll", "pitch", "yaw", "thrust", "gyro.x", "gyro.y"), "f") | {
+        "gyro.z": "h"
+    }
     rows = np.tile((0.0, 0.5, -0.25, 0.1, 0.3, 10.0, -20.0, 30.0), (NUM_ROWS, 1))
     rows[:, 0] = 1.0 + 0.01 * np.arange(NUM_ROWS)
     slow = np.array([[0.9, 3900.0], [1.4, 3800.0]])
@@ -216,7 +246,12 @@ DATAFLASH_TYPES = {
     "N": ("16s", 1),
 }
 DATAFLASH_TYPES |= {"Z": ("64s", 1), "n": ("4s", 1), "b": ("b", 1)}
-COPTER_PARAMETERS = {"ACRO_RP_RATE": 360.0, "ACRO_Y_RATE": 180.0, "ATC_RATE_R_MAX": 500.0, "FRAME_CLASS": 1.0}
+COPTER_PARAMETERS = {
+    "ACRO_RP_RATE": 360.0,
+    "ACRO_Y_RATE": 180.0,
+    "ATC_RATE_R_MAX": 500.0,
+    "FRAME_CLASS": 1.0,
+}
 
 
 def dataflash(
@@ -230,7 +265,11 @@ def dataflash(
     """
     known = {
         "FMT": ("BBnNZ", "Type,Length,Name,Format,Columns", []),
-        "PARM": ("QNf", "TimeUS,Name,Value", [(0, name, value) for name, value in parameters.items()]),
+        "PARM": (
+            "QNf",
+            "TimeUS,Name,Value",
+            [(0, name, value) for name, value in parameters.items()],
+        ),
         "MSG": ("QZ", "TimeUS,Message", [(0, text)]),
         **messages,
     }
@@ -250,7 +289,9 @@ def dataflash(
         return DATAFLASH_HEAD + bytes([number]) + struct.pack(pattern, *values)
 
     content, rows = b"", list[bytes]()
-    for number, (name, (types, columns, values)) in enumerate(known.items(), start=DATAFLASH_FORMAT):
+    for number, (name, (types, columns, values)) in enumerate(
+        known.items(), start=DATAFLASH_FORMAT
+    ):
         size = 3 + struct.calcsize("<" + "".join(DATAFLASH_TYPES[kind][0] for kind in types))
         content += packed(DATAFLASH_FORMAT, "BBnNZ", (number, size, name, types, columns))
         rows += [packed(number, types, row) for row in values]
@@ -275,7 +316,8 @@ def dataflash_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, None
     return folder / "a.bin", None
 
 
-# Logs of a drone that turns about z at as many deg/s as rows are before, so that rows can be told apart.
+# Logs of a drone that turns about z at as many deg/s as rows are before, so that rows can be told
+# apart.
 CLOCK_STICKS = (0.5, -0.25, 0.1, 0.3)
 
 
@@ -327,7 +369,9 @@ def bag_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
         sec, nanosec = divmod(round(1e9 * stamp_s), 10**9)
         header = {"stamp": {"sec": sec, "nanosec": nanosec}}
         rates = {"x": 0.0, "y": 0.0, "z": np.deg2rad(row)}
-        messages.append(("/flight", row * 4_000_000, {"header": header, "u": CLOCK_STICKS, "w": rates}))
+        messages.append(
+            ("/flight", row * 4_000_000, {"header": header, "u": CLOCK_STICKS, "w": rates})
+        )
     save_messages(folder / "a.mcap", messages)
     return folder / "a.mcap", _with_mapping(folder, "bag")
 
@@ -335,7 +379,9 @@ def bag_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
 def csv_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
     """Write a CSV file with these stamps."""
     rows = _sticks_and_turn(stamps_s)
-    np.savetxt(folder / "a.csv", rows, "%.9f", ",", header="t,roll,pitch,yaw,thrust,p,q,r", comments="")
+    np.savetxt(
+        folder / "a.csv", rows, "%.9f", ",", header="t,roll,pitch,yaw,thrust,p,q,r", comments=""
+    )
     return folder / "a.csv", _with_mapping(folder, "clock")
 
 
@@ -344,8 +390,12 @@ def csv_files_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path
     rows, flight = _sticks_and_turn(stamps_s), folder / "flight"
     flight.mkdir()
     sticks = np.column_stack([1e3 * (rows[:, 0] - 50.0005), rows[:, 1:5]])
-    np.savetxt(flight / "x_gyro_0.csv", rows[:, [0, 5, 6, 7]], "%.9f", ",", header="t,p,q,r", comments="")
-    np.savetxt(flight / "x_rc_0.csv", sticks, "%.9f", ",", header="ms,roll,pitch,yaw,thrust", comments="")
+    np.savetxt(
+        flight / "x_gyro_0.csv", rows[:, [0, 5, 6, 7]], "%.9f", ",", header="t,p,q,r", comments=""
+    )
+    np.savetxt(
+        flight / "x_rc_0.csv", sticks, "%.9f", ",", header="ms,roll,pitch,yaw,thrust", comments=""
+    )
     return flight, _with_mapping(folder, "files")
 
 

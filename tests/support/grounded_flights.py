@@ -36,16 +36,17 @@ def stands_flies_and_lands(step_s: float = STEP_S, seed: int = 0) -> FlightLog:
 
 
 def falls(
-    kind: str, noise: float = 1.0, terminal_speed: float = 12.0, throttle: float = 0.0, seed: int = 0
+    kind: str,
+    noise: float = 1.0,
+    terminal_speed: float = 12.0,
+    throttle: float = 0.0,
+    seed: int = 0,
 ) -> FlightLog:
     """Return a flight of 10 s, a fall of 10 s that does not turn, and a flight of 10 s.
 
-    Args:
-        kind: "ballistic", without drag, or "descent", on quadratic drag, until drag carries the weight.
-        noise: factor of NOISE.
-        terminal_speed: of the descent, m/s.
-        throttle: during the fall, as a fraction of its range.
-        seed: of motion and noise.
+    Args: kind: "ballistic", without drag, or "descent", on quadratic drag, until drag carries the
+        weight. noise: factor of NOISE. terminal_speed: of the descent, m/s. throttle: during the
+        fall, as a fraction of its range. seed: of motion and noise.
     """
     flight = stands_flies_and_lands(seed=seed)
     part = flight.select((flight.time >= TAKE_OFF_S + 0.1) & (flight.time < LANDING_S - 0.1))
@@ -59,7 +60,8 @@ def falls(
     fall = {
         "u": np.tile([0.0, 0.0, 0.0, 2.0 * throttle - 1.0], (num_fall, 1)),
         "w": noise * NOISE["w"] * rng.standard_normal((num_fall, 3)),
-        "f": noise * NOISE["f"] * rng.standard_normal((num_fall, 3)) + felt[:, None] * [0.0, 0.0, 1.0],
+        "f": noise * NOISE["f"] * rng.standard_normal((num_fall, 3))
+        + felt[:, None] * [0.0, 0.0, 1.0],
         "v_bat": np.full((num_fall, 1), 16.0),
     }
     channels = {name: np.concatenate([part[name], fall[name], part[name]]) for name in fall}

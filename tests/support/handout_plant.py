@@ -17,8 +17,8 @@ HOVER = -0.25  # about what holds the weight of ``HandoutPlant``
 class HandoutPlant:
     """A plant ``step(x, u)`` with parameters that no tool is told; one state or many at once.
 
-    tau: s. coeffs: N on 1 kg. max_rate: deg/s. drain: V/min. drag_b: 1/s, linear drag along the body's axes.
-    gravity: m/s^2.
+    tau: s. coeffs: N on 1 kg. max_rate: deg/s. drain: V/min. drag_b: 1/s, linear drag along the
+    body's axes. gravity: m/s^2.
     """
 
     tau: tuple[float, ...] = (0.021, 0.034, 0.057, 0.045)
@@ -76,7 +76,8 @@ def rotation(quat: np.ndarray) -> np.ndarray:
 def excited(plant: HandoutPlant, skip: int = 1, repeat: int = 1, jitter: float = 0.0) -> FlightLog:
     """Return the log of the excitation on a plant, float64, without noise.
 
-    skip, repeat: of commands, for steps of 0.01 s times skip over repeat. jitter: of steps, relative.
+    skip, repeat: of commands, for steps of 0.01 s times skip over repeat. jitter: of steps,
+    relative.
     """
     rng = np.random.default_rng(5)
     planned = script(24, HOVER, rng)

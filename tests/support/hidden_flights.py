@@ -14,7 +14,9 @@ LOW_START = Start((1.0, -2.0, 3.0), 0.7, 23.5, -0.3)
 COLUMNS = {"x": 21, "p": 3, "v": 3, "q": 4, "f": 3, "w": 3, "slope": 3}
 
 
-def scripted(seed: int, seconds: float, noise: str = "sensors", **changes: Any) -> tuple[Truth, FlightLog]:
+def scripted(
+    seed: int, seconds: float, noise: str = "sensors", **changes: Any
+) -> tuple[Truth, FlightLog]:
     """Return a plant of a seed, with some fields replaced, and the measured log of its flight."""
     rng = np.random.default_rng(seed)
     truth = replace(draw_base(rng), **changes)
@@ -39,5 +41,10 @@ def flown_in_floats(truth: Truth, commands: Any, start: Start = LOW_START) -> di
 
 def random_sticks(num_steps: int, seed: int = 4) -> np.ndarray:
     """Return steps of the sticks at random, each held for ten steps, (num_steps, 4)."""
-    sticks = np.random.default_rng(seed).uniform(-1.0, 1.0, (-(-num_steps // 10), 4)) * [0.5, 0.5, 1.0, 1.0]
+    sticks = np.random.default_rng(seed).uniform(-1.0, 1.0, (-(-num_steps // 10), 4)) * [
+        0.5,
+        0.5,
+        1.0,
+        1.0,
+    ]
     return np.repeat(sticks, 10, axis=0)[:num_steps]

@@ -34,4 +34,8 @@ def commands(text: str) -> list[str]:
         for line in code.splitlines()
     ]
     starts = (".venv/bin/", "make ", "python ", "flytrack ")
-    return [line.partition("  #")[0].removeprefix(".venv/bin/") for line in lines if line.startswith(starts)]
+    return [
+        line.partition("  #")[0].removeprefix(".venv/bin/")
+        for line in lines
+        if line.startswith(starts)
+    ]

@@ -10,7 +10,9 @@ from baselines.purejaxrl_ppo.training import Options, Trainer
 
 SEED = 3
 BATCH = 16 * 24
-CONFIG = Config(total_timesteps=7 * BATCH, num_envs=16, num_steps=24, num_minibatches=4, hidden_sizes=(8,))
+CONFIG = Config(
+    total_timesteps=7 * BATCH, num_envs=16, num_steps=24, num_minibatches=4, hidden_sizes=(8,)
+)
 EVERY_OTHER_UPDATE = Options(checkpoint_every=2 * BATCH)
 DEAD_URI = "http://127.0.0.1:9"  # the port at which nothing listens
 
@@ -18,7 +20,8 @@ DEAD_URI = "http://127.0.0.1:9"  # the port at which nothing listens
 @cache
 def make_trainer() -> Trainer:
     """Return the trainer, compiled once for all tests of a process."""
-    # The id with the most state: another drone in every episode, sensor noise, a history of commands.
+    # The id with the most state: another drone in every episode, sensor noise, a history of
+    # commands.
     return Trainer(CONFIG, "FlyTrackRobust-v0")
 
 

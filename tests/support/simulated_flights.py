@@ -14,7 +14,8 @@ from flytrack_env.state import BATTERY, QUATERNION, Action, Drone, pack, unpack,
 
 DT, NUM_STEPS = 0.01, 200
 NOMINAL = nominal_parameters()
-# Neutral effects change no bit (tests/contract/test_effects.py), so that a test may replace any of them.
+# Neutral effects change no bit (tests/contract/test_effects.py), so that a test may replace any of
+# them.
 ALL_NEUTRAL = NOMINAL.with_effects(*(effect.parameters() for effect in EFFECTS))
 _SIMULATOR = Simulator(MOST_STEPS)
 
@@ -36,7 +37,10 @@ def fly(drone: Drone, commands: jax.Array, model: ModelParameters, dt: float = D
 
 
 def flown(
-    parameters: Any = (), commands: Any = None, drone: Drone | None = None, model: ModelParameters = NOMINAL
+    parameters: Any = (),
+    commands: Any = None,
+    drone: Drone | None = None,
+    model: ModelParameters = NOMINAL,
 ) -> np.ndarray:
     """Return a flight, (num_steps, 37), float64, with one effect or a tuple of them."""
     effects = parameters if type(parameters) is tuple else (parameters,)
@@ -45,10 +49,14 @@ def flown(
     padded = np.zeros((NUM_STEPS, 4), np.float32)
     padded[: len(commands)] = commands
     padded[len(commands) :] = commands[-1]
-    return np.asarray(fly(drone_with() if drone is None else drone, padded, full), float)[: len(commands)]
+    return np.asarray(fly(drone_with() if drone is None else drone, padded, full), float)[
+        : len(commands)
+    ]
 
 
-def flown_by(plant: Plant, model: ModelParameters, start: jax.Array, commands: jax.Array) -> jax.Array:
+def flown_by(
+    plant: Plant, model: ModelParameters, start: jax.Array, commands: jax.Array
+) -> jax.Array:
     """Return a plant's packed states after each command, (num_steps, 21)."""
 
     def one(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
@@ -60,7 +68,9 @@ def flown_by(plant: Plant, model: ModelParameters, start: jax.Array, commands: j
 
 def held(num_steps: int = 1, **sticks: float) -> np.ndarray:
     """Return commands (num_steps, 4) that hold sticks; those not named are 0."""
-    return np.tile(np.array(Action(**{**dict.fromkeys(Action._fields, 0.0), **sticks})), (num_steps, 1))
+    return np.tile(
+        np.array(Action(**{**dict.fromkeys(Action._fields, 0.0), **sticks})), (num_steps, 1)
+    )
 
 
 def drone_with(**fields: Any) -> Drone:

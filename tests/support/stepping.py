@@ -1,6 +1,7 @@
 """The step outside of plain ``jit``: flights divided among devices, which need a process of their own.
 
-``python -m tests.support.stepping ENV_ID ...``, with ``XLA_FLAGS``, flies each id in each way and compares.
+``python -m tests.support.stepping ENV_ID ...``, with ``XLA_FLAGS``, flies each id in each way and
+compares.
 """
 
 import sys
@@ -16,7 +17,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 import flytrack_env  # noqa: F401, registers the ids
 
 NUM_DEVICES, NUM_ENVS, NUM_STEPS = 4, 8, 5
-XLA_FLAGS = f"--xla_force_host_platform_device_count={NUM_DEVICES}"  # of the environment of the process
+# of the environment of the process
+XLA_FLAGS = f"--xla_force_host_platform_device_count={NUM_DEVICES}"
 MAX_STEPS = 3  # of an episode, so that episodes end
 TOLERANCE = 1e-4  # rounding of a float32 step depends on how many environments are computed at once
 
@@ -37,7 +39,9 @@ def flight(env: Any) -> Callable[..., Any]:
         step = jax.vmap(env.step, in_axes=(0, 0, 0, None))
 
         def advance(begun: Any, _: Any) -> Any:
-            observation, state, reward, terminated, truncated, _ = step(keys, begun[1], actions, params)
+            observation, state, reward, terminated, truncated, _ = step(
+                keys, begun[1], actions, params
+            )
             return (observation, state), (reward, terminated, truncated)
 
         begun = jax.vmap(env.reset, in_axes=(0, None))(keys, params)
@@ -53,7 +57,9 @@ def inputs(env: Any) -> tuple[jax.Array, jax.Array, Any]:
     return jax.random.split(jax.random.key(0), NUM_ENVS), actions, short_episodes(env)
 
 
-def _by_named_sharding(fly: Any, keys: jax.Array, actions: jax.Array, params: Any, mesh: Mesh) -> Any:
+def _by_named_sharding(
+    fly: Any, keys: jax.Array, actions: jax.Array, params: Any, mesh: Mesh
+) -> Any:
     placed = jax.device_put((keys, actions), NamedSharding(mesh, PartitionSpec("batch")))
     program = jax.jit(fly).lower(*placed, params).compile()
     text = program.as_text()
@@ -91,10 +97,15 @@ def main(env_ids: list[str]) -> None:
         expected = jax.jit(fly)(*inputs(env))
         for way in WAYS:
             found = way(fly, *inputs(env), mesh)
-            paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(found)]
+            paths = [
+                jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(found)
+            ]
             leaves = zip(paths, *map(jax.tree.leaves, (found, expected)), strict=True)
             for path, leaf, one in leaves:
-                name, numbers = f"{env_id}{way.__name__}{path}", (np.asarray(x, float) for x in (leaf, one))
+                name, numbers = (
+                    f"{env_id}{way.__name__}{path}",
+                    (np.asarray(x, float) for x in (leaf, one)),
+                )
                 np.testing.assert_allclose(*numbers, rtol=TOLERANCE, atol=TOLERANCE, err_msg=name)
         print(env_id, "flown in", len(WAYS), "ways")
 

@@ -89,9 +89,11 @@ def arrays(params: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)
 
 
-# One step on the FlyTrack course: position, velocity, other fields of the drone, steps already flown, action;
-# causes; truncated.
-ENDS = {name: (*own, set(causes), is_late) for name, (*own, causes, is_late) in table("ends").items()}
+# One step on the FlyTrack course: position, velocity, other fields of the drone, steps already
+# flown, action; causes; truncated.
+ENDS = {
+    name: (*own, set(causes), is_late) for name, (*own, causes, is_late) in table("ends").items()
+}
 
 
 def before_ends(env: Any, params: Any, ends: Iterable[Any], **fields: Any) -> tuple[Any, jax.Array]:

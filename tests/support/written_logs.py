@@ -17,7 +17,9 @@ def read_mapping(name: str) -> str:
     return (MAPPINGS / f"{name}.toml").read_text(encoding="utf-8")
 
 
-def make_log(seed: int = 0, num_rows: int = NUM_ROWS, names: tuple[str, ...] = tuple(CHANNELS)) -> FlightLog:
+def make_log(
+    seed: int = 0, num_rows: int = NUM_ROWS, names: tuple[str, ...] = tuple(CHANNELS)
+) -> FlightLog:
     """Return a log of random numbers in two segments that every check of a file passes."""
     rng = np.random.default_rng(seed)
     channels = {name: rng.standard_normal((num_rows, len(CHANNELS[name]))) for name in names}

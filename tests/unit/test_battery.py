@@ -11,7 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from flytrack_env import Battery, BatteryWarning, FlyTrack, load_model, nominal_parameters, save_model
+from flytrack_env import (
+    Battery,
+    BatteryWarning,
+    FlyTrack,
+    load_model,
+    nominal_parameters,
+    save_model,
+)
 from flytrack_env.model_file import ModelFileError
 from flytrack_env.state import BATTERY, pack
 from flytrack_env.thrust import collective_thrust
@@ -39,7 +46,8 @@ def thrust_to_weight(model: Any, stick: Any, volts: Any) -> np.ndarray:
 def test_episodes_stay_within_the_battery_of_the_craft(cells: int, mass_kg: float) -> None:
     model = craft_model(cells, mass_kg)
     assert model.battery == Battery(4.2 * cells, 3.4 * cells, 3.4 * cells, 4.2 * cells)
-    # The nominal craft's thrust-to-weight ratios at the same share of full: 3.5 there, by its docstring.
+    # The nominal craft's thrust-to-weight ratios at the same share of full: 3.5 there, by its
+    # docstring.
     assert thrust_to_weight(model, 1.0, model.battery.full_v) == pytest.approx(3.5, abs=0.02)
     env, params = gymnax.make("FlyTrack-v0", model=model)
     keys = jax.random.split(jax.random.key(0), NUM_STARTS)
@@ -105,7 +113,10 @@ def test_a_model_file_without_a_battery_is_warned_of(tmp_path: Path) -> None:
         ({"full": 4.2}, r"battery\.full: unknown; expected one of full_v"),
         ({"full_v": "4.2"}, r"battery\.full_v: found .*expected a number"),
         ({"full_v": 3.4, "empty_v": 4.2}, "model.battery: found empty_v 4.2, full_v 3.4, expected"),
-        ({"full_v": 24, "empty_v": 22, "fitted_low_v": 14, "fitted_high_v": 16.8}, "14 to 16.8 V.*22 to 24"),
+        (
+            {"full_v": 24, "empty_v": 22, "fitted_low_v": 14, "fitted_high_v": 16.8},
+            "14 to 16.8 V.*22 to 24",
+        ),
     ],
 )
 def test_bad_batteries_are_refused(battery: Any, reason: str, tmp_path: Path) -> None:

@@ -40,7 +40,9 @@ def test_sticks_become_rates_and_hover_stays_one() -> None:
     expected = np.deg2rad(np.asarray(NOMINAL.max_rate)) * (0.3, -0.2, 0.5)
     np.testing.assert_allclose(states[-1, RATES], expected, rtol=0.03, atol=0.03)
     still = flown(held(SECOND, thrust=-0.22))
-    np.testing.assert_allclose(still[:, APPLIED_ACTION], np.tile([0, 0, 0, -0.22], (SECOND, 1)), atol=1e-5)
+    np.testing.assert_allclose(
+        still[:, APPLIED_ACTION], np.tile([0, 0, 0, -0.22], (SECOND, 1)), atol=1e-5
+    )
 
 
 def test_motors_that_end_trade_thrust_for_rates_and_airmode_adds_it() -> None:
@@ -73,7 +75,9 @@ def test_a_weak_motor_turns_a_craft_that_climbs_until_the_integral_holds_it() ->
 
 def test_the_loop_takes_the_place_of_lags_in_fits() -> None:
     free = base_of(NOMINAL.with_effects(RACER))
-    assert "betaflight_loop.roll_arm" in free and not {"tau_roll", "betaflight_loop.p_roll"} & {*free}
+    assert "betaflight_loop.roll_arm" in free and not {"tau_roll", "betaflight_loop.p_roll"} & {
+        *free
+    }
     assert "tau_roll" in base_of(NOMINAL)
     times = half_response_s(NOMINAL.with_effects(RACER))
     assert np.all((times > 0.005) & (times < 0.05))
@@ -81,7 +85,11 @@ def test_the_loop_takes_the_place_of_lags_in_fits() -> None:
 
 def test_settings_become_the_loop_and_another_loop_is_none() -> None:
     loop = rate_loop(SETTINGS.__getitem__, 100.0)
-    assert loop is not None and (loop.sticks_hz, loop.throttle_hz, loop.p_pitch) == (37.0, 20.0, 47.0)
+    assert loop is not None and (loop.sticks_hz, loop.throttle_hz, loop.p_pitch) == (
+        37.0,
+        20.0,
+        47.0,
+    )
     static = {"gyro_lpf1_dyn_min_hz": "0", "gyro_lpf1_static_hz": "90", "rc_smoothing": "OFF"}
     loop = rate_loop({**SETTINGS, **static, "iterm_relax": "OFF"}.__getitem__, 100.0)
     assert loop is not None and loop.gyro_lpf1_dyn_min_hz == loop.gyro_lpf1_dyn_max_hz == 90.0

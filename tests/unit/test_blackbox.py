@@ -17,10 +17,22 @@ from flytrack_env.blackbox import BlackBoxError, load
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.dynamics import step as model_step
 from flytrack_env.state import APPLIED_ACTION, BATTERY, RATES
-from tests.support.black_boxes import AIRLESS, FORBIDDEN, ROOT, SHIPPED, random_inputs, start, write_artifact
+from tests.support.black_boxes import (
+    AIRLESS,
+    FORBIDDEN,
+    ROOT,
+    SHIPPED,
+    random_inputs,
+    start,
+    write_artifact,
+)
 
 REFUSALS = [
-    (r"signature: found .*float32\[20\], float32\[4\].*expected", lambda x, u: x, {"shapes": ((20,), (4,))}),
+    (
+        r"signature: found .*float32\[20\], float32\[4\].*expected",
+        lambda x, u: x,
+        {"shapes": ((20,), (4,))},
+    ),
     (r"signature: found .*-> \(float32\[21\], float32\[4\]\).*expected", lambda x, u: (x, u), {}),
     (r"signature: found .*\(float32\[21\]\) ->.*expected", lambda x: x, {"shapes": ((21,),)}),
     (r"signature: found .*float16\[21\].*expected", lambda x, u: x, {"dtype": jnp.float16}),
@@ -117,8 +129,12 @@ def test_environment_flies_the_black_box(black_box, fly_black_box):
 
 
 def test_airless_plant_is_the_minimal_model():
-    lag, thrust, rate = (np.array(one, np.float32) for one in (AIRLESS.lag, AIRLESS.thrust, AIRLESS.max_rate))
-    model = ModelParameters(tau=lag, thrust_coeffs=thrust, max_rate=rate, m=AIRLESS.mass, g=AIRLESS.gravity)
+    lag, thrust, rate = (
+        np.array(one, np.float32) for one in (AIRLESS.lag, AIRLESS.thrust, AIRLESS.max_rate)
+    )
+    model = ModelParameters(
+        tau=lag, thrust_coeffs=thrust, max_rate=rate, m=AIRLESS.mass, g=AIRLESS.gravity
+    )
     states, actions = random_inputs(64)
     found = jax.vmap(lambda x, u: plant.step(x, u, AIRLESS))(states, actions)
     expected = jax.vmap(lambda x, u: model_step(x, u, 0.01, model))(states, actions)
@@ -139,13 +155,17 @@ def test_lags_and_full_stick_rates(fly_black_box):
 # The artifact and its runtime
 
 
-def test_rebuilt_artifact_is_the_committed_one_that_tells_nothing_about_its_source(tmp_path, capsys):
+def test_rebuilt_artifact_is_the_committed_one_that_tells_nothing_about_its_source(
+    tmp_path, capsys
+):
     main(["--out", str(tmp_path / "deep" / "acro_step.bin")])
     assert "acro_step.bin" in capsys.readouterr().out
     assert os.listdir(tmp_path / "deep") == ["acro_step.bin"]
     rebuilt = load(tmp_path / "deep" / "acro_step.bin")
     states, actions = random_inputs(512)
-    shipped, again = (jax.jit(jax.vmap(box.step_vector))(states, actions) for box in (load(SHIPPED), rebuilt))
+    shipped, again = (
+        jax.jit(jax.vmap(box.step_vector))(states, actions) for box in (load(SHIPPED), rebuilt)
+    )
     assert np.isfinite(shipped).all()
     np.testing.assert_array_equal(shipped, again)
     for word in (b".py", b"lift", b"drag", b"ground", b"jit("):
@@ -154,7 +174,9 @@ def test_rebuilt_artifact_is_the_committed_one_that_tells_nothing_about_its_sour
 
 def test_runtime_interface(tmp_path, fly_black_box):
     x, u = (rows[0] for rows in random_inputs(1))
-    np.testing.assert_allclose(acro_step_runtime.step(x, u), fly_black_box(x, u), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        acro_step_runtime.step(x, u), fly_black_box(x, u), rtol=1e-6, atol=1e-6
+    )
     path = build(AIRLESS, tmp_path / "airless.bin")
     elsewhere = acro_step_runtime.step(x, u, bin_path=str(path))
     expected = plant.step(x, jnp.asarray(u), AIRLESS)
@@ -184,5 +206,7 @@ def test_nothing_mentions_the_numbers():
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stdout
     paths = [ROOT / name for name in listed.split("\0") if name] or list(ROOT.rglob("*.py"))
     allowed = {ROOT / "blackbox" / name for name in ("build.py", "plant.py", f"{FORBIDDEN}.py")}
-    found = {path for path in paths if path.is_file() and FORBIDDEN in path.read_text(encoding="utf-8")}
+    found = {
+        path for path in paths if path.is_file() and FORBIDDEN in path.read_text(encoding="utf-8")
+    }
     assert found - allowed == set() and ROOT / "blackbox" / "build.py" in found

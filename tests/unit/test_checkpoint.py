@@ -10,7 +10,12 @@ import safetensors.numpy
 
 from baselines.purejaxrl_ppo import CheckpointError, Config, load_checkpoint, make_network
 from baselines.purejaxrl_ppo import checkpoint as checkpoint_module
-from baselines.purejaxrl_ppo.checkpoint import as_named_arrays, checksum, observation_layout, save_checkpoint
+from baselines.purejaxrl_ppo.checkpoint import (
+    as_named_arrays,
+    checksum,
+    observation_layout,
+    save_checkpoint,
+)
 from flytrack_env import FlyTrack
 from flytrack_env.observations import OBSERVATION_SIZE
 
@@ -21,7 +26,11 @@ DESCRIPTION = {
     "missed_gate": "terminate",
     "observation_size": OBSERVATION_SIZE,
 }
-TRAINING = {"key": np.arange(2, dtype=np.uint32), "flags": np.array([True, False]), "scalar": np.float32(3.0)}
+TRAINING = {
+    "key": np.arange(2, dtype=np.uint32),
+    "flags": np.array([True, False]),
+    "scalar": np.float32(3.0),
+}
 
 
 @pytest.fixture
@@ -42,7 +51,11 @@ def test_round_trip(path, params):
     assert (checkpoint.env_id, checkpoint.track) == ("FlyTrack-v0", "flytrack")
     for name, array in TRAINING.items():
         found = checkpoint.training[name]
-        assert (found.dtype, found.shape, found.tobytes()) == (array.dtype, array.shape, array.tobytes())
+        assert (found.dtype, found.shape, found.tobytes()) == (
+            array.dtype,
+            array.shape,
+            array.tobytes(),
+        )
     checkpoint.check_fits(FlyTrack())
 
 
@@ -51,7 +64,9 @@ def test_observations_that_do_not_fit_are_refused(tmp_path, params):
     layout = observation_layout(env)
     layout["row 1 (velocity)"]["scale"] = 4.0
     save_checkpoint(path, params, CONFIG, {**DESCRIPTION, "observation": layout})
-    with pytest.raises(CheckpointError, match=r"row 1 \(velocity\)\.scale: found 4\.0, expected 5\.0$"):
+    with pytest.raises(
+        CheckpointError, match=r"row 1 \(velocity\)\.scale: found 4\.0, expected 5\.0$"
+    ):
         load_checkpoint(path).check_fits(env)
     params = make_network(CONFIG).init(jax.random.key(0), jnp.zeros((1, 5)))
     save_checkpoint(path, params, CONFIG, {**DESCRIPTION, "observation_size": 5})
@@ -62,7 +77,10 @@ def test_observations_that_do_not_fit_are_refused(tmp_path, params):
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        ((2**40).to_bytes(8, "little") + b"{}", "found a header of 1099511627776 bytes, expected at most"),
+        (
+            (2**40).to_bytes(8, "little") + b"{}",
+            "found a header of 1099511627776 bytes, expected at most",
+        ),
         (safetensors.numpy.save({"a": np.zeros(3)}), "not a checkpoint, or damaged"),
         (
             safetensors.numpy.save({}, {"meta": "{}", "sha256": checksum("{}", {})}),
@@ -100,8 +118,16 @@ def test_every_flipped_bit_is_noticed(path):
             r"observation_size: found 1000000000000, expected a whole number .*up to 65536",
         ),
         ("config", [1, 2], "config: found .*, expected a table of fields"),
-        ("config", {"learning_rate": 10**400}, "learning_rate: found 1000.*, expected a number above 0"),
-        ("config", {"hidden_sizes": [8] * 5000}, "hidden_sizes: found .*, expected a list of 1 to 16"),
+        (
+            "config",
+            {"learning_rate": 10**400},
+            "learning_rate: found 1000.*, expected a number above 0",
+        ),
+        (
+            "config",
+            {"hidden_sizes": [8] * 5000},
+            "hidden_sizes: found .*, expected a list of 1 to 16",
+        ),
         (
             "config",
             {"memory_size": 2**40},
@@ -115,7 +141,12 @@ def test_descriptions_that_cannot_be_used_are_refused(path, params, name, value,
     arrays = {f"policy.{key}": array for key, array in as_named_arrays(params).items()}
     if name == "factor":
         arrays = {key: np.float32(value) * array for key, array in arrays.items()}
-    meta = {"format": checkpoint_module.FORMAT, "config": {"hidden_sizes": [8]}, **DESCRIPTION, name: value}
+    meta = {
+        "format": checkpoint_module.FORMAT,
+        "config": {"hidden_sizes": [8]},
+        **DESCRIPTION,
+        name: value,
+    }
     text = json.dumps(meta)
     metadata = {"meta": text, "sha256": checksum(text, arrays)}  # one that fits
     path.write_bytes(safetensors.numpy.save(arrays, metadata))

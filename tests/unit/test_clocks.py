@@ -47,7 +47,9 @@ def test_standard_errors_are_those_of_other_draws_of_the_noise(truth):
 
 
 def test_clocks_that_agree_are_left_and_lag_of_the_plant_is_no_offset(truth):
-    later = FlightLog(truth.time, {**truth.channels, "u": np.roll(truth["u"], 20, axis=0)}, truth.segment)
+    later = FlightLog(
+        truth.time, {**truth.channels, "u": np.roll(truth["u"], 20, axis=0)}, truth.segment
+    )
     aligned, found = clocks.align_clocks(truth)
     assert all(one.verdict == "not significant, left" and abs(one.offset_s) < 1e-3 for one in found)
     np.testing.assert_array_equal(aligned["q"], truth["q"])
@@ -87,7 +89,8 @@ def test_commands_stamped_after_the_turns_they_cause_are_put_before_them() -> No
         if notes:
             assert "the clock of the commands was about" in notes[0]
             off = [
-                np.abs(found["u"] - np.roll(truth["u"], -by, axis=0)[is_kept]).mean() for by in range(-4, 5)
+                np.abs(found["u"] - np.roll(truth["u"], -by, axis=0)[is_kept]).mean()
+                for by in range(-4, 5)
             ]
             assert min(off) < 0.1 * np.abs(found["u"]).mean()
 
@@ -108,4 +111,6 @@ def test_a_drone_on_time_is_no_simulator_however_little_the_model_explains() -> 
     """Commands that have nothing to do with the motion stand for a rate loop that the model lacks."""
     log = noisy(flight(TIME_S), seed=1)
     with jax.enable_x64(True):
-        assert how_it_moves(log, HandoutPlant().model(), np.ones(len(log), bool)) == Moves(Motion.CONTINUOUS)
+        assert how_it_moves(log, HandoutPlant().model(), np.ones(len(log), bool)) == Moves(
+            Motion.CONTINUOUS
+        )

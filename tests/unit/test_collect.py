@@ -23,7 +23,14 @@ def test_plant_and_function_of_the_same_equations_give_the_same_log():
     np.testing.assert_array_equal(plant.segment, function.segment)
     np.testing.assert_array_equal(plant.time, function.time)
     np.testing.assert_allclose(plant["u"], function["u"], atol=1e-5)
-    for name, tolerance in {"p": 2e-3, "v": 2e-3, "a": 2e-3, "q": 1e-4, "w": 1e-3, "v_bat": 2e-4}.items():
+    for name, tolerance in {
+        "p": 2e-3,
+        "v": 2e-3,
+        "a": 2e-3,
+        "q": 1e-4,
+        "w": 1e-3,
+        "v_bat": 2e-4,
+    }.items():
         np.testing.assert_allclose(plant[name], function[name], atol=tolerance, err_msg=name)
     assert plant.time.max() <= 2.5 and len(plant) > 0.8 * 6000
 
@@ -105,7 +112,9 @@ def test_held_out_part_has_every_kind_a_clear_step_of_each_axis_and_all_voltages
     same = judged.segment[1:] == judged.segment[:-1]
     for axis, stick in enumerate(STICKS[:3]):
         jumps = np.abs(np.diff(judged["u"][:, axis]))
-        alone = np.array([KINDS[number // 4 % len(KINDS)] == stick for number in judged.segment[1:]])
+        alone = np.array(
+            [KINDS[number // 4 % len(KINDS)] == stick for number in judged.segment[1:]]
+        )
         assert jumps[same & alone].max() >= 0.3, stick
 
 
@@ -148,4 +157,6 @@ def test_accelerometer_measures_what_is_not_gravity_in_the_attitude_before(truth
     expected = np.einsum("nji,nj->ni", before, truth["a"][1:] + np.array([0.0, 0.0, GRAVITY]))
     inside = ~truth.is_start()[1:]
     np.testing.assert_allclose(force[1:][inside], expected[inside], atol=1e-12)
-    np.testing.assert_allclose(force[1:][inside][:, :2], 0.0, atol=1e-9)  # without drag, thrust alone
+    np.testing.assert_allclose(
+        force[1:][inside][:, :2], 0.0, atol=1e-9
+    )  # without drag, thrust alone

@@ -38,7 +38,9 @@ def test_the_next_process_compiles_nothing_that_is_slow(tmp_path):
     kept = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
     environment = kept | {"XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", STEP]
-    runs = [subprocess.run(command, env=environment, capture_output=True, check=True) for _ in range(2)]
+    runs = [
+        subprocess.run(command, env=environment, capture_output=True, check=True) for _ in range(2)
+    ]
     assert [int(run.stdout) for run in runs] == [0, 1], runs
 
 

@@ -10,9 +10,13 @@ from flytrack_sysid import LogError, import_log
 from tests.support.foreign_logs import CLOCK_WRITERS
 
 STEP_S, NUM_ROWS, KEPT = 0.004, 1000, 0.9
-# What a note says where the whole rows are used, or why the log is refused; least rows that are used.
+# What a note says where the whole rows are used, or why the log is refused; least rows that are
+# used.
 USED = {
-    "ULog": (700, "cut off: used up to the last whole message"),  # topic by topic, so that some end earlier
+    "ULog": (
+        700,
+        "cut off: used up to the last whole message",
+    ),  # topic by topic, so that some end earlier
     "blackbox": (890, "cut off: found no end-of-log event; 8.. whole frames used"),
     "DataFlash": (890, "cut off: used up to the last whole message"),
     "uSD": (890, "damaged or cut off: .* bytes are used"),

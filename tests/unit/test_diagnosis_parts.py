@@ -86,7 +86,9 @@ def correlation(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 def test_innovations_are_white_and_of_variance_one(lanes, disturbed):
     ones = np.ones(NUM_AXES)
-    noise = noises.Noise(DIRECT, LEVEL, WANDER, DISTURBANCE, TAU_S * ones, ones)  # that they were made of
+    noise = noises.Noise(
+        DIRECT, LEVEL, WANDER, DISTURBANCE, TAU_S * ones, ones
+    )  # that they were made of
     with jax.enable_x64(True):
         gains = noises.make_gains(noise, noises.step_to(lanes), lanes.is_known, lanes.counts)
         found = np.array(noises.innovations(gains, disturbed, lanes.counts))
@@ -125,7 +127,9 @@ def test_lanes_are_only_where_something_is_judged(flown):
     counting = own[lanes.counts[LEAD_IN_S * RATE :].any(axis=(2, 3))]
     assert np.isin(counting, wanted).all()
     assert own.shape[1] == 6  # 12 s and 7 s, in stretches of five, and one that fills up
-    assert (np.diff(lead_in[:, :5], axis=0) == 1).all()  # flown for real, also where it is not judged
+    assert (
+        np.diff(lead_in[:, :5], axis=0) == 1
+    ).all()  # flown for real, also where it is not judged
 
 
 def predictions(step: Step, _: None) -> tuple[jax.Array, ...]:
@@ -156,7 +160,8 @@ def test_lanes_agree_with_one_long_replay(flown, lanes):
     for (axis, channel), one in expected.items():
         axes = slice(axis, axis + 3)
         counts = lanes.counts[..., axes, channel]
-        # In multiples of the noise; what came before the lead-in is forgotten to a millionth of full stick.
+        # In multiples of the noise; what came before the lead-in is forgotten to a millionth of
+        # full stick.
         error = (left[..., axes, channel] - one[lanes.row]) / (DIRECT, LEVEL)[channel][axes]
         assert counts[LEAD_IN_S * RATE].any() and np.abs(error[counts]).max() < 1e-3
 
@@ -199,7 +204,10 @@ def test_logs_are_joined_by_what_they_all_have_with_a_warning(flown):
     assert unused_channels([first, second]) == ["channel f is not used: b.npz has none"]
     assert unused_channels([first, first]) == []
     both = joined([first, second])
-    assert sorted(both.channels) == sorted(set(first.channels) - {"f"}) and both.source == "a.npz + b.npz"
+    assert (
+        sorted(both.channels) == sorted(set(first.channels) - {"f"})
+        and both.source == "a.npz + b.npz"
+    )
     np.testing.assert_array_equal(both.segment, np.repeat([0, 1, 2], [30, 10, 10]))
     np.testing.assert_array_equal(both["w"], np.concatenate([first["w"], second["w"]]))
     assert joined([first]) is first
@@ -223,7 +231,9 @@ def test_a_sensor_farther_off_than_any_on_the_list_is_told_and_not_named():
     off = log["f"] + np.array([2.5, 0.0, 0.0])
     found = diagnose(replace(log, channels={**log.channels, "f": off}), model_of(truth))
     (cause,) = found.beyond
-    assert found.causes == () and found.verdict == "unexplained" and found.unexplained.depends_on == ()
+    assert (
+        found.causes == () and found.verdict == "unexplained" and found.unexplained.depends_on == ()
+    )
     assert cause.effect == "accelerometer_bias" and cause.beyond == "x at least 2 m/s^2"
     assert float(found.extended.effect("accelerometer_bias").x) == 0.0
     (warning,) = (one for one in found.warnings if "beyond the list" in one)
@@ -236,7 +246,10 @@ def test_what_may_be_something_unknown_is_told_with_its_size_and_not_named(state
     vector[problem.index(THRUST_COEFFS)] *= 1.146
     selection = Selection(state, None, None, {}, stand_ins=("thrust_curve", "wind", "tau_yaw"))
     thrust, lag = stand_in_notes(selection, vector)
-    assert thrust.startswith("thrust_curve differs") and "thrust or your mass by +14.6% in the mean" in thrust
+    assert (
+        thrust.startswith("thrust_curve differs")
+        and "thrust or your mass by +14.6% in the mean" in thrust
+    )
     assert lag.startswith("tau_yaw differs in the extended model, but is not named")
 
 
@@ -256,7 +269,9 @@ def test_values_at_the_end_of_their_range_are_beyond_the_list(state, field, valu
     vector = problem.start.copy()
     vector[problem.names.index(field)] = value
     effect, _, name = field.rpartition(".")
-    cause = replace(CAUSE, effect=effect or name, parameters={name: Estimated(value, (value, value), "1")})
+    cause = replace(
+        CAUSE, effect=effect or name, parameters={name: Estimated(value, (value, value), "1")}
+    )
     found = with_refined_values([cause], Refined((), None, None, (), {}, problem, None), vector)
     assert found[0].beyond.startswith(f"{name} at most {value:g}" if is_warned_of else "")
     warned = [one for one in warnings_of(problem, found, []) if "beyond the list" in one]
@@ -270,8 +285,13 @@ def test_a_value_that_no_flight_depends_on_is_not_told(state):
     fit = Fit(problem.start, places, np.diag([1e-6, 0.0]))
     told = {name: Estimated(0.01, (0.0, 0.02), "s") for name in names}
     cause = replace(CAUSE, effect="command_delay", parameters=told)
-    (found,) = with_refined_values([cause], Refined((), fit, None, (), {}, problem, None), problem.start)
-    assert list(found.parameters) == ["delay_s"] and found.parameters["delay_s"].ci95 == (0.0, 0.001)
+    (found,) = with_refined_values(
+        [cause], Refined((), fit, None, (), {}, problem, None), problem.start
+    )
+    assert list(found.parameters) == ["delay_s"] and found.parameters["delay_s"].ci95 == (
+        0.0,
+        0.001,
+    )
 
 
 @pytest.mark.parametrize(("effect", "is_law"), [("rate_scale", True), ("command_delay", False)])
@@ -296,9 +316,13 @@ def test_a_long_log_is_thinned_with_a_warning_that_counts_judged_rows(state, mon
     monkeypatch.setattr("flytrack_sysid.diagnosis.lanes.MOST_ROWS", 4 * LANE_S * 100 + 10)
     (warning,) = thinning_warning(every, thinned(every))
     kept, number = thinned(every).num_judged, every.num_judged
-    assert kept < 0.8 * number and warning.startswith(f"only {kept} of {number} rows were learnt from")
+    assert kept < 0.8 * number and warning.startswith(
+        f"only {kept} of {number} rows were learnt from"
+    )
     in_lanes = int((thinned(every).row[100:] >= 0).sum())
-    assert in_lanes >= number  # as many rows as are judged: counting those would have hidden the loss
+    assert (
+        in_lanes >= number
+    )  # as many rows as are judged: counting those would have hidden the loss
 
 
 @pytest.mark.parametrize(

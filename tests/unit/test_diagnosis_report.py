@@ -56,7 +56,15 @@ def test_pictures_of_a_cause_that_begins_in_flight_show_the_part_in_which_it_act
     model, log = flown
     found = traces(log, {"nominal": model}, like="nominal")
     late = Cause(
-        "linear_drag", (), "velocity", {}, 9.0, 3.0, 9.0, 9.0, onset_s=Estimated(7.0, (6.8, 7.2), "s")
+        "linear_drag",
+        (),
+        "velocity",
+        {},
+        9.0,
+        3.0,
+        9.0,
+        9.0,
+        onset_s=Estimated(7.0, (6.8, 7.2), "s"),
     )
     acting = report.while_acting(found, late, float(log.time[0]))
     expected = found.elapsed_s >= 7.0 - log.time[0]
@@ -79,21 +87,32 @@ def test_residuals_are_measured_minus_modelled(flown):
     airspeed_b = quat.inv().apply(log["v"])[:-1]
     stick, volt, coeffs = applied[1:, 3], log["v_bat"][:-1, 0], wrong.thrust_coeffs
     thrust = np.polyval(coeffs[3::-1], stick) + volt * (coeffs[4] + stick * coeffs[5])
-    modelled = np.array([0.0, 0.0, 1.0]) * thrust[:, None] / wrong.m - np.array([0.1, 0.2, 0.0]) * airspeed_b
+    modelled = (
+        np.array([0.0, 0.0, 1.0]) * thrust[:, None] / wrong.m
+        - np.array([0.1, 0.2, 0.0]) * airspeed_b
+    )
     rates = log["w"] - applied[:, :3] * np.deg2rad(wrong.max_rate)
     later, own = slice(SETTLED, None), found.residuals["wrong"]
     np.testing.assert_allclose(own["rates"][later], rates[later], atol=1e-5)
-    np.testing.assert_allclose(own["force"][later], (log["f"][1:] - modelled)[SETTLED - 1 :], atol=1e-4)
+    np.testing.assert_allclose(
+        own["force"][later], (log["f"][1:] - modelled)[SETTLED - 1 :], atol=1e-4
+    )
     gravity_w = np.array([0.0, 0.0, wrong.g])
     moved = quat[:-1].inv().apply(np.diff(log["v"], axis=0) / DT_S + gravity_w) - modelled
     np.testing.assert_allclose(own["velocity"][later], moved[SETTLED - 1 :], atol=1e-3)
-    turned = (quat[:-1].inv() * quat[1:]).as_rotvec() / DT_S - applied[1:, :3] * np.deg2rad(wrong.max_rate)
+    turned = (quat[:-1].inv() * quat[1:]).as_rotvec() / DT_S - applied[1:, :3] * np.deg2rad(
+        wrong.max_rate
+    )
     np.testing.assert_allclose(
         own["attitude"][later], turned[SETTLED - 1 :], atol=0.05
     )  # of steps, not angles
     drained = log["v_bat"][:, 0] - log["v_bat"][0, 0] + 0.5 / 60.0 * log.time
     np.testing.assert_allclose(own["battery"][:, 0], drained, atol=1e-6)
-    for name in ("rates", "force", "velocity"):  # what is there is seen, and gone with the right model
+    for name in (
+        "rates",
+        "force",
+        "velocity",
+    ):  # what is there is seen, and gone with the right model
         assert np.abs(own[name][later]).max() > 0.1
         assert np.abs(found.residuals["right"][name][later]).max() < 1e-3
 
@@ -109,7 +128,11 @@ def shown(model: ModelParameters, cause: str) -> ModelParameters:
 
 def test_every_cause_has_a_plot_in_which_it_shows(flown):
     base, log = flown
-    low = log["p"] - [0.0, 0.0, log["p"][:, 2].min() - 0.1]  # some effects are there near the ground only
+    low = log["p"] - [
+        0.0,
+        0.0,
+        log["p"][:, 2].min() - 0.1,
+    ]  # some effects are there near the ground only
     log = replace(log, channels={**log.channels, "p": low})
     causes = [*(effect.name for effect in EFFECTS), *BASE_CAUSES]
     assert set(EVIDENCE) == set(causes)
@@ -122,8 +145,12 @@ def test_every_cause_has_a_plot_in_which_it_shows(flown):
         explained = []
         for panel in evidence.panels:
             assert panel.regressor in REGRESSORS
-            (less, counts), (full, _) = (found.column(name, panel.residual) for name in ("without", cause))
-            explained.append(np.abs(full - less)[counts].max() / sizes[panel.residual.split("_")[0]])
+            (less, counts), (full, _) = (
+                found.column(name, panel.residual) for name in ("without", cause)
+            )
+            explained.append(
+                np.abs(full - less)[counts].max() / sizes[panel.residual.split("_")[0]]
+            )
         assert max(explained) > 1.0, cause
 
 
@@ -134,7 +161,8 @@ def diagnosis(flown, measured):
     nominal = base._replace(tau=1.3 * base.tau)
     bias = AccelerometerBias(0.2, 0.0, 0.0)
     drag = {
-        name: Estimated(value, (0.9 * value, 1.1 * value), "1/s") for name, value in DRAG._asdict().items()
+        name: Estimated(value, (0.9 * value, 1.1 * value), "1/s")
+        for name, value in DRAG._asdict().items()
     }
     lag = {"tau_roll": Estimated(0.03, (0.02, 0.04), "s")}
     offset = {"x": Estimated(0.2, (0.1, 0.3), "m/s^2")}
@@ -145,15 +173,23 @@ def diagnosis(flown, measured):
     )
     error = {
         name: Errors(
-            {"w": 0.5 * share, "f": 0.4 * share, "q": float("nan")}, {"0.5": 0.1 * share, "1": 0.5 * share}
+            {"w": 0.5 * share, "f": 0.4 * share, "q": float("nan")},
+            {"0.5": 0.1 * share, "1": 0.5 * share},
         )
-        for name, share in (("nominal", 1.0), ("refitted_base", 0.8), ("extended", 0.2), ("noise_floor", 0.1))
+        for name, share in (
+            ("nominal", 1.0),
+            ("refitted_base", 0.8),
+            ("extended", 0.2),
+            ("noise_floor", 0.1),
+        )
     }
     return Diagnosis(
         verdict=f"{CAUSES_FOUND}+{UNEXPLAINED}",
         causes=causes,
         unexplained=Unexplained(True, ("position",), {"force: position": 0.3}),
-        not_identifiable=(NotIdentifiable("ground_effect", 0.02, "m^2", ("thrust_scale",), "low_passes"),),
+        not_identifiable=(
+            NotIdentifiable("ground_effect", 0.02, "m^2", ("thrust_scale",), "low_passes"),
+        ),
         error=error,
         nominal=nominal,
         base=base,
@@ -185,14 +221,20 @@ def test_page_says_all_and_loads_nothing(tmp_path, diagnosis, measured):
     ):
         assert words in text.replace("&#x27;", "'"), words
     assert not re.search(r"https?://|url\(|@import|<link|<script", text)
-    assert text.count('src="data:image/png;base64,') == text.count("<img") == 1 + len(diagnosis.causes)
+    assert (
+        text.count('src="data:image/png;base64,') == text.count("<img") == 1 + len(diagnosis.causes)
+    )
     assert len(text) < 3e6
 
 
 def test_what_refitting_alone_or_a_guess_reaches_is_no_gain_of_effects(diagnosis):
-    errors = {name: Errors({}, {"1": size}) for name, size in (("nominal", 8.7), ("refitted_base", 0.404))}
+    errors = {
+        name: Errors({}, {"1": size}) for name, size in (("nominal", 8.7), ("refitted_base", 0.404))
+    }
     blind = Prediction({"placebo": {"position_m": {"1": 0.27}}})
-    found = replace(diagnosis, error={**errors, "extended": Errors({}, {"1": 0.403})}, prediction=blind)
+    found = replace(
+        diagnosis, error={**errors, "extended": Errors({}, {"1": 0.403})}, prediction=blind
+    )
     assert (
         "0.4 m when only refitted: no effect adds to that; a guess that ignores the commands, 0.27 m)"
         in report.text_of(found)
@@ -204,9 +246,12 @@ def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):
     at_end = replace(lag, beyond="tau_roll at most 0.001 s")
     found = replace(diagnosis, causes=(drag,), beyond=(at_end,))
     text = report.verdict_of(found).text
-    assert text.startswith("The model lacks drag in proportion to airspeed. Named linear_drag: flies")
+    assert text.startswith(
+        "The model lacks drag in proportion to airspeed. Named linear_drag: flies"
+    )
     assert (
-        "Beyond the list, so that its cause may be another: lag of roll (tau_roll at most 0.001 s)." in text
+        "Beyond the list, so that its cause may be another: lag of roll (tau_roll at most 0.001 s)."
+        in text
     )
     alone = replace(found, causes=(), unexplained=Unexplained())
     assert "lag of roll (tau_roll at most 0.001 s)" in report.verdict_of(alone).text
@@ -219,7 +264,9 @@ def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):
 @pytest.mark.slow
 def test_page_of_a_log_of_few_channels(diagnosis, measured):
     text = report.html_of(diagnosis, measured.without("w", "f", "v_bat"))
-    assert "attitude or velocity replace them" in text and text.count("<img") == 1 + len(diagnosis.causes)
+    assert "attitude or velocity replace them" in text and text.count("<img") == 1 + len(
+        diagnosis.causes
+    )
 
 
 # --- Any page -----------------------------------------------------------------------------------------

@@ -64,14 +64,20 @@ def test_gradients_equal_finite_differences(differentiate: Any) -> None:
         for x, u in zip(*random_inputs(3, seed=5), strict=True):
             vector = np.concatenate([x, u, [0.02], flat])
             shifts = 1e-6 * np.eye(vector.size)
-            numeric = np.stack([(packed(vector + s) - packed(vector - s)) / 2e-6 for s in shifts], -1)
+            numeric = np.stack(
+                [(packed(vector + s) - packed(vector - s)) / 2e-6 for s in shifts], -1
+            )
             np.testing.assert_allclose(jacobian(vector), numeric, rtol=1e-5, atol=1e-5)
     # Everything matters but the old acceleration and rates, and the ends of the battery.
     unused = {*range(6, 9), *range(13, 16), *range(vector.size - len(Battery()), vector.size)}
     assert set(np.flatnonzero(~np.abs(numeric).any(axis=0)).tolist()) == unused
 
 
-@pytest.mark.parametrize(("x_shape", "u_shape", "name"), [((20,), (4,), "x"), ((21,), (3,), "action")])
-def test_wrong_shapes_are_refused(x_shape: tuple[int, ...], u_shape: tuple[int, ...], name: str) -> None:
+@pytest.mark.parametrize(
+    ("x_shape", "u_shape", "name"), [((20,), (4,), "x"), ((21,), (3,), "action")]
+)
+def test_wrong_shapes_are_refused(
+    x_shape: tuple[int, ...], u_shape: tuple[int, ...], name: str
+) -> None:
     with pytest.raises(ValueError, match=rf"^{name}: found shape .* expected"):
         step(np.zeros(x_shape), np.zeros(u_shape), 0.01, NOMINAL)

@@ -39,7 +39,8 @@ YAWED = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # 90 degrees: the world's x is t
 
 # --- Laws that hidden plants have, too ----------------------------------------------------------------
 
-# Hidden plants have other laws on purpose, and an accelerometer off the centre without a mean over the step.
+# Hidden plants have other laws on purpose, and an accelerometer off the centre without a mean over
+# the step.
 OTHER_LAWS = ("rate_saturation", "translational_lift", "ground_effect", "imu_offset")
 SAME_LAWS = tuple(name for name in hidden.NAMES if name not in OTHER_LAWS)
 # An imbalance leaks into yaw in the package, and does not in hidden plants.
@@ -56,7 +57,11 @@ CHOSEN = {
 
 
 @pytest.mark.parametrize(
-    "names", [*(pytest.param((name,), id=name) for name in SAME_LAWS), pytest.param(TOGETHER, id="together")]
+    "names",
+    [
+        *(pytest.param((name,), id=name) for name in SAME_LAWS),
+        pytest.param(TOGETHER, id="together"),
+    ],
 )
 def test_laws_are_those_of_hidden_plants_in_plain_floats(names: tuple[str, ...]) -> None:
     """Alone and together, by equations that were written twice."""
@@ -72,14 +77,20 @@ def test_laws_are_those_of_hidden_plants_in_plain_floats(names: tuple[str, ...])
         values["quadratic_drag"] |= {"shared": 0.0}
     parameters = tuple(effects.BY_NAME[name].parameters(**own) for name, own in values.items())
     found = flown(parameters, commands, drone, model_of(truth))
-    for columns, theirs in ((slice(21), expected["x"]), (slice(21, 24), rates_b), (slice(24, 27), force_b)):
+    for columns, theirs in (
+        (slice(21), expected["x"]),
+        (slice(21, 24), rates_b),
+        (slice(24, 27), force_b),
+    ):
         np.testing.assert_allclose(found[5:, columns], theirs[5:], rtol=2e-4, atol=5e-4)
 
 
 # --- Forces -----------------------------------------------------------------------------------------
 
 
-def force_of(parameters: Any, thrust: float = -1.0, model: Any = NOMINAL, **fields: Any) -> np.ndarray:
+def force_of(
+    parameters: Any, thrust: float = -1.0, model: Any = NOMINAL, **fields: Any
+) -> np.ndarray:
     """Return the acceleration without gravity of one step, world, m/s^2."""
     drone = drone_with(applied=(0.0, 0.0, 0.0, thrust), **fields)
     return flown(parameters, held(thrust=thrust), drone, model)[0, ACCELERATION] + GRAVITY_W
@@ -87,9 +98,14 @@ def force_of(parameters: Any, thrust: float = -1.0, model: Any = NOMINAL, **fiel
 
 @pytest.mark.parametrize(
     ("vel_w", "quat", "expected"),
-    [((3.0, 4.0, 0.0), (1.0, 0.0, 0.0, 0.0), (-1.5, -4.0, 0.0)), ((5.0, 0.0, 0.0), YAWED, (-5.0, 0.0, 0.0))],
+    [
+        ((3.0, 4.0, 0.0), (1.0, 0.0, 0.0, 0.0), (-1.5, -4.0, 0.0)),
+        ((5.0, 0.0, 0.0), YAWED, (-5.0, 0.0, 0.0)),
+    ],
 )
-def test_quadratic_drag_multiplies_each_axis_by_the_whole_speed(vel_w: Any, quat: Any, expected: Any) -> None:
+def test_quadratic_drag_multiplies_each_axis_by_the_whole_speed(
+    vel_w: Any, quat: Any, expected: Any
+) -> None:
     found = force_of(effects.QuadraticDrag(0.1, 0.2, 0.3), model=NO_THRUST, vel_w=vel_w, quat=quat)
     np.testing.assert_allclose(found, expected, atol=2e-5)
 
@@ -100,7 +116,9 @@ def lift_ratio(parameters: Any, **fields: Any) -> float:
 
 
 @pytest.mark.parametrize(("speed", "share"), [(0.0, 0.0), (HALF_SPEED, 0.5), (3 * HALF_SPEED, 0.9)])
-def test_translational_lift_grows_with_airspeed_in_the_rotors_plane(speed: float, share: float) -> None:
+def test_translational_lift_grows_with_airspeed_in_the_rotors_plane(
+    speed: float, share: float
+) -> None:
     lift, expected = effects.TranslationalLift(0.2), pytest.approx(1.0 + 0.2 * share, rel=1e-5)
     assert lift_ratio(lift, vel_w=(speed, 0.0, 5.0)) == expected
     assert lift_ratio((lift, effects.Wind(v_y=-speed))) == expected
@@ -128,9 +146,13 @@ def test_a_hard_saturation_cuts_the_sticks_off(stick: float) -> None:
 
 
 @pytest.mark.parametrize("steps", [0, 2, LONGEST_STEPS])
-def test_a_delay_of_whole_steps_shifts_each_channel_by_its_own_and_none_is_early(steps: int) -> None:
+def test_a_delay_of_whole_steps_shifts_each_channel_by_its_own_and_none_is_early(
+    steps: int,
+) -> None:
     drone, commands = random_drone(3), random_commands(3, 20)
-    found = flown(effects.CommandDelay(steps * DT, 3 * DT, -3 * DT), commands, drone)[:, APPLIED_ACTION]
+    found = flown(effects.CommandDelay(steps * DT, 3 * DT, -3 * DT), commands, drone)[
+        :, APPLIED_ACTION
+    ]
     for channel, own in enumerate((steps, steps, steps + 3, max(steps - 3, 0))):
         before = np.tile(np.stack(drone.applied), (own, 1))  # what was commanded before the flight
         shifted = flown((), np.concatenate([before, commands])[:20], drone)[:, APPLIED_ACTION]
@@ -140,7 +162,11 @@ def test_a_delay_of_whole_steps_shifts_each_channel_by_its_own_and_none_is_early
 # --- Sensors ----------------------------------------------------------------------------------------
 
 # Forces that are not thrust, and rates that are not sticks.
-DISTURBED = (effects.LinearDrag(0.3, 0.2, 0.1), effects.Wind(3.0), effects.MotorImbalance(0.01, 0.02))
+DISTURBED = (
+    effects.LinearDrag(0.3, 0.2, 0.1),
+    effects.Wind(3.0),
+    effects.MotorImbalance(0.01, 0.02),
+)
 
 
 class Readings:
@@ -173,7 +199,9 @@ def past(truth: np.ndarray, before: np.ndarray, steps: float) -> np.ndarray:
     """Return the rows of so many steps ago; before the flight, there was one that stayed."""
     known = np.concatenate([np.tile(before, (USUAL_STEPS, 1)), truth])
     rows = np.arange(len(known))
-    return np.stack([np.interp(rows[USUAL_STEPS:] - steps, rows, column) for column in known.T], axis=1)
+    return np.stack(
+        [np.interp(rows[USUAL_STEPS:] - steps, rows, column) for column in known.T], axis=1
+    )
 
 
 @pytest.mark.parametrize("steps", [0.0, 1.0, 2.0, 4.0, 0.3, 2.6])
@@ -212,7 +240,12 @@ class WithoutGyro(Plant):
 @pytest.mark.parametrize(
     ("parameters", "plant", "lateness", "bias"),
     [
-        ((effects.GyroBias(0.1, -0.2, 0.3), effects.AccelerometerBias(1.0)), None, 0, (0.1, -0.2, 0.3)),
+        (
+            (effects.GyroBias(0.1, -0.2, 0.3), effects.AccelerometerBias(1.0)),
+            None,
+            0,
+            (0.1, -0.2, 0.3),
+        ),
         ((effects.ImuLatency(DT),), None, 1, (0.0, 0.0, 0.0)),
         ((effects.GyroBias(0.5),), WithoutGyro(), 0, (0.0, 0.0, 0.0)),
     ],
@@ -223,7 +256,10 @@ def test_the_observation_shows_the_gyro_of_the_plant(
     env = FlyTrack(model=nominal_parameters().with_effects(*parameters), plant=plant)
     params, step = env.default_params, jax.jit(env.step_env)
     state = env.begin(drone_with(rates_b=(0.5, -0.3, 0.2)), 0, params, jnp.uint32(0))
-    shown, true = [env.observe(None, state, None, params)[SHOWN]], [np.stack(env.drone(state).rates_b)]
+    shown, true = (
+        [env.observe(None, state, None, params)[SHOWN]],
+        [np.stack(env.drone(state).rates_b)],
+    )
     for _ in range(3):
         observation, state, *_ = step(None, state, jnp.array([0.2, -0.1, 0.3, 0.0]), params)
         shown.append(observation[SHOWN])

@@ -37,7 +37,9 @@ def test_default_parameters_are_used_when_none_are_given(env, flight):
     """Without ``jit``, which changes nothing either."""
     key, action = jax.random.key(3), np.full(4, 0.3, np.float32)
     keys, states = jnp.stack([key] * NUM_ENVS), flight.start
-    expected = steps_of(env)(keys, states, np.tile(action, (NUM_ENVS, 1)), arrays(env.default_params))
+    expected = steps_of(env)(
+        keys, states, np.tile(action, (NUM_ENVS, 1)), arrays(env.default_params)
+    )
     with jax.disable_jit():
         found = env.step(key, jax.tree.map(lambda leaf: leaf[0], states), action)
     expected = jax.tree.map(lambda leaf: leaf[0], expected)
@@ -52,14 +54,19 @@ def test_spaces_contain_every_observation_of_flights_that_end_in_many_ways(env, 
     for array in (flight.observations, flight.info["final_observation"]):
         assert ((array >= np.asarray(space.low)) & (array <= np.asarray(space.high))).all()
     assert flight.terminated.sum() > 30
-    assert sum(flight.info[cause].any() for cause in CAUSES) >= 3 and flight.info["gates_passed"].max() >= 1
+    assert (
+        sum(flight.info[cause].any() for cause in CAUSES) >= 3
+        and flight.info["gates_passed"].max() >= 1
+    )
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((flight.states, flight.rewards)))
 
 
 def test_info_belongs_to_the_step_not_to_the_reset(env, flight):
     done, states, info = flight.ended, flight.states, flight.info
     assert set(info) == {*CAUSES, *RACE, "terminated", "truncated", "final_observation"}
-    np.testing.assert_array_equal(np.stack([info[cause] for cause in CAUSES]).any(axis=0), flight.terminated)
+    np.testing.assert_array_equal(
+        np.stack([info[cause] for cause in CAUSES]).any(axis=0), flight.terminated
+    )
     np.testing.assert_array_equal(info["terminated"], flight.terminated)
     np.testing.assert_array_equal(info["truncated"], flight.truncated)
     # An ended episode still shows its own count.
@@ -112,7 +119,9 @@ def test_batch_step_resets_episodes_apart(env, params, ends):
         assert not np.asarray(leaf)[done].any()  # begun again, with nothing counted yet
     starts = np.stack([np.asarray(leaf)[done] for leaf in env.drone(state).pos_w], -1)
     assert len(np.unique(starts, axis=0)) == done.sum()
-    expected = jax.jit(jax.vmap(env.observe, in_axes=(None, 0, None, None)))(None, state, None, params)
+    expected = jax.jit(jax.vmap(env.observe, in_axes=(None, 0, None, None)))(
+        None, state, None, params
+    )
     np.testing.assert_allclose(observation, expected, atol=1e-6)
 
 
@@ -121,10 +130,14 @@ def test_batch_step_resets_episodes_apart(env, params, ends):
 
 def test_actions_beyond_the_range_are_clipped_and_integers_are_as_good(env, flight):
     corners = np.resize(np.array([[1, -1, 1, 1], [-1, 1, -1, -1]], np.float32), (NUM_ENVS, 4))
-    factors = np.resize(np.array([1.001, 7.0, 1e30, np.inf], np.float32).repeat(2), NUM_ENVS)[:, None]
+    factors = np.resize(np.array([1.001, 7.0, 1e30, np.inf], np.float32).repeat(2), NUM_ENVS)[
+        :, None
+    ]
     keys, params = jax.random.split(jax.random.key(11), NUM_ENVS), arrays(env.default_params)
     both = jnp.asarray(corners * factors), jnp.asarray(corners)
-    chex.assert_trees_all_equal(*(steps_of(env)(keys, flight.start, actions, params) for actions in both))
+    chex.assert_trees_all_equal(
+        *(steps_of(env)(keys, flight.start, actions, params) for actions in both)
+    )
     assert clip_action(jnp.array([3, 0, -2, 1])) == clip_action(jnp.array([1.0, 0.0, -1.0, 1.0]))
 
 
@@ -148,10 +161,18 @@ def test_actions_of_another_shape_are_refused(shape, env, params):
         ({"track": "monza"}, TrackError, "track: found 'monza', expected one of .*flytrack"),
         ({"track": Path("no/such.toml")}, TrackError, "no/such.toml: cannot be read"),
         ({"model": "no/such.json"}, ModelFileError, "no/such.json: cannot be read"),
-        ({"plant": "nominal"}, TypeError, r"plant: found str, expected a subclass of plants\.Plant"),
+        (
+            {"plant": "nominal"},
+            TypeError,
+            r"plant: found str, expected a subclass of plants\.Plant",
+        ),
         ({"missed_gate": "ignore"}, ValueError, "missed_gate: found 'ignore', expected one of"),
         ({"reward": {"speed": 1.0}}, ValueError, "reward: found 'speed', expected one of progress"),
-        ({"reward": {"progress": "much"}}, ValueError, r"reward\.progress: found 'much', expected a finite"),
+        (
+            {"reward": {"progress": "much"}},
+            ValueError,
+            r"reward\.progress: found 'much', expected a finite",
+        ),
     ],
 )
 def test_wrong_arguments_say_what_was_expected(arguments, error, message):
@@ -199,7 +220,9 @@ def test_observation_index_by_index(flight):
 
 
 def test_observation_is_clipped_to_its_range(env, params):
-    drone = drone_at((1e6, -1e6, 0.0), (1e5, 0.0, 0.0), applied=Action(2.0, -2.0, 0.0, 0.0), battery_v=30.0)
+    drone = drone_at(
+        (1e6, -1e6, 0.0), (1e5, 0.0, 0.0), applied=Action(2.0, -2.0, 0.0, 0.0), battery_v=30.0
+    )
     observation = env.observe(None, env.begin(drone, 0, params), None, params)
     assert env.observation_space(params).contains(observation)
     limits = np.asarray(env.observation_space(params).high)

@@ -42,17 +42,28 @@ def acted(env, checkpoint):
         none = NoiseParams(*np.zeros(len(NoiseParams._fields)))
         params = params.replace(wrappers={**params.wrappers, ObservationNoise.key: none})
     policy = policy_of(checkpoint, "a.safetensors")
-    past = np.random.default_rng(SEED).uniform(-1.0, 1.0, (COUNT, len(policy.past), 4)).astype(np.float32)
+    past = (
+        np.random.default_rng(SEED)
+        .uniform(-1.0, 1.0, (COUNT, len(policy.past), 4))
+        .astype(np.float32)
+    )
 
     def act(state, gate, past):
         begun = env.begin(unpack(state), gate, params)
         if policy.past:
             begun = begun._replace(actions=tuple(map(unpack_action, past)))
         observation = env.observe(None, begun, None, params)
-        return jnp.clip(checkpoint.network.apply(checkpoint.params, observation)[0].mode(), -1.0, 1.0)
+        return jnp.clip(
+            checkpoint.network.apply(checkpoint.params, observation)[0].mode(), -1.0, 1.0
+        )
 
     states, gates = states_in_box(policy, COUNT, SEED)
-    return states, gates, past.reshape(COUNT, -1), np.asarray(jax.jit(jax.vmap(act))(states, gates, past))
+    return (
+        states,
+        gates,
+        past.reshape(COUNT, -1),
+        np.asarray(jax.jit(jax.vmap(act))(states, gates, past)),
+    )
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -68,18 +79,24 @@ def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
     assert f"{header}: {header.stat().st_size} bytes" in capsys.readouterr().out
     if shutil.which("gcc") is not None:
         compiled = CompiledPolicy(header)
-        np.testing.assert_allclose(compiled.act(states, gates, past), actions, rtol=0.0, atol=LARGEST)
+        np.testing.assert_allclose(
+            compiled.act(states, gates, past), actions, rtol=0.0, atol=LARGEST
+        )
         assert np.isnan(compiled.act(states * np.nan, gates, past)).all()
 
     flags = ["--float64"] * is_float64
-    found = act_by_onnx(tmp_path / "a.safetensors", flags, {"state": states, "gate": gates, "past": past})
+    found = act_by_onnx(
+        tmp_path / "a.safetensors", flags, {"state": states, "gate": gates, "past": past}
+    )
     np.testing.assert_allclose(found, actions, rtol=0.0, atol=LARGEST)
 
 
 def act_by_onnx(checkpoint, flags, inputs):
     """Export a checkpoint as ONNX, and return the actions that ONNX Runtime computes."""
     pytest.importorskip("onnx", reason="onnx is not installed (extra flytrack[export])")
-    onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed (flytrack[dev])")
+    onnxruntime = pytest.importorskip(
+        "onnxruntime", reason="onnxruntime is not installed (flytrack[dev])"
+    )
     path = str(checkpoint.with_name("policy.onnx"))
     main(["export", str(checkpoint), "--onnx", path, *flags])
     session = onnxruntime.InferenceSession(path)
@@ -139,13 +156,22 @@ def test_a_header_counts_gates_and_lags_as_the_environment_does(tmp_path):
     compiled = CompiledPolicy(tmp_path / "policy.h")
     params = make("FlyTrack-v0", track="split_s").default_params
     gates = params.course.gates
-    centres, forward, up = (np.stack(axis, axis=-1) for axis in (gates.centre, gates.forward, gates.up))
+    centres, forward, up = (
+        np.stack(axis, axis=-1) for axis in (gates.centre, gates.forward, gates.up)
+    )
     count = np.arange(len(centres))
-    for ahead, aside, is_pass in ((1.0, 0.0, True), (1.0, 0.5, True), (1.0, 0.7, False), (-1.0, 0.0, False)):
+    for ahead, aside, is_pass in (
+        (1.0, 0.0, True),
+        (1.0, 0.5, True),
+        (1.0, 0.7, False),
+        (-1.0, 0.0, False),
+    ):
         ends = [np.zeros((len(count), 21)) for _ in range(2)]
         for end, sign in zip(ends, (-ahead, ahead), strict=True):
             end[:, :3] = centres + sign * forward + aside * up
-        np.testing.assert_array_equal(compiled.next_gates(*ends, count), (count + is_pass) % len(count))
+        np.testing.assert_array_equal(
+            compiled.next_gates(*ends, count), (count + is_pass) % len(count)
+        )
     action, applied = np.array([1.0, -1.0, 0.5, 0.2]), np.array([0.0, 0.3, -0.5, 1.0])
     wanted = lag(unpack_action(applied), Action(*action), 0.01, params.model.tau)
     np.testing.assert_allclose(compiled.lag(action, applied), wanted, atol=LARGEST_LAG)
@@ -156,4 +182,6 @@ def test_observations_that_cannot_be_exported_are_told(tmp_path, monkeypatch, ca
     monkeypatch.setattr(export, "KINDS_OF_PAST", ("applied",))
     write_checkpoint(tmp_path / "a.safetensors", "FlyTrackActionHistory-v0", "flytrack", (4,))
     said = refused(capsys, "export", "a.safetensors", "--c", "policy.h")
-    assert "a.safetensors: observation: found commanded_0, " in said and not Path("policy.h").exists()
+    assert (
+        "a.safetensors: observation: found commanded_0, " in said and not Path("policy.h").exists()
+    )

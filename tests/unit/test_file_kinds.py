@@ -71,5 +71,7 @@ def test_logs_of_other_formats_are_refused_with_the_format_that_reads_them(
     path = tmp_path / "flight"
     for other in set(LOGS) - {format}:
         path.write_bytes(LOGS[other])
-        with pytest.raises(LogError, match=rf"flight: found .* \(--format {other} reads it\), expected "):
+        with pytest.raises(
+            LogError, match=rf"flight: found .* \(--format {other} reads it\), expected "
+        ):
             import_log(path, format, tmp_path / "map.toml")

@@ -35,11 +35,16 @@ def test_a_dumps_lines_select_profiles_and_end_with_what_the_plant_needs():
         "set roll_srate = 70",
     ]
     assert lines[-2:] == ["map AETR1234", "aux 0 0 0 1700 2100 0 0"]
-    assert f"set small_angle = {REQUIRED['small_angle']}" in lines and "set small_angle = 25" not in lines
+    assert (
+        f"set small_angle = {REQUIRED['small_angle']}" in lines
+        and "set small_angle = 25" not in lines
+    )
 
 
 def test_a_dict_is_above_the_defaults_and_may_not_change_what_the_plant_needs():
-    values = {one.name: one.value for one in settings_of({"roll_srate": 80, "feature airmode": False})}
+    values = {
+        one.name: one.value for one in settings_of({"roll_srate": 80, "feature airmode": False})
+    }
     assert values["roll_srate"] == "80" and values["pitch_srate"] == "62"
     assert values["feature AIRMODE"] == "OFF"
     with pytest.raises(FirmwareError, match="small_angle: found 25, expected 180"):
@@ -56,7 +61,9 @@ def test_other_lines_are_refused_by_name(line):
 
 def test_what_the_firmware_did_not_keep_is_named():
     settings = [
-        *parse_dump("set p_roll = 60\nprofile 1\nset p_roll = 70\nset rates_type = actual\nset gone = 1")
+        *parse_dump(
+            "set p_roll = 60\nprofile 1\nset p_roll = 70\nset rates_type = actual\nset gone = 1"
+        )
     ]
     dump = "set rates_type = ACTUAL\nprofile 0\nset p_roll = 60\nprofile 1\nset p_roll = 71\nrateprofile 0\n"
     with pytest.raises(FirmwareError) as error:
@@ -75,8 +82,13 @@ def test_impossible_bodies_are_refused_by_name(field, value):
 def test_body_is_packed_as_its_header_counts_it():
     header = (HERE / "body.h").read_text()
     struct = header.partition("typedef struct {")[2].partition("} Body;")[0]
-    declared = "".join(line.partition("//")[0] for line in struct.splitlines()).replace("double", "")
-    sizes = [name.partition("[")[2].rstrip("]") or "1" for name in declared.replace(";", ",").split(",")[:-1]]
+    declared = "".join(line.partition("//")[0] for line in struct.splitlines()).replace(
+        "double", ""
+    )
+    sizes = [
+        name.partition("[")[2].rstrip("]") or "1"
+        for name in declared.replace(";", ",").split(",")[:-1]
+    ]
     assert len(Body().pack(False)) == 8 * sum(map(int, (size.strip() for size in sizes)))
 
 
@@ -99,7 +111,9 @@ def test_a_body_file_that_cannot_be_used_is_named(tmp_path, capsys, content, mes
     file.write_text(content)
     with pytest.raises(FirmwareError, match=message):
         read_body(file)
-    said = refused(capsys, "loop", "--plant", "betaflight", "--body", file, "--out", tmp_path / "out")
+    said = refused(
+        capsys, "loop", "--plant", "betaflight", "--body", file, "--out", tmp_path / "out"
+    )
     assert "body.json" in said and not (tmp_path / "out").exists()
     file.write_text('{"mass_kg": 0.9, "health": [0.9, 1, 1, 1]}')
     assert read_body(file) == Body(mass_kg=0.9, health=(0.9, 1, 1, 1))

@@ -101,7 +101,10 @@ def test_intervals_hold_the_truth(fitted):
     inside = [low <= TRUTH[name] <= high for name, (_, low, high) in fitted.intervals.items()]
     assert sum(inside) >= len(inside) - 2
     assert tau_error(fitted) < 0.02 and map_error(fitted) < 0.01
-    assert fitted.map_uncertainty.share < 0.01 and map_error(fitted) < 2.0 * fitted.map_uncertainty.share
+    assert (
+        fitted.map_uncertainty.share < 0.01
+        and map_error(fitted) < 2.0 * fitted.map_uncertainty.share
+    )
 
 
 @pytest.mark.slow
@@ -112,7 +115,10 @@ def test_intervals_widen_with_fewer_channels_and_with_what_the_model_lacks(noisy
     lacking = fit(measure(dragged, 1.0, GRAVITY, np.random.default_rng(0)))
     for name, half in half_widths(lacking).items():
         if name in ("tau_thrust", "c0", "c1", "c2", "c4"):
-            assert abs(lacking.intervals[name].value - TRUTH[name]) < 3.0 * half and half > 1.2 * narrow[name]
+            assert (
+                abs(lacking.intervals[name].value - TRUTH[name]) < 3.0 * half
+                and half > 1.2 * narrow[name]
+            )
 
 
 @pytest.fixture(scope="session")
@@ -135,13 +141,37 @@ EVERYTHING = dict.fromkeys((*TAUS, *THRUST_COEFFS, DRAIN), 0.1)
 REFUSED = {
     "yaw stuck": (lambda log: scaled(log, "u", (1, 1, 0, 1)), {}, "u_yaw: stuck at 0; tau_yaw"),
     "no rates": (lambda log: log.without("w", "q"), {}, "w and q are absent"),
-    "no force": (lambda log: log.without("f", "v", "p"), {}, "thrust needs f, or q with one of a, v and p"),
-    "unknown name": (lambda log: log, {"fixed": {"tau_jaw": 0.1}}, "fixed: tau_jaw: unknown; expected"),
-    "a setting": (lambda log: log, {"effects": ("quick_rates",)}, "quick_rates: known from settings and not"),
-    "unknown effect": (lambda log: log, {"effects": ("rag",)}, "effects: rag: no effect of that name"),
+    "no force": (
+        lambda log: log.without("f", "v", "p"),
+        {},
+        "thrust needs f, or q with one of a, v and p",
+    ),
+    "unknown name": (
+        lambda log: log,
+        {"fixed": {"tau_jaw": 0.1}},
+        "fixed: tau_jaw: unknown; expected",
+    ),
+    "a setting": (
+        lambda log: log,
+        {"effects": ("quick_rates",)},
+        "quick_rates: known from settings and not",
+    ),
+    "unknown effect": (
+        lambda log: log,
+        {"effects": ("rag",)},
+        "effects: rag: no effect of that name",
+    ),
     "nothing left": (lambda log: log, {"fixed": EVERYTHING}, "fixed: found every parameter"),
-    "wrong sign": (lambda log: scaled(log, "w", (-1, 1, 1)), {}, "w_x: .* sign and order of u_roll and w_x"),
-    "no time constant": (lambda log: log, {"fixed": {"tau_yaw": 0.0}}, "tau_yaw: found 0.0, expected 0.001"),
+    "wrong sign": (
+        lambda log: scaled(log, "w", (-1, 1, 1)),
+        {},
+        "w_x: .* sign and order of u_roll and w_x",
+    ),
+    "no time constant": (
+        lambda log: log,
+        {"fixed": {"tau_yaw": 0.0}},
+        "tau_yaw: found 0.0, expected 0.001",
+    ),
 }
 
 
@@ -169,7 +199,8 @@ def test_result_as_text_and_json(fitted):
 def test_a_drone_on_the_ground_is_refused_as_motionless(noisy):
     rng = np.random.default_rng(0)
     still = {
-        name: values[0] + 0.05 * rng.normal(size=values.shape) for name, values in noisy.channels.items()
+        name: values[0] + 0.05 * rng.normal(size=values.shape)
+        for name, values in noisy.channels.items()
     }
     still["q"] = still["q"] / np.linalg.norm(still["q"], axis=1, keepdims=True)
     with pytest.raises(FitError, match="w: found no body rate that follows its command"):
@@ -180,7 +211,9 @@ def test_a_drone_on_the_ground_is_refused_as_motionless(noisy):
 def test_a_log_that_measured_nothing_is_refused_by_its_name(exact):
     since_start = exact.time - exact.time[exact.is_start()][np.cumsum(exact.is_start()) - 1]
     short = exact.select(since_start < 0.14)  # a few lags: what was applied before is not forgotten
-    with pytest.raises(FitError, match=r"^handout\.npz: tau_roll, .* nothing that the log measured"):
+    with pytest.raises(
+        FitError, match=r"^handout\.npz: tau_roll, .* nothing that the log measured"
+    ):
         fit(short.without("uprev"))
 
 

@@ -36,7 +36,9 @@ def flown() -> tuple[ModelParameters, FlightLog]:
     """A plant with drag, as a model without it, and the log of two flights, each with a clock from 0 on."""
     truth, log = scripted(5, SECONDS, "none", effects={"linear_drag": DRAG._asdict()})
     segment = (np.arange(len(log)) >= SECOND).astype(int)
-    return model_of(truth), replace(log, time=log.time - segment * log.time[SECOND], segment=segment)
+    return model_of(truth), replace(
+        log, time=log.time - segment * log.time[SECOND], segment=segment
+    )
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +57,10 @@ def flights(flown, models) -> dict:
 
 def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, models, tmp_path):
     log, path = flown[1], tmp_path / "flight.rrd"
-    assert write_flight_recording(path, log, {name: models[name] for name in ("nominal", "true")}) == ""
+    assert (
+        write_flight_recording(path, log, {name: models[name] for name in ("nominal", "true")})
+        == ""
+    )
     recording = Recording(path)
     quat = Rotation.from_quat(log["q"], scalar_first=True)
     drag_w = quat.apply(-np.array(DRAG) * quat.inv().apply(log["v"]))  # of the step after a row
@@ -64,7 +69,8 @@ def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, models
     drawn = zip(recording.times[entity], recording.rows[entity, "Arrows3D:vectors"], strict=True)
     steps = sorted(step for (step, _), row in drawn if row)
     arrows = {
-        name: recording.series(f"/world/residual/{name}", "Arrows3D:vectors") for name in ("nominal", "true")
+        name: recording.series(f"/world/residual/{name}", "Arrows3D:vectors")
+        for name in ("nominal", "true")
     }
     inside = [at for at, row in enumerate(steps) if SECOND + SETTLED + half < row < len(log) - half]
     assert len(inside) > 250
@@ -77,7 +83,9 @@ def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, models
     np.testing.assert_allclose(starts, log["p"][rows], rtol=1e-6, atol=1e-6)
     plotted = recording.series("/plots/residual/nominal", "Scalars:scalars")[rows]
     np.testing.assert_allclose(plotted, np.linalg.norm(expected, axis=1), atol=0.02)
-    assert np.isnan(recording.series("/plots/residual/nominal", "Scalars:scalars")[[0, SECOND]]).all()
+    assert np.isnan(
+        recording.series("/plots/residual/nominal", "Scalars:scalars")[[0, SECOND]]
+    ).all()
 
 
 def test_ends_of_late_poses_have_no_force(flown, models):
@@ -101,7 +109,9 @@ def test_a_model_flies_by_itself_and_starts_anew_every_second(flown, flights):
     log = flown[1]
     wrong, right = flights["nominal"], flights["true"]
     starts_s = right.time_s[right.restarts]
-    assert starts_s[0] == 0.0 and right.time_s[-1] == pytest.approx(trajectories.time_in_line(log)[-1])
+    assert starts_s[0] == 0.0 and right.time_s[-1] == pytest.approx(
+        trajectories.time_in_line(log)[-1]
+    )
     gaps = np.diff(starts_s[1:])
     is_jump = gaps > 1.5  # from the first segment into the second
     assert is_jump.sum() == 1 and len(gaps) >= 5
@@ -146,12 +156,16 @@ def test_of_a_long_log_rows_are_left_out_but_no_start(monkeypatch, made):
     assert np.flatnonzero(shown.restarts).tolist() == [0, 75] and "1 row in 4" in shown.ended
 
 
-def test_diagnose_writes_the_recording_or_says_why_not(flown, models, tmp_path, monkeypatch, capsys):
+def test_diagnose_writes_the_recording_or_says_why_not(
+    flown, models, tmp_path, monkeypatch, capsys
+):
     shown = {"nominal": flown[0], "base": flown[0], "extended": models["true"]}
     rest = {"noise": {}, "source": "log", "sha256": ""}
     found = Diagnosis(CONSISTENT, (), Unexplained(), (), {}, **shown, **rest)  # which names nothing
     monkeypatch.setattr(identification, "diagnose", lambda *_: found)  # the rest is the real one
-    monkeypatch.setattr(identification, "write_diagnosis", lambda folder, *_: [folder / "diagnosis.json"])
+    monkeypatch.setattr(
+        identification, "write_diagnosis", lambda folder, *_: [folder / "diagnosis.json"]
+    )
     save_log(tmp_path / "log.npz", flown[1])
     save_log(tmp_path / "turns.npz", flown[1].without("q"))
     out = tmp_path / "out"
@@ -163,7 +177,11 @@ def test_diagnose_writes_the_recording_or_says_why_not(flown, models, tmp_path, 
 
     assert f"written: {out / 'diagnosis.json'}, {path}\n" in diagnosed("log.npz")
     drones = {entity for entity, _ in Recording(path).rows if entity.endswith("/drone")}
-    assert drones == {"/world/drone", "/world/flights/nominal/drone", "/world/flights/extended/drone"}
+    assert drones == {
+        "/world/drone",
+        "/world/flights/nominal/drone",
+        "/world/flights/extended/drone",
+    }
     text = diagnosed("turns.npz")  # which removes the recording of another log
     assert "left out" in text and "expected q (attitude)" in text and not path.exists()
     monkeypatch.setitem(sys.modules, "rerun", None)  # as if it were not installed

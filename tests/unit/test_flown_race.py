@@ -98,7 +98,9 @@ def test_end_is_the_environments(end):
     states[:, POSITION] = start + 0.01 * np.arange(500)[:, None] * np.array(velocity)
     _, causes = fly_recorded(states, 0)
     last = int(np.argmax(np.any(list(causes), axis=0)))
-    names = [name.replace("_", " ") for name, happened in causes._asdict().items() if happened[last]]
+    names = [
+        name.replace("_", " ") for name, happened in causes._asdict().items() if happened[last]
+    ]
     assert names == [end]
     flown = states[: last + 1]
     race = follow_race(flown[:, POSITION], TRACK, last_vel_w=flown[-1, VELOCITY])
@@ -116,7 +118,9 @@ def test_first_gate_is_the_tracks_near_its_start_else_the_one_passed_first():
     assert found.passes == () and found.is_miss.sum() == 1 and set(found.gate) == {0}
 
 
-@pytest.mark.parametrize(("shift_m", "end"), [(0.0, "all steps flown"), (1.0, "crash"), (3.0, "missed gate")])
+@pytest.mark.parametrize(
+    ("shift_m", "end"), [(0.0, "all steps flown"), (1.0, "crash"), (3.0, "missed gate")]
+)
 def test_two_gates_in_one_step_each_have_their_time_and_end(shift_m, end):
     row = track_of_row([2.0, 2.1, 20.0])  # the second gate is close behind the first, and aside
     aside = replace(row.gates[1], position=(2.1, shift_m, 2.0))
@@ -124,12 +128,18 @@ def test_two_gates_in_one_step_each_have_their_time_and_end(shift_m, end):
     states = np.zeros((10, 21))
     states[:, POSITION] = np.stack([0.2 * np.arange(10), np.zeros(10), np.full(10, 2.0)], axis=1)
     states[:, POSITION] += (0.15, 0.0, 0.0)
-    states[:, QUATERNION.start], states[:, BATTERY], states[:, VELOCITY] = 1.0, 24.0, (20.0, 0.0, 0.0)
+    states[:, QUATERNION.start], states[:, BATTERY], states[:, VELOCITY] = (
+        1.0,
+        24.0,
+        (20.0, 0.0, 0.0),
+    )
     race = follow_race(states[:, POSITION], track, last_vel_w=states[-1, VELOCITY])
     assert why_ended(states, track, race) == end
     times_s = [one.time_s for one in race.passes]
     np.testing.assert_allclose(times_s, [0.0925, 0.0975][: 1 + (shift_m == 0.0)], atol=1e-5)
-    np.testing.assert_allclose([one.pos_w[0] for one in race.passes], [2.0, 2.1][: len(times_s)], atol=1e-5)
+    np.testing.assert_allclose(
+        [one.pos_w[0] for one in race.passes], [2.0, 2.1][: len(times_s)], atol=1e-5
+    )
 
 
 def test_flight_that_goes_on_ended_when_its_steps_did():

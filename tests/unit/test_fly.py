@@ -40,7 +40,9 @@ def display(monkeypatch):
 @pytest.fixture
 def pad(monkeypatch):
     methods = {"get_axis": 0.0, "get_numaxes": 6, "get_instance_id": 7, "get_name": "Pad"}
-    joystick = type("Joystick", (), {name: lambda *_, value=value: value for name, value in methods.items()})
+    joystick = type(
+        "Joystick", (), {name: lambda *_, value=value: value for name, value in methods.items()}
+    )
     monkeypatch.setattr(pygame.joystick, "get_count", lambda: 1)
     monkeypatch.setattr(pygame.joystick, "Joystick", lambda number: joystick())
 
@@ -54,7 +56,9 @@ def post(kind, **fields):
     pygame.event.post(pygame.event.Event(kind, **fields))
 
 
-def test_keys_fly_and_the_rollout_is_written_beside_an_old_file(display, tmp_path, monkeypatch, capsys):
+def test_keys_fly_and_the_rollout_is_written_beside_an_old_file(
+    display, tmp_path, monkeypatch, capsys
+):
     frames = iter(range(100))
     script = {1: pygame.K_w, 31: pygame.K_RIGHT, 36: pygame.K_h, 37: pygame.K_ESCAPE}
 
@@ -93,18 +97,26 @@ def test_a_gamepad_that_replays_the_optimum_times_its_lap(session, display, pad,
             battery_v = float(session.now.log.rows[-1, BATTERY])
             hover = hover_action(MODEL.thrust_coeffs, MODEL.m * MODEL.g, battery_v)
             throttle = (command[3] - hover) / (1.0 - hover if command[3] > hover else 1.0 + hover)
-            for axis, value in zip((3, 4, 0, 1), (command[0], *-command[1:3], -throttle), strict=True):
+            for axis, value in zip(
+                (3, 4, 0, 1), (command[0], *-command[1:3], -throttle), strict=True
+            ):
                 post(pygame.JOYAXISMOTION, instance_id=7, axis=axis, value=value)
         return 0.01
 
     monkeypatch.setattr(play, "make_renderer", lambda course, gate_ids: Renderer())
     pygame.display.init()
-    play.play(session, play.Controls(Gamepad(0, deadzone=0.0, expo=0.0)), lambda picture: None, tick)
+    play.play(
+        session, play.Controls(Gamepad(0, deadzone=0.0, expo=0.0)), lambda picture: None, tick
+    )
     flight = session.now
-    assert flight.num_gates == 8 and flight.lap_times_s == pytest.approx([STANDING.time_s], abs=1e-3)
+    assert flight.num_gates == 8 and flight.lap_times_s == pytest.approx(
+        [STANDING.time_s], abs=1e-3
+    )
     assert seen[0].startswith("W, or throttle up") and "best 3.88 s" in seen[-1]
     for gate in TRACK.gates:
-        assert any(re.search(rf"gate {gate.id}: .0.00 s to the time-optimal", notes) for notes in seen)
+        assert any(
+            re.search(rf"gate {gate.id}: .0.00 s to the time-optimal", notes) for notes in seen
+        )
     (lap,) = cut_laps(np.asarray(flight.rollout()[0], float), TRACK)
     np.testing.assert_allclose(lap.gate_times_s, GHOST.first.gate_times_s, atol=1e-3)
 
@@ -124,14 +136,18 @@ def test_in_a_race_the_opponent_goes_its_own_way_and_is_hit(session):
     early = GHOST.first._replace(state_at=lambda time_s: GHOST.first.state_at(time_s + 0.5))
     race = Session(TRACK, MODEL, GHOST._replace(first=early), is_race=True)
     start_w = race.now.log.rows[-1, POSITION]
-    np.testing.assert_allclose(start_w, GHOST.state_at(0, 0.0)[POSITION] + (0.5, 0.5, 0.0), atol=1e-5)
+    np.testing.assert_allclose(
+        start_w, GHOST.state_at(0, 0.0)[POSITION] + (0.5, 0.5, 0.0), atol=1e-5
+    )
     session.restart()
     race.state = session.state  # on the optimum itself, half a second behind the opponent
     for command in STANDING.commands:
         race.fly(command)
     flight = race.now
     assert flight.num_gates == 8 and flight.gap == (7, pytest.approx(0.0, abs=1e-3))
-    np.testing.assert_allclose(race.ghost_state(), GHOST.flying.state_at(flight.log.time_s - STANDING.time_s))
+    np.testing.assert_allclose(
+        race.ghost_state(), GHOST.flying.state_at(flight.log.time_s - STANDING.time_s)
+    )
     assert "to the time-optimal opponent" in race.notes()
     assert GHOST.lap_begin_s(2) == STANDING.time_s + GHOST.flying.gate_times_s[-1]
     still = GHOST.first._replace(state_at=lambda time_s: np.r_[start_w, np.zeros(18)])
@@ -154,13 +170,21 @@ def test_the_picture_shows_the_ghost_and_looks_where_the_nose_points(session):
 
 def test_sticks_steps_and_ghosts():
     pulls, sticks = np.array([-1.0, 0.0, 1.0, 0.0]), np.zeros(4)
-    for is_full, pulled, expected in ((0, pulls, [-0.4, 0, 1, 0]), (1, pulls, pulls), (0, 0 * UP, 0 * UP)):
+    for is_full, pulled, expected in (
+        (0, pulls, [-0.4, 0, 1, 0]),
+        (1, pulls, pulls),
+        (0, 0 * UP, 0 * UP),
+    ):
         for _ in range(50):
             before, sticks = sticks, move_by_keys(sticks, pulled, bool(is_full), 0.01)
             assert np.abs(sticks - before).max() < 0.07
         np.testing.assert_allclose(sticks, expected, atol=1e-9)
-    values = [Gamepad(expo=0.5, deadzone=0.1).sticks(np.full(4, value)) for value in (0.1, -0.55, 1.0)]
-    np.testing.assert_allclose(values, [[0.0] * 4, [-0.3125, 0.3125, 0.3125, 0.5], [1.0, -1.0, -1.0, -1.0]])
+    values = [
+        Gamepad(expo=0.5, deadzone=0.1).sticks(np.full(4, value)) for value in (0.1, -0.55, 1.0)
+    ]
+    np.testing.assert_allclose(
+        values, [[0.0] * 4, [-0.3125, 0.3125, 0.3125, 0.5], [1.0, -1.0, -1.0, -1.0]]
+    )
     assert steps_due(0.004, 0.017, 0.01) == (2, pytest.approx(0.001))
     assert steps_due(0.0, 5.0, 0.01)[0] == 10, "a late picture is not made up for"
     np.testing.assert_allclose(GHOST.state_at(0, 1.0), STANDING.states[100], atol=1e-6)
@@ -182,7 +206,9 @@ def test_sticks_steps_and_ghosts():
         ("", "display: found none, expected a screen"),
     ],
 )
-def test_what_cannot_be_flown_is_one_sentence(arguments, message, display, pad, monkeypatch, capsys):
+def test_what_cannot_be_flown_is_one_sentence(
+    arguments, message, display, pad, monkeypatch, capsys
+):
     for name in () if arguments else ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(SystemExit):

@@ -61,10 +61,15 @@ def test_a_point_on_the_plane_is_counted_once(y: float, event: str, sign: float)
 
 
 NUM = 8  # segments at once: one shape, compiled once
-CLOSE_M, USUAL_M = 2e-3, 100.0  # so near an edge, float32 and float64 may differ, of segments of a usual size
+CLOSE_M, USUAL_M = (
+    2e-3,
+    100.0,
+)  # so near an edge, float32 and float64 may differ, of segments of a usual size
 FARTHEST_M = 2.0**40  # that what moves a thousand km out of bounds in a step may reach
 
-unit_turns = st.integers(0, 2**32 - 1).map(lambda seed: Rotation.random(rng=np.random.default_rng(seed)))
+unit_turns = st.integers(0, 2**32 - 1).map(
+    lambda seed: Rotation.random(rng=np.random.default_rng(seed))
+)
 centres = st.tuples(*[st.floats(-50.0, 50.0)] * 3)
 openings = st.floats(0.4, 5.0)
 thicknesses = st.floats(0.01, 3.0)
@@ -75,16 +80,21 @@ def vectors(rows: np.ndarray) -> Vec3:
     return Vec3(*jnp.asarray(np.asarray(rows, np.float32).T))
 
 
-def gate_of(turn: Rotation, centre: Any, direction: float, opening: float, thickness: float) -> Gate:
+def gate_of(
+    turn: Rotation, centre: Any, direction: float, opening: float, thickness: float
+) -> Gate:
     """Return a gate; thickness: of its frame, m."""
     quat = tuple(turn.as_quat(scalar_first=True).tolist())
     return Gate(0, tuple(centre), quat, direction, opening, opening + 2.0 * thickness)
 
 
-def events_in_float64(gate: Gate, start: np.ndarray, end: np.ndarray, radius: float) -> tuple[str, float]:
+def events_in_float64(
+    gate: Gate, start: np.ndarray, end: np.ndarray, radius: float
+) -> tuple[str, float]:
     """Return what a segment (world, m) does to a gate, and how near float32 may get it wrong, m.
 
-    By rotating the segment into the gate's own frame, where it is flown along +-y and stands in x and z.
+    By rotating the segment into the gate's own frame, where it is flown along +-y and stands in x
+    and z.
     """
     turn = Rotation.from_quat(gate.quaternion, scalar_first=True)
     (x0, y0, z0), (x1, y1, z1) = turn.inv().apply(np.stack([start, end]) - gate.position)
@@ -113,12 +123,20 @@ def events_in_float64(gate: Gate, start: np.ndarray, end: np.ndarray, radius: fl
     seed=st.integers(0, 2**32 - 1),
 )
 def test_any_segment_meets_any_gate_as_in_the_gates_own_frame(
-    turn: Rotation, centre: Any, direction: float, opening: float, thickness: float, radius: float, seed: int
+    turn: Rotation,
+    centre: Any,
+    direction: float,
+    opening: float,
+    thickness: float,
+    radius: float,
+    seed: int,
 ) -> None:
     """However long, short, far away or degenerate: never two events, and a fraction in the unit interval."""
     gate = gate_of(turn, centre, direction, opening, thickness)
     rng = np.random.default_rng(seed)
-    spread = rng.choice([0.0, 1e-40, 0.3, 0.3, 1.0, 1.0, 4.0, 4.0, FARTHEST_M], (2, NUM, 1)) * opening
+    spread = (
+        rng.choice([0.0, 1e-40, 0.3, 0.3, 1.0, 1.0, 4.0, 4.0, FARTHEST_M], (2, NUM, 1)) * opening
+    )
     start, end = np.asarray(centre) + spread * rng.uniform(-1.0, 1.0, (2, NUM, 3))
     end[0] = start[0]
     crossing = cross(frame_of(gate), vectors(start), vectors(end), np.float32(radius))
@@ -177,15 +195,24 @@ def test_a_race_counts_what_its_gates_see_one_after_the_other(seed: int, num_gat
     """Passes, laps and the gate to fly next along a path at random, against a reading in float64."""
     rng = np.random.default_rng(seed)
     gates = [
-        gate_of(Rotation.random(rng=rng), rng.uniform(-3.0, 3.0, 3), rng.choice([-1.0, 1.0]), 4.0, 0.5)
+        gate_of(
+            Rotation.random(rng=rng), rng.uniform(-3.0, 3.0, 3), rng.choice([-1.0, 1.0]), 4.0, 0.5
+        )
         for _ in range(num_gates)
     ]
     course = course_of(*gates)
     points = rng.uniform(-4.0, 4.0, (LENGTH + 1, 3))
     first = int(rng.integers(num_gates))
     times = np.arange(LENGTH, dtype=np.float32) * 0.01
-    arguments = (vectors(points[:-1]), vectors(points[1:]), times, np.full(LENGTH, np.float32(0.01)))
-    last, events = fly_race(start_race(jnp.int32(first), course), *arguments, course, np.float32(0.1))
+    arguments = (
+        vectors(points[:-1]),
+        vectors(points[1:]),
+        times,
+        np.full(LENGTH, np.float32(0.01)),
+    )
+    last, events = fly_race(
+        start_race(jnp.int32(first), course), *arguments, course, np.float32(0.1)
+    )
     index, passed = first, 0
     for leg, (start, end) in enumerate(pairwise(points)):
         event, doubt = events_in_float64(gates[index], start, end, 0.1)
@@ -193,7 +220,9 @@ def test_a_race_counts_what_its_gates_see_one_after_the_other(seed: int, num_gat
         num_passed = int(event == "pass")
         if event == "pass":
             local = Rotation.from_quat(gates[index].quaternion, scalar_first=True).inv()
-            before, after = (local.apply(point - gates[index].position)[1] for point in (start, end))
+            before, after = (
+                local.apply(point - gates[index].position)[1] for point in (start, end)
+            )
             middle = start + before / (before - after) * (end - start)
             event, doubt = events_in_float64(gates[(index + 1) % len(gates)], middle, end, 0.1)
             assume(doubt > CLOSE_M)

@@ -45,7 +45,9 @@ frame = "flu"
 [craft]
 max_rate_deg_s = [500, 500, 500]
 """
-COLUMNS = [f"{name}{axis}" for name, size in (("u", 4), ("w", 3), ("acc", 3)) for axis in range(size)]
+COLUMNS = [
+    f"{name}{axis}" for name, size in (("u", 4), ("w", 3), ("acc", 3)) for axis in range(size)
+]
 
 
 def write_csv(log: FlightLog, folder: Path) -> Path:
@@ -68,7 +70,8 @@ def write_bag(log: FlightLog, folder: Path) -> Path:
     contents = (dict(zip(COLUMNS, map(float, row), strict=True)) for row in rows)
     times_ns = np.round(log.time * 1e9).astype(int)
     save_messages(
-        folder / "a.mcap", (("/a", int(at), row) for at, row in zip(times_ns, contents, strict=True))
+        folder / "a.mcap",
+        (("/a", int(at), row) for at, row in zip(times_ns, contents, strict=True)),
     )
     (folder / "map.toml").write_text(MAPPING.format("/a:"))
     return folder / "a.mcap"
@@ -96,7 +99,11 @@ def write_ulog(log: FlightLog, folder: Path) -> Path:
         return [(int(at), *map(float, row)) for at, row in zip(times, values, strict=True)]
 
     setpoints = np.column_stack(
-        [log["u"][:, :3] * np.deg2rad(500.0) * flip, np.zeros((len(log), 2)), -0.5 * (log["u"][:, 3] + 1.0)]
+        [
+            log["u"][:, :3] * np.deg2rad(500.0) * flip,
+            np.zeros((len(log), 2)),
+            -0.5 * (log["u"][:, 3] + 1.0),
+        ]
     )
     axes = [("float", name, 0) for name in ("roll", "pitch", "yaw")]
     tables = {
@@ -121,7 +128,9 @@ WRITERS = {
 
 @pytest.mark.parametrize("form", WRITERS)
 def test_ground_is_dropped_and_counted_in_every_format(tmp_path, form):
-    pytest.importorskip({"bag": "mcap", "betaflight": "orangebox", "ulog": "pyulog"}.get(form, "numpy"))
+    pytest.importorskip(
+        {"bag": "mcap", "betaflight": "orangebox", "ulog": "pyulog"}.get(form, "numpy")
+    )
     truth = stands_flies_and_lands()
     path, mapping = WRITERS[form](truth, tmp_path), tmp_path / "map.toml"
     found = import_log(path, form, mapping, align=False)
@@ -136,7 +145,9 @@ def test_ground_is_dropped_and_counted_in_every_format(tmp_path, form):
     kept = import_log(path, form, mapping, align=False)
     assert len(kept.log) >= num_rows and not any("on the ground" in note for note in kept.notes)
     mapping.write_text(text + f"[rows]\nto_s = {TAKE_OFF_S - 1.0}\n")
-    with pytest.raises(LogError, match=r"nothing flies: on the ground in all \d+ rows; rows.on_ground ="):
+    with pytest.raises(
+        LogError, match=r"nothing flies: on the ground in all \d+ rows; rows.on_ground ="
+    ):
         import_log(path, form, mapping)
 
 
@@ -163,7 +174,9 @@ def test_what_is_measured_decides_whether_the_ground_shows(name):
     is_ground = find_ground([without(log, *absent)])[0]
     is_flight = (log.time > TAKE_OFF_S + SLACK_S) & (log.time < LANDING_S - SLACK_S)
     assert not is_ground[is_flight].any()
-    assert is_ground[log.time < TAKE_OFF_S].all() == is_ground[log.time > LANDING_S].all() == is_shown
+    assert (
+        is_ground[log.time < TAKE_OFF_S].all() == is_ground[log.time > LANDING_S].all() == is_shown
+    )
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])
@@ -207,7 +220,10 @@ def test_a_log_on_the_ground_beside_flights_is_no_flight(tmp_path):
     flight = stands_flies_and_lands()
     standing = flight.select(flight.time < TAKE_OFF_S - 0.1)
     standing["u"][:, 3] = 2.0 * 0.07 - 1.0
-    logs = [blackbox(frames_of(log), BLACKBOX_NAMES, BLACKBOX_HEADERS) for log in (flight, standing, flight)]
+    logs = [
+        blackbox(frames_of(log), BLACKBOX_NAMES, BLACKBOX_HEADERS)
+        for log in (flight, standing, flight)
+    ]
     path, mapping = tmp_path / "a.bbl", tmp_path / "map.toml"
     path.write_bytes(b"".join(logs))
     found = import_log(path, "betaflight")
@@ -242,13 +258,25 @@ def test_wrong_rows_are_refused(tmp_path, rows, message):
         import_log(csv, "csv", tmp_path / "map.toml")
 
 
-# Folder, file, format, mapping -> seconds on the ground at the start and the end, by the motors' outputs.
-# NanoBench's mapping chooses heights.
+# Folder, file, format, mapping -> seconds on the ground at the start and the end, by the motors'
+# outputs. NanoBench's mapping chooses heights.
 REAL = {
     "Gecko": ("bf_gecko/btfl_002.bbl", "betaflight", None, 1.25, 0.0),
     "6S acro": ("betaflight_acro_log/shortLog.BFL", "betaflight", None, 2.25, 0.0),
-    "PX4": ("px4_h520/3DRFlight_1.ulg", "ulog", None, 0.0, 1.82),  # its own detector says so 0.8 s later
-    "Crazyflie": ("crazyflie_rate_flights/seed00066_log3.csv.gz", "csv", "crazyflie_phoenix", 0.0, 0.0),
+    "PX4": (
+        "px4_h520/3DRFlight_1.ulg",
+        "ulog",
+        None,
+        0.0,
+        1.82,
+    ),  # its own detector says so 0.8 s later
+    "Crazyflie": (
+        "crazyflie_rate_flights/seed00066_log3.csv.gz",
+        "csv",
+        "crazyflie_phoenix",
+        0.0,
+        0.0,
+    ),
     "NanoBench": ("nanobench/B8_star_fast_rep1.csv.gz", "csv", "nanobench", 0.0, 0.0),
     "Crazyflie, motors": ("cf_arpl_motors/log15", "usd", "crazyflie_motors", 11.75, 7.7),
 }

@@ -52,7 +52,9 @@ def messages() -> list[tuple[int, str, Any]]:
                 message = made("Joy", header, axes, np.zeros(0, np.int32))
             elif topic == "/twist":
                 turn = made("Vector3", 0.5 * np.cos(time), 0.0, 0.0)
-                message = made("TwistStamped", header, made("Twist", made("Vector3", 0.0, 0.0, 0.0), turn))
+                message = made(
+                    "TwistStamped", header, made("Twist", made("Vector3", 0.0, 0.0, 0.0), turn)
+                )
             else:
                 place = made("Point", time, 0.0, 1.0)
                 attitude = made("Quaternion", *motion(time).as_quat())
@@ -65,7 +67,8 @@ def write_ros2(folder: Path, storage: str) -> Path:
     """Write a bag of ROS 2."""
     with Writer(folder / "bag", version=9, storage_plugin=StoragePlugin[storage]) as writer:
         topics = {
-            topic: writer.add_connection(topic, kind, typestore=TYPES) for topic, (kind, _) in KINDS.items()
+            topic: writer.add_connection(topic, kind, typestore=TYPES)
+            for topic, (kind, _) in KINDS.items()
         }
         for stamp_ns, topic, message in messages():
             data = TYPES.serialize_cdr(message, KINDS[topic][0])
@@ -75,7 +78,9 @@ def write_ros2(folder: Path, storage: str) -> Path:
 
 def write_json(folder: Path) -> Path:
     """Write an MCAP file of JSON, without stamps."""
-    contents = ((topic, stamp_ns, dataclasses.asdict(message)) for stamp_ns, topic, message in messages())
+    contents = (
+        (topic, stamp_ns, dataclasses.asdict(message)) for stamp_ns, topic, message in messages()
+    )
     unstamped = ((topic, at, {**content, "header": None}) for topic, at, content in contents)
     save_messages(folder / "flight.mcap", unstamped)
     return folder / "flight.mcap"
@@ -89,13 +94,16 @@ WRITERS = {
 }
 
 
-def test_a_bag_compressed_as_a_whole_is_told_and_the_command_named_makes_it_one_that_is_read(tmp_path):
+def test_a_bag_compressed_as_a_whole_is_told_and_the_command_named_makes_it_one_that_is_read(
+    tmp_path,
+):
     storage = StoragePlugin.SQLITE3
     unopened = Writer(tmp_path / "bag", version=9, storage_plugin=storage)
     unopened.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
     with unopened as writer:
         topics = {
-            topic: writer.add_connection(topic, kind, typestore=TYPES) for topic, (kind, _) in KINDS.items()
+            topic: writer.add_connection(topic, kind, typestore=TYPES)
+            for topic, (kind, _) in KINDS.items()
         }
         for stamp_ns, topic, message in messages():
             writer.write(topics[topic], stamp_ns, TYPES.serialize_cdr(message, KINDS[topic][0]))
@@ -107,7 +115,9 @@ def test_a_bag_compressed_as_a_whole_is_told_and_the_command_named_makes_it_one_
     subprocess.run([Path(sys.executable).with_name(program), *arguments], check=True)
     plain = import_log(tmp_path / "bag_plain", "bag", tmp_path / "map.toml").log
     (tmp_path / "other").mkdir()
-    expected = import_log(write_ros2(tmp_path / "other", "SQLITE3"), "bag", tmp_path / "map.toml").log
+    expected = import_log(
+        write_ros2(tmp_path / "other", "SQLITE3"), "bag", tmp_path / "map.toml"
+    ).log
     np.testing.assert_array_equal(plain["w"], expected["w"])
 
 
@@ -116,11 +126,17 @@ def test_what_was_written_is_read_back(tmp_path, kind):
     (tmp_path / "map.toml").write_text(MAPPING)
     found = import_log(WRITERS[kind](tmp_path), "bag", tmp_path / "map.toml", align=False)
     log, time = found.log, found.log.time
-    assert len(log) >= 990 and np.diff(time) == pytest.approx(0.005, abs=1e-6)  # the rates' own rows
+    assert len(log) >= 990 and np.diff(time) == pytest.approx(
+        0.005, abs=1e-6
+    )  # the rates' own rows
     np.testing.assert_allclose(log["w"][:, 0], 0.5 * np.cos(time), atol=1e-6)
     np.testing.assert_allclose(log["p"][:, 0], time, atol=1e-6)  # interpolated
-    assert (Rotation.from_quat(log["q"], scalar_first=True).inv() * motion(time)).magnitude().max() < 1e-4
-    np.testing.assert_allclose(log["u"][:, 0], np.sin(np.floor(time / 0.02 + 1e-6) * 0.02), atol=1e-6)  # held
+    assert (
+        Rotation.from_quat(log["q"], scalar_first=True).inv() * motion(time)
+    ).magnitude().max() < 1e-4
+    np.testing.assert_allclose(
+        log["u"][:, 0], np.sin(np.floor(time / 0.02 + 1e-6) * 0.02), atol=1e-6
+    )  # held
     is_told = any("times are those of their recording" in note for note in found.notes)
     assert is_told == (kind == "MCAP of JSON") and log["u"][:, 3] == pytest.approx(0.5)
 
@@ -128,9 +144,24 @@ def test_what_was_written_is_read_back(tmp_path, kind):
 def test_what_lacks_a_topic_or_a_field_is_refused(tmp_path):
     mapping, flight = tmp_path / "map.toml", write_json(tmp_path)
     for path, old, new, message in (
-        (flight, "/twist:twist.angular.x", "/gyro:x", "topic /gyro: no messages; found /pose, /sticks, /tw"),
-        (flight, "twist.angular.x", "rate", "topic /twist: field rate: not a number in messages of type any"),
-        (flight, "/sticks:axes[0]", "roll", r"map\.toml: command: found roll, expected topic:field"),
+        (
+            flight,
+            "/twist:twist.angular.x",
+            "/gyro:x",
+            "topic /gyro: no messages; found /pose, /sticks, /tw",
+        ),
+        (
+            flight,
+            "twist.angular.x",
+            "rate",
+            "topic /twist: field rate: not a number in messages of type any",
+        ),
+        (
+            flight,
+            "/sticks:axes[0]",
+            "roll",
+            r"map\.toml: command: found roll, expected topic:field",
+        ),
     ):
         mapping.write_text(MAPPING.replace(old, new, 1))
         with pytest.raises(LogError, match=message):
@@ -158,5 +189,6 @@ def test_topics_of_other_epochs_are_put_together_by_their_recording(tmp_path):
     assert position_m[0] < 0.0051  # the rounding of 77 s may cost the first row
     np.testing.assert_allclose(position_m - position_m[0], imported.log.time, atol=1e-5)
     assert any(
-        f"stamps of q are {START_NS * 1e-9 - 77:+.6g} s before those of w" in note for note in imported.notes
+        f"stamps of q are {START_NS * 1e-9 - 77:+.6g} s before those of w" in note
+        for note in imported.notes
     )

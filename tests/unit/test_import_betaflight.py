@@ -20,7 +20,11 @@ from tests.support.real_logs import BETAFLIGHT, shared
 pytest.importorskip("orangebox", reason="orangebox is not installed: pip install 'flytrack[logs]'")
 
 GRAVITY = 9.80665
-FULL_STICK = (1021.6, 200.0 / 0.3, 500.0)  # of the headers: 5.108 x 200; 200 / (1 - 0.7); 100 / (1 - 0.8)
+FULL_STICK = (
+    1021.6,
+    200.0 / 0.3,
+    500.0,
+)  # of the headers: 5.108 x 200; 200 / (1 - 0.7); 100 / (1 - 0.8)
 
 
 def still() -> np.ndarray:
@@ -36,9 +40,13 @@ def write(path: Path, *logs: bytes) -> Path:
     return path
 
 
-def log_with(rows: np.ndarray | None = None, names: list[str] = NAMES, **headers: str | None) -> bytes:
+def log_with(
+    rows: np.ndarray | None = None, names: list[str] = NAMES, **headers: str | None
+) -> bytes:
     """Return a log with other headers; None leaves one out."""
-    kept = {name: value for name, value in (BLACKBOX_HEADERS | headers).items() if value is not None}
+    kept = {
+        name: value for name, value in (BLACKBOX_HEADERS | headers).items() if value is not None
+    }
     return blackbox(frames() if rows is None else rows, names, kept)
 
 
@@ -52,7 +60,9 @@ def test_units_and_frames_are_ours(tmp_path):
     np.testing.assert_allclose(log["w"][0], np.deg2rad([100.0, -50.0, 25.0]))
     np.testing.assert_allclose(log["f"][0], [0.5 * GRAVITY, -0.25 * GRAVITY, GRAVITY])
     assert log["v_bat"][0] == pytest.approx(24.1)
-    assert 'the effect betaflight_rates: {"pitch": 0.7, "yaw": 0.8, "roll_expo": 0.1}' in str(found.notes)
+    assert 'the effect betaflight_rates: {"pitch": 0.7, "yaw": 0.8, "roll_expo": 0.1}' in str(
+        found.notes
+    )
     assert set(log.channels) == {"u", "w", "f", "v_bat"} and "Betaflight 4.5.1" in found.notes[0]
 
 
@@ -73,7 +83,8 @@ def test_logs_of_one_file_become_segments_and_lost_frames_no_rows(tmp_path):
     assert np.bincount(found.log.segment).tolist() == [200, 189]
     assert [source.rpartition("a.bbl")[2] for source in found.sources] == [", log 1", ", log 2"]
     assert any(
-        "log 2: 1 of 190 rows of the frames left out: 1 with a repeated" in note for note in found.notes
+        "log 2: 1 of 190 rows of the frames left out: 1 with a repeated" in note
+        for note in found.notes
     )
     assert np.diff(found.log.time[200:]).max() == pytest.approx(11 * 500e-6)
 
@@ -111,7 +122,9 @@ def test_stick_curves_are_the_firmwares(rates_type):
     curve, sticks = stick_curve(rates_type, axes), np.linspace(-1, 1, 21)
     full = [full_stick_rate(rates_type, rc, rate, 1998.0) for rc, rate, _ in axes]
     for stick in sticks:
-        bent = effect_of(curve).hooks["command"](curve, None, Action(stick, stick, stick, 0.3), None)
+        bent = effect_of(curve).hooks["command"](
+            curve, None, Action(stick, stick, stick, 0.3), None
+        )
         expected = [of_firmware(rates_type, stick, *axis) for axis in axes]
         np.testing.assert_allclose(bent[:3], np.divide(expected, full), atol=1e-6)
         assert bent.thrust == 0.3
@@ -130,11 +143,20 @@ def test_stick_curves_are_the_firmwares(rates_type):
         (log_with(rows=still()), r"a\.bbl: nothing flies: the thrust command never exceeds 5 %"),
         (log_with().replace(b"encoding:1", b"encoding:77"), r"a\.bbl: damaged, cannot be decoded"),
         (log_with(rows=frames(0)), r"a\.bbl: (found no frames|damaged)"),
-        (log_with(**{"Firmware revision": "INAV 7.1"}), r"Firmware revision: found 'INAV 7\.1', exp"),
+        (
+            log_with(**{"Firmware revision": "INAV 7.1"}),
+            r"Firmware revision: found 'INAV 7\.1', exp",
+        ),
         (log_with(rc_rates=None), r"a\.bbl: header rc_rates: missing, so full stick is unknown"),
-        (log_with(acc_1G=None), r"a\.bbl: header acc_1G: found None, expected 1 numbers of at least 0"),
+        (
+            log_with(acc_1G=None),
+            r"a\.bbl: header acc_1G: found None, expected 1 numbers of at least 0",
+        ),
         (log_with(names=[NAMES[0], "\x1b[2J", *NAMES[2:]]), r"field time: missing; found [ -~]+$"),
-        (log_with(rc_rates="50,50,50"), r"column u_roll: found 5\.11, expected a command in \[-1, 1\]"),
+        (
+            log_with(rc_rates="50,50,50"),
+            r"column u_roll: found 5\.11, expected a command in \[-1, 1\]",
+        ),
     ],
 )
 def test_wrong_files_are_refused(tmp_path, content, message):
@@ -144,10 +166,17 @@ def test_wrong_files_are_refused(tmp_path, content, message):
 
 def test_overshoot_is_clipped_and_counted(tmp_path):
     rows = frames()
-    rows[10:13, 2] = [1022, 1040, -1070]  # full stick is 1021.6: rounding, 1.8 % past it, 4.7 % past it
+    rows[10:13, 2] = [
+        1022,
+        1040,
+        -1070,
+    ]  # full stick is 1021.6: rounding, 1.8 % past it, 4.7 % past it
     found = import_log(write(tmp_path / "a.bbl", log_with(rows)), "betaflight")
     assert found.log["u"][10:13, 0].tolist() == [1.0, 1.0, -1.0]
-    assert "2 rows clipped to full stick: smoothed setpoints overshoot, at most 4.7 %" in found.notes[1]
+    assert (
+        "2 rows clipped to full stick: smoothed setpoints overshoot, at most 4.7 %"
+        in found.notes[1]
+    )
 
 
 def test_a_log_without_accelerometer_is_read(tmp_path):
@@ -200,7 +229,9 @@ ATTITUDE = [f"imuQuaternion[{axis}]" for axis in range(3)]
 
 def test_logged_attitude_is_read(tmp_path):
     rows, time = frames(3000), 0.004 * np.arange(3000)
-    truth = Rotation.from_euler("xyz", np.column_stack([0.3 * np.sin(time), 0.2 * np.cos(time), 0.1 * time]))
+    truth = Rotation.from_euler(
+        "xyz", np.column_stack([0.3 * np.sin(time), 0.2 * np.cos(time), 0.1 * time])
+    )
     quat = truth.as_quat(canonical=True)
     turns = np.gradient(summed_turns(truth), time, axis=0)
     rows[:, 1], rows[:, 7:10] = 1e6 * time, np.round(np.rad2deg(turns))
@@ -217,12 +248,28 @@ def test_logged_attitude_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("headers", "note"),
     [
-        ({"vbat_sag_compensation": "75"}, "vbat_sag_compensation 75: motors get more at a low voltage"),
+        (
+            {"vbat_sag_compensation": "75"},
+            "vbat_sag_compensation 75: motors get more at a low voltage",
+        ),
         ({"thrust_linear": "20"}, "thrust_linear 20: motors get less"),
         ({"motor_output_limit": "80"}, "motor_output_limit 80: motors get that percentage"),
-        ({"throttle_limit_type": "1", "throttle_limit_percent": "60"}, "the throttle is scaled to 60 %"),
-        ({"throttle_limit_type": "2", "throttle_limit_percent": "60"}, "the throttle is clipped at 60 %"),
-        ({"throttle_limit_type": "0", "throttle_limit_percent": "60", "motor_output_limit": "100"}, None),
+        (
+            {"throttle_limit_type": "1", "throttle_limit_percent": "60"},
+            "the throttle is scaled to 60 %",
+        ),
+        (
+            {"throttle_limit_type": "2", "throttle_limit_percent": "60"},
+            "the throttle is clipped at 60 %",
+        ),
+        (
+            {
+                "throttle_limit_type": "0",
+                "throttle_limit_percent": "60",
+                "motor_output_limit": "100",
+            },
+            None,
+        ),
     ],
 )
 def test_settings_that_change_the_thrust_curve_are_told(tmp_path, headers, note):
@@ -235,21 +282,30 @@ def test_motors_are_counted_and_their_saturation_told(tmp_path):
     names = [*NAMES, *(f"motor[{number}]" for number in range(6))]
     rows = np.column_stack([frames(), np.full((200, 6), 700)])
     rows[:5, -1] = 2047
-    found = import_log(write(tmp_path / "a.bbl", log_with(rows, names, motorOutput="158,2047")), "betaflight")
+    found = import_log(
+        write(tmp_path / "a.bbl", log_with(rows, names, motorOutput="158,2047")), "betaflight"
+    )
     assert "found 6 motors, not a quadcopter" in found.notes[1]
     assert "a motor at its upper end in 2.50% of the rows" in found.notes[2]
     (tmp_path / "map.toml").write_text("[motors]\nas_thrust = true\n")
     thrust = import_log(tmp_path / "a.bbl", "betaflight", tmp_path / "map.toml").log["u"][:, 3]
-    assert thrust[-1] == pytest.approx(2.0 * (700 - 158) / (2047 - 158) - 1.0) and thrust[0] > thrust[-1]
+    assert (
+        thrust[-1] == pytest.approx(2.0 * (700 - 158) / (2047 - 158) - 1.0)
+        and thrust[0] > thrust[-1]
+    )
 
 
 def test_logs_of_different_craft_or_channels_make_no_log(tmp_path):
     first = write(tmp_path / "a.bbl", log_with())
     second = write(tmp_path / "b.bbl", log_with(rc_rates="220,100,60"))
-    with pytest.raises(LogError, match=r"b\.bbl: craft: full stick .* 600 deg/s.*a\.bbl.* 500 deg/s"):
+    with pytest.raises(
+        LogError, match=r"b\.bbl: craft: full stick .* 600 deg/s.*a\.bbl.* 500 deg/s"
+    ):
         import_log([first, second], "betaflight")
     write(second, log_with(names=[name.replace("vbatLatest", "x") for name in NAMES]))
-    with pytest.raises(LogError, match=r"b\.bbl: channels v_bat: not in both this file and .*a\.bbl"):
+    with pytest.raises(
+        LogError, match=r"b\.bbl: channels v_bat: not in both this file and .*a\.bbl"
+    ):
         import_log([first, second], "betaflight")
 
 
@@ -267,7 +323,9 @@ def test_real_log_holds_what_another_decoder_found(tmp_path):
     time_us = decoded["time"] - decoded["time"][0]
     np.testing.assert_allclose(every.time, 1e-6 * time_us, atol=1e-9)
     for axis in range(3):
-        np.testing.assert_allclose(np.rad2deg(every["w"][:, axis]), decoded[f"gyroADC[{axis}]"], atol=1e-9)
+        np.testing.assert_allclose(
+            np.rad2deg(every["w"][:, axis]), decoded[f"gyroADC[{axis}]"], atol=1e-9
+        )
         force_g = every["f"][:, axis] / GRAVITY
         np.testing.assert_allclose(force_g, decoded[f"accSmooth[{axis}]"] / 2048, atol=1e-9)
     np.testing.assert_allclose(every["v_bat"][:, 0], decoded["vbatLatest"] / 100, atol=1e-9)

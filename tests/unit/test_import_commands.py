@@ -62,9 +62,13 @@ def test_attitude_setpoints_become_rates_by_given_gains(tmp_path):
 def test_attitude_gains_are_identified_or_asked_for(tmp_path):
     note = next(note for note in read(tmp_path, MAPPING).notes if "times gains" in note)
     gains = [float(text) for text in note.partition("gains of ")[2].split(" 1/s")[0].split(", ")]
-    assert gains == pytest.approx([6.0, 5.0, 2.0], rel=0.1) and "roll, pitch, yaw identified" in note
+    assert (
+        gains == pytest.approx([6.0, 5.0, 2.0], rel=0.1) and "roll, pitch, yaw identified" in note
+    )
     columns = {**flight(), "wz": np.random.default_rng(1).normal(size=NUM_ROWS)}
-    with pytest.raises(LogError, match=r"attitude_command\.gain: cannot be identified for yaw: .*; state it"):
+    with pytest.raises(
+        LogError, match=r"attitude_command\.gain: cannot be identified for yaw: .*; state it"
+    ):
         read(tmp_path, MAPPING, columns)
     some = read(tmp_path, MAPPING.replace("signs", "gain = [0, 0, 2]\nsigns"), columns)
     assert "2 1/s (roll, pitch identified" in " ".join(some.notes)
@@ -88,7 +92,9 @@ def test_motors_replace_the_thrust_command_and_show_saturation(tmp_path):
 def test_only_the_longest_stretch_in_the_air_is_used(tmp_path):
     height = np.repeat([0.0, 1.0, 0.0, 1.0, 0.0], 300)
     height[700:720] = 1.0  # a hop
-    place = '[position]\ncolumns = ["n", "e", "h"]\nunit = "m"\nframe = "z_up"\n[rows]\nabove_m = 0.2\n'
+    place = (
+        '[position]\ncolumns = ["n", "e", "h"]\nunit = "m"\nframe = "z_up"\n[rows]\nabove_m = 0.2\n'
+    )
     columns = {**flight(), "n": 0 * height, "e": 0 * height, "h": height}
     log = read(tmp_path, MAPPING.replace("signs", "gain = [6, 5, 2]\nsigns") + place, columns).log
     assert len(log) == 300 and log.time[[0, -1]] == pytest.approx([3.0, 5.99])

@@ -17,17 +17,47 @@ from tests.support.tables import table
 from tests.support.written_logs import read_mapping
 
 FLIP = np.array([1.0, -1.0, -1.0])
-HEADER = ["ms", "n", "e", "d", "vn", "ve", "vd", "ax", "ay", "az", "p", "q", "r", "qx", "qy", "qz", "qw"]
+HEADER = [
+    "ms",
+    "n",
+    "e",
+    "d",
+    "vn",
+    "ve",
+    "vd",
+    "ax",
+    "ay",
+    "az",
+    "p",
+    "q",
+    "r",
+    "qx",
+    "qy",
+    "qz",
+    "qw",
+]
 HEADER += ["ail", "ele", "rud", "thr", "mv"]
 MAPPING = read_mapping("every_unit")
 
 
 def write_csv(path: Path, log: FlightLog) -> Path:
     """Write a log as others would: NED, FRD, degrees, g, cm, ms, PWM, quaternions x, y, z, w."""
-    ned = Rotation.from_quat(log["q"], scalar_first=True).as_quat(scalar_first=True) * [1.0, 1.0, -1.0, -1.0]
+    ned = Rotation.from_quat(log["q"], scalar_first=True).as_quat(scalar_first=True) * [
+        1.0,
+        1.0,
+        -1.0,
+        -1.0,
+    ]
     sticks = 1500.0 + 500.0 * log["u"] * [1.0, -1.0, -1.0, 1.0]
     p, v, f, w = (log[name] * FLIP for name in "pvfw")
-    columns = [1e3 * log.time + 5000.0, 100.0 * p, v, f / GRAVITY, np.rad2deg(w), ned[:, [1, 2, 3, 0]]]
+    columns = [
+        1e3 * log.time + 5000.0,
+        100.0 * p,
+        v,
+        f / GRAVITY,
+        np.rad2deg(w),
+        ned[:, [1, 2, 3, 0]],
+    ]
     columns += [sticks, 1e3 * log["v_bat"]]
     np.savetxt(path, np.column_stack(columns), "%.17g", ",", header=",".join(HEADER), comments="")
     return path
@@ -47,7 +77,9 @@ def test_units_and_frames_come_out_ours(folder, truth):
     found = import_log(folder / "flight.csv", "csv", folder / "map.toml")
     np.testing.assert_allclose(found.log.time, TIME_S[:300], atol=1e-9)
     for name, values in truth.select(slice(300)).channels.items():
-        sign = np.sign(np.sum(found.log[name] * values, axis=1, keepdims=True)) if name == "q" else 1.0
+        sign = (
+            np.sign(np.sum(found.log[name] * values, axis=1, keepdims=True)) if name == "q" else 1.0
+        )
         np.testing.assert_allclose(sign * found.log[name], values, atol=1e-6, err_msg=name)
     assert found.craft == Craft((700.0, 600.0, 500.0), 0.5, (14.0, 16.8)) and found.problems == ()
 
@@ -89,7 +121,11 @@ def test_wrong_mappings_are_refused(folder, tmp_path, old, new, message):
 @pytest.mark.parametrize(
     ("row", "change", "message"),
     [
-        (4, lambda cells: [*cells[:3], "", *cells[4:]], r"row 3 \(line 5\), column d: found an empty cell"),
+        (
+            4,
+            lambda cells: [*cells[:3], "", *cells[4:]],
+            r"row 3 \(line 5\), column d: found an empty cell",
+        ),
         (0, lambda cells: ["ms", *cells[:-1]], r"column n: found .*|column ms: found 2 times"),
     ],
 )
@@ -103,7 +139,12 @@ def test_wrong_cells_are_refused(folder, tmp_path, row, change, message):
 
 def test_missing_and_unmapped_files_are_refused(folder, tmp_path):
     for path, format_name, mapping, message in (
-        (folder / "flight.csv", "csv", tmp_path / "no.toml", r"no\.toml: found no such .*crazyflie_phoenix"),
+        (
+            folder / "flight.csv",
+            "csv",
+            tmp_path / "no.toml",
+            r"no\.toml: found no such .*crazyflie_phoenix",
+        ),
         (folder / "flight.csv", "csv", None, r"flight\.csv: no mapping names no columns"),
         (folder / "flight.csv", "mat", None, "format: found 'mat'"),
         ([], "csv", folder / "map.toml", "found no files"),
@@ -123,7 +164,11 @@ FILES = read_mapping("files")
             '"*_rc_1.csv"',
             r"flight: found 0 files of the name \*_rc_1\.csv among x_gyro_0\.csv, x_rc_0",
         ),
-        ('"*_rc_0.csv"', '"*.csv"', r"flight: found 2 files .*expected one by .*map\.toml: files\.rc"),
+        (
+            '"*_rc_0.csv"',
+            '"*.csv"',
+            r"flight: found 2 files .*expected one by .*map\.toml: files\.rc",
+        ),
         (
             '"*_rc_0.csv"',
             '"../*.csv"',
@@ -158,13 +203,22 @@ def test_several_files_keep_their_own_clocks(tmp_path):
     path, mapping = csv_files_with_clock(tmp_path, 100.0 + 0.01 * np.arange(200))
     late = np.loadtxt(path / "x_rc_0.csv", delimiter=",", skiprows=1)[::2]
     late[:, 1] = np.linspace(-1.0, 1.0, len(late))
-    np.savetxt(path / "x_rc_0.csv", late, "%.9f", ",", header="ms,roll,pitch,yaw,thrust", comments="")
+    np.savetxt(
+        path / "x_rc_0.csv", late, "%.9f", ",", header="ms,roll,pitch,yaw,thrust", comments=""
+    )
     log = import_log(path, "csv", mapping).log
-    np.testing.assert_allclose(log["u"][:, 0], np.repeat(late[:, 1], 2)[: len(log)], atol=1e-8)  # held
-    for folder, message in ((path / "x_rc_0.csv", "found no folder"), (tmp_path / "no", "found no folder")):
+    np.testing.assert_allclose(
+        log["u"][:, 0], np.repeat(late[:, 1], 2)[: len(log)], atol=1e-8
+    )  # held
+    for folder, message in (
+        (path / "x_rc_0.csv", "found no folder"),
+        (tmp_path / "no", "found no folder"),
+    ):
         with pytest.raises(LogError, match=message):
             import_log(folder, "csv", mapping)
-    with pytest.raises(LogError, match=r"flight: found a folder, expected a file, or files\.NAME in"):
+    with pytest.raises(
+        LogError, match=r"flight: found a folder, expected a file, or files\.NAME in"
+    ):
         (tmp_path / "one.toml").write_text(read_mapping("clock"))
         import_log(path, "csv", tmp_path / "one.toml")
 
@@ -192,15 +246,33 @@ def test_command_writes_log_details_and_model(folder, tmp_path, capsys):
     details = json.loads((tmp_path / "log.import.json").read_text())
     assert details["sha256"] == load_log(out).sha256
     assert [Path(source).name for source in details["sources"]] == ["flight.csv"]
-    assert load_model(model).m == 0.5 and load_model(model).max_rate.tolist() == [700.0, 600.0, 500.0]
+    assert load_model(model).m == 0.5 and load_model(model).max_rate.tolist() == [
+        700.0,
+        600.0,
+        500.0,
+    ]
 
 
 @pytest.mark.slow
 def test_command_keeps_clocks_if_asked(folder, tmp_path, capsys):
     late = write_csv(tmp_path / "late.csv", flight(TIME_S, 0.02))
-    arguments = ["import", late, "--format", "csv", "--map", folder / "map.toml", "--out", tmp_path / "a.npz"]
-    for options, verdict, num_rows in (([], "corrected", 1998), (["--keep-clocks"], "left as asked", 2000)):
+    arguments = [
+        "import",
+        late,
+        "--format",
+        "csv",
+        "--map",
+        folder / "map.toml",
+        "--out",
+        tmp_path / "a.npz",
+    ]
+    for options, verdict, num_rows in (
+        ([], "corrected", 1998),
+        (["--keep-clocks"], "left as asked", 2000),
+    ):
         main([str(part) for part in (*arguments, *options)])
-        (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("clock of q"))
+        (line,) = (
+            line for line in capsys.readouterr().out.splitlines() if line.startswith("clock of q")
+        )
         assert "+20." in line and verdict in line
         assert abs(len(load_log(tmp_path / "a.npz")) - num_rows) <= 1

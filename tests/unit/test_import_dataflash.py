@@ -25,7 +25,10 @@ def rows_of(every: int, *columns: Any) -> list[tuple[Any, ...]]:
     """Return rows of stamps and columns; each of every so many samples."""
     stamps_us = np.round(START_US + 1e6 * TIME_S)
     table = np.column_stack(
-        [stamps_us, *(np.broadcast_to(column, (len(TIME_S), *np.shape(column)[1:])) for column in columns)]
+        [
+            stamps_us,
+            *(np.broadcast_to(column, (len(TIME_S), *np.shape(column)[1:])) for column in columns),
+        ]
     )
     return [(int(row[0]), *row[1:].tolist()) for row in table[::every]]
 
@@ -48,7 +51,9 @@ def messages() -> Messages:
     sensors = [
         row
         for number, good, scale in instance
-        for row in rows_of(8, zero + number, *(scale * part for part in imu), zero + good, zero + 1.0)
+        for row in rows_of(
+            8, zero + number, *(scale * part for part in imu), zero + good, zero + 1.0
+        )
     ]
     volts = TRUTH["v_bat"][:, 0]
     packs = rows_of(400, zero, zero) + rows_of(400, zero + 1, volts)
@@ -81,7 +86,11 @@ def test_a_made_flight_comes_back(tmp_path: Path, attitude: str) -> None:
         del written["XKQ"]
     found = import_log(write(tmp_path / "a.bin", written), "dataflash", align=False)
     log = found.log
-    assert len(log) > 4700 and log.time[0] == 0.0 and np.diff(log.time) == pytest.approx(0.0025, abs=1e-6)
+    assert (
+        len(log) > 4700
+        and log.time[0] == 0.0
+        and np.diff(log.time) == pytest.approx(0.0025, abs=1e-6)
+    )
     rows = np.round(log.time / 0.0025).astype(int)
     tolerances = {
         "u": 1e-6,
@@ -97,7 +106,9 @@ def test_a_made_flight_comes_back(tmp_path: Path, attitude: str) -> None:
         TRUTH["q"][rows], scalar_first=True
     )
     assert np.max(turned.magnitude()) < 0.01
-    assert found.problems == () and found.craft.max_rate_deg_s == pytest.approx(tuple(FULL_STICK_DEG_S))
+    assert found.problems == () and found.craft.max_rate_deg_s == pytest.approx(
+        tuple(FULL_STICK_DEG_S)
+    )
     said = " ".join(found.notes)
     assert "instance 1 of IMU is used, not 0 (not healthy), 2" in said
     assert "instance 1 of BAT is used, not 0 (not healthy)" in said
@@ -122,9 +133,15 @@ def test_rates_of_the_imu_where_it_is_faster_and_motors_as_thrust(tmp_path: Path
     written = messages()
     written["RATE"] = (*written["RATE"][:2], written["RATE"][2][::16])
     (tmp_path / "map.toml").write_text("[motors]\nas_thrust = true\n")
-    found = import_log(write(tmp_path / "a.bin", written), "dataflash", tmp_path / "map.toml", align=False)
-    assert np.diff(found.log.time) == pytest.approx(0.02) and "rates of IMU" in " ".join(found.notes)
-    assert found.log["u"][:, 3] == pytest.approx(2.0 * 0.375 - 1.0, abs=1e-3)  # the mean of 0, 1/4, 1/2, 3/4
+    found = import_log(
+        write(tmp_path / "a.bin", written), "dataflash", tmp_path / "map.toml", align=False
+    )
+    assert np.diff(found.log.time) == pytest.approx(0.02) and "rates of IMU" in " ".join(
+        found.notes
+    )
+    assert found.log["u"][:, 3] == pytest.approx(
+        2.0 * 0.375 - 1.0, abs=1e-3
+    )  # the mean of 0, 1/4, 1/2, 3/4
 
 
 def test_setpoints_past_full_stick_raise_it(tmp_path: Path) -> None:
@@ -132,8 +149,13 @@ def test_setpoints_past_full_stick_raise_it(tmp_path: Path) -> None:
     rows = written["RATE"][2]
     rows[100] = (rows[100][0], 777.0, *rows[100][2:])
     found = import_log(write(tmp_path / "a.bin", written), "dataflash", align=False)
-    assert found.craft.max_rate_deg_s == pytest.approx((777.0, 360.0, 180.0)) and found.log["u"].max() == 1.0
-    assert any("RDes reaches 777 deg/s: full stick is that, not 500" in note for note in found.notes)
+    assert (
+        found.craft.max_rate_deg_s == pytest.approx((777.0, 360.0, 180.0))
+        and found.log["u"].max() == 1.0
+    )
+    assert any(
+        "RDes reaches 777 deg/s: full stick is that, not 500" in note for note in found.notes
+    )
 
 
 @pytest.mark.parametrize(
@@ -150,11 +172,17 @@ def test_setpoints_past_full_stick_raise_it(tmp_path: Path) -> None:
             {"text": "ArduPlane V4.5.7"},
             r"a\.bin: found a log of ArduPlane V4\.5\.7, expected one of ArduCopter",
         ),
-        ((), {"parameters": {**COPTER_PARAMETERS, "Q_ENABLE": 1.0}}, r"a\.bin: found a log of a quadplane"),
+        (
+            (),
+            {"parameters": {**COPTER_PARAMETERS, "Q_ENABLE": 1.0}},
+            r"a\.bin: found a log of a quadplane",
+        ),
         ((), None, r"a\.bin: damaged|a\.bin: message RATE: missing"),
     ],
 )
-def test_other_logs_are_refused(tmp_path: Path, change: tuple[str, ...], options: Any, message: str) -> None:
+def test_other_logs_are_refused(
+    tmp_path: Path, change: tuple[str, ...], options: Any, message: str
+) -> None:
     written = {name: content for name, content in messages().items() if name not in change}
     path = write(tmp_path / "a.bin", written, **(options or {}))
     if options is None:
@@ -166,4 +194,6 @@ def test_other_logs_are_refused(tmp_path: Path, change: tuple[str, ...], options
 def test_another_airframe_is_told(tmp_path: Path) -> None:
     parameters = {**COPTER_PARAMETERS, "FRAME_CLASS": 2.0}
     found = import_log(write(tmp_path / "a.bin", messages(), parameters=parameters), "dataflash")
-    assert any("found a hexacopter (FRAME_CLASS 2), not a quadcopter" in note for note in found.notes)
+    assert any(
+        "found a hexacopter (FRAME_CLASS 2), not a quadcopter" in note for note in found.notes
+    )

@@ -56,12 +56,16 @@ def test_setpoints_are_held_and_sensors_interpolated(tmp_path):
     fields, _ = tables["vehicle_rates_setpoint"]
     rolls = np.deg2rad(720.0) * np.linspace(0.0, 1.0, 40)
     times = TIMES_US[::5] + STEP_US // 2
-    setpoints = [(int(time), roll, 0, 0, 0, 0, -0.5) for time, roll in zip(times, rolls, strict=True)]
+    setpoints = [
+        (int(time), roll, 0, 0, 0, 0, -0.5) for time, roll in zip(times, rolls, strict=True)
+    ]
     places = [(int(time), 1e-6 * (time - 1e6), 0, 0, 1, 0, 0) for time in TIMES_US[::5]]
     tables["vehicle_rates_setpoint"] = (fields, setpoints)
     tables["vehicle_local_position"] = ([*XYZ, *VXYZ], places)
     log = import_log(write(tmp_path / "a.ulg", tables), "ulog").log
-    assert log.time[0] == 0.0 and len(log) == 195  # after the first setpoint, before the last position
+    assert (
+        log.time[0] == 0.0 and len(log) == 195
+    )  # after the first setpoint, before the last position
     held = np.linspace(0.0, 1.0, 40)[np.arange(195) // 5]
     np.testing.assert_allclose(log["u"][:, 0], held, atol=1e-6)
     np.testing.assert_allclose(log["p"][:, 0], 1e-6 * STEP_US * np.arange(1, 196), atol=1e-6)
@@ -85,14 +89,18 @@ def test_unknown_full_stick_is_refused_unless_the_mapping_states_it(tmp_path, pi
     parameters = PARAMETERS | {"MC_ACRO_P_MAX": pitch_max}
     known = {name: value for name, value in parameters.items() if value is not None}
     path = write(tmp_path / "a.ulg", topics(), known)
-    with pytest.raises(LogError, match=r"a\.ulg: parameter MC_ACRO_P_MAX or MC_PITCHRATE_MAX: missing"):
+    with pytest.raises(
+        LogError, match=r"a\.ulg: parameter MC_ACRO_P_MAX or MC_PITCHRATE_MAX: missing"
+    ):
         import_log(path, "ulog")
     mapping = tmp_path / "craft.toml"
     mapping.write_text("[craft]\nmax_rate_deg_s = [720, 180, 90]\n")
     commands = import_log(path, "ulog", mapping).log["u"]
     np.testing.assert_allclose(commands[0], [0.5, -0.5, 0.5, 0.5], atol=1e-6)
     mapping.write_text("[craft]\nmax_rate_deg_s = [90, 90, 90]\n")
-    text = r"up to 360, 90, 45 deg/s, .*, 90, 90, 90 deg/s; in a mapping, craft\.max_rate_deg_s = \["
+    text = (
+        r"up to 360, 90, 45 deg/s, .*, 90, 90, 90 deg/s; in a mapping, craft\.max_rate_deg_s = \["
+    )
     with pytest.raises(LogError, match=text) as error:
         import_log(path, "ulog", mapping)
     advice = re.search(r"max_rate_deg_s = \[.*?\]", str(error.value)).group()
@@ -100,7 +108,9 @@ def test_unknown_full_stick_is_refused_unless_the_mapping_states_it(tmp_path, pi
     assert import_log(path, "ulog", mapping).log["u"][0, 0] == pytest.approx(1.0, abs=0.005)
 
 
-@pytest.mark.parametrize(("first_v", "second_v"), [(16.25, 15.0), (0.0, 15.0), (np.nan, 15.0), (0.0, 0.0)])
+@pytest.mark.parametrize(
+    ("first_v", "second_v"), [(16.25, 15.0), (0.0, 15.0), (np.nan, 15.0), (0.0, 0.0)]
+)
 def test_the_battery_that_is_measured_is_used(tmp_path, first_v, second_v):
     tables = topics()
     fields, rows = tables["battery_status"]
@@ -122,14 +132,20 @@ def test_samples_from_before_the_estimator_runs_are_left_out(tmp_path):
     fields, rows = tables["vehicle_attitude"]
     late = [(*row[:1], 0.0, 0.0, 0.0, 0.0) if index < 3 else row for index, row in enumerate(rows)]
     whole = import_log(write(tmp_path / "a.ulg", tables), "ulog").log
-    found = import_log(write(tmp_path / "b.ulg", {**tables, "vehicle_attitude": (fields, late)}), "ulog").log
+    found = import_log(
+        write(tmp_path / "b.ulg", {**tables, "vehicle_attitude": (fields, late)}), "ulog"
+    ).log
     assert 0 < len(found) < len(whole)
     none = [(*row[:1], 0.0, 0.0, 0.0, 0.0) for row in rows]
     path = write(tmp_path / "c.ulg", {**tables, "vehicle_attitude": (fields, none)})
-    with pytest.raises(LogError, match=r"c\.ulg: topic vehicle_attitude: q: found no unit quaternion"):
+    with pytest.raises(
+        LogError, match=r"c\.ulg: topic vehicle_attitude: q: found no unit quaternion"
+    ):
         import_log(path, "ulog")
     del tables["vehicle_attitude"]
-    with pytest.raises(LogError, match=r"d\.ulg: topic vehicle_attitude .*missing or empty; found "):
+    with pytest.raises(
+        LogError, match=r"d\.ulg: topic vehicle_attitude .*missing or empty; found "
+    ):
         import_log(write(tmp_path / "d.ulg", tables), "ulog")
 
 
@@ -182,7 +198,10 @@ def test_slow_topics_are_told(tmp_path):
 def test_a_real_hexacopter_is_told():
     found = import_log(shared("px4_h520") / "3DRFlight_1.ulg", "ulog")
     said = " ".join(found.notes)
-    assert "found a hexacopter (MAV_TYPE 13), not a quadcopter" in said and "u at 31.2 Hz, held" in said
+    assert (
+        "found a hexacopter (MAV_TYPE 13), not a quadcopter" in said
+        and "u at 31.2 Hz, held" in said
+    )
 
 
 @pytest.mark.parametrize(("mav_type", "vehicle"), [(1, "a plane"), (10, "a rover")])
@@ -204,12 +223,18 @@ def test_a_helicopter_without_rate_parameters_is_told_as_one(tmp_path):
 
 
 @pytest.mark.parametrize("microseconds", [7_200_000_000, 2**32])
-def test_stamps_of_samples_from_another_clock_give_way_to_those_of_publishing(tmp_path, microseconds):
+def test_stamps_of_samples_from_another_clock_give_way_to_those_of_publishing(
+    tmp_path, microseconds
+):
     tables = topics()
     for name, (fields, rows) in tables.items():
-        sampled = [(row[0], row[0] - (microseconds if "velocity" in name else 500), *row[1:]) for row in rows]
+        sampled = [
+            (row[0], row[0] - (microseconds if "velocity" in name else 500), *row[1:])
+            for row in rows
+        ]
         later = [
-            (stamp + 2 * microseconds, sample + 2 * microseconds, *rest) for stamp, sample, *rest in sampled
+            (stamp + 2 * microseconds, sample + 2 * microseconds, *rest)
+            for stamp, sample, *rest in sampled
         ]
         tables[name] = ([("uint64_t", "timestamp_sample", 0), *fields], later)
     found = import_log(write(tmp_path / "a.ulg", tables), "ulog")

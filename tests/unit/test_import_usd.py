@@ -38,7 +38,9 @@ def test_events_of_other_rates_become_one_log(tmp_path, version):
     log = read(tmp_path, usd_log(events, version)).log
     np.testing.assert_allclose(log.time, 0.002 * np.arange(400), atol=1e-9)
     np.testing.assert_allclose(log["w"][:, 0], np.sin(time), atol=1e-9)
-    assert (log["u"][:5, 0] == -1.0).all() and log["u"][5, 0] == pytest.approx(-1.0 + 2.0 / 84)  # held
+    assert (log["u"][:5, 0] == -1.0).all() and log["u"][5, 0] == pytest.approx(
+        -1.0 + 2.0 / 84
+    )  # held
     assert log["v_bat"][[0, 150, -1], 0] == pytest.approx([3.9, 3.8, 3.7])
 
 
@@ -52,13 +54,16 @@ def test_rows_that_are_no_numbers_are_left_out_and_counted(tmp_path):
     assert len(found.log) == 48 and found.log["v_bat"] == pytest.approx(3.9)
     said = " ".join(found.notes)
     assert (
-        "2 of 50 rows of rates left out: 2 not finite" in said and "1 of 2 rows of battery left out" in said
+        "2 of 50 rows of rates left out: 2 not finite" in said
+        and "1 of 2 rows of battery left out" in said
     )
 
 
 def test_a_cut_off_or_damaged_log_is_read_to_its_end(tmp_path):
     found = read(tmp_path, usd()[:-100])
-    assert 20 <= len(found.log) < 30 and "damaged or cut off: the checksum is wrong" in found.notes[0]
+    assert (
+        20 <= len(found.log) < 30 and "damaged or cut off: the checksum is wrong" in found.notes[0]
+    )
     content = bytearray(usd())
     content[-150] ^= 1
     assert "the checksum is wrong" in read(tmp_path, bytes(content)).notes[0]
@@ -68,7 +73,9 @@ REFUSALS = {
     r"log00: found an empty file, expected a Crazyflie uSD log": b"",
     r"log00: damaged header: found version 3, expected one of 1, 2": b"\xbc\x03" + usd()[2:],
     r"damaged header: found variable gyro\.x\(s\), expected name": usd().replace(b"x(f)", b"x(s)"),
-    r"column gyro\.x: found 0 times among .*map\.toml: rates": usd().replace(b"gyro.x(f)", b"gyro.q(f)"),
+    r"column gyro\.x: found 0 times among .*map\.toml: rates": usd().replace(
+        b"gyro.x(f)", b"gyro.q(f)"
+    ),
 }
 
 
@@ -90,9 +97,13 @@ def lee_log() -> tuple[bytes, np.ndarray]:
     kr, kw, ki = (np.array(GAINS[name]) for name in ("KR", "Kw", "KI"))
     asked = reference - kr / kw * errors
     torque = kw * (asked - rates) - ki * (np.cumsum(errors, axis=0) - 0.5 * errors) * 0.004
-    names = [f"ctrlLee.{vector}{axis}" for vector in VECTORS for axis in "xyz"] + ["ctrlLee.thrustSI"]
+    names = [f"ctrlLee.{vector}{axis}" for vector in VECTORS for axis in "xyz"] + [
+        "ctrlLee.thrustSI"
+    ]
     names += [f"stateEstimateZ.{axis}" for axis in ("x", "y", "z", "vx", "vy", "vz")]
-    rows = np.column_stack([time, angles, wanted, rates, reference, torque, 0.35 + 0 * time, *[0 * time] * 6])
+    rows = np.column_stack(
+        [time, angles, wanted, rates, reference, torque, 0.35 + 0 * time, *[0 * time] * 6]
+    )
     return usd_log({"fixedFrequency": (dict.fromkeys(names, "d"), rows)}), asked
 
 
@@ -106,4 +117,6 @@ def test_torques_become_the_rates_that_the_controller_tracks(tmp_path):
     assert found.log["u"][:, 3] == pytest.approx(0.0)
     assert found.craft.mass_kg == 0.032 and "f" not in found.log
     stated = "[torque_command]\ninertia_kg_m2 = [1e-5, 1e-5, 2e-5]\nlag_s = [0.01, 0.01, 0.01]\n"
-    assert "0.001, 0.001, 0.002 N m s/rad (given)" in " ".join(read(tmp_path, content, LEE + stated).notes)
+    assert "0.001, 0.001, 0.002 N m s/rad (given)" in " ".join(
+        read(tmp_path, content, LEE + stated).notes
+    )

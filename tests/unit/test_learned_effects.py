@@ -21,7 +21,9 @@ from tests.support.simulated_flights import NOMINAL, drone_with, flown, held
 from tests.support.tables import table
 
 NO = (0.0, 0.0, 0.0)
-DRAG = Term("force", "air", (Factor("airspeed", "bump", (4.0, 1.0)),), (-2.0, 0.0, 0.0), (0.1, 0.0, 0.0))
+DRAG = Term(
+    "force", "air", (Factor("airspeed", "bump", (4.0, 1.0)),), (-2.0, 0.0, 0.0), (0.1, 0.0, 0.0)
+)
 FLAP = Term(
     "rate",
     "body",
@@ -52,7 +54,9 @@ def test_a_product_turns_the_drone() -> None:
     drone = drone_with(vel_w=(3.0, 0.0, 0.0))
     plain, law = (flown(one, held(), drone)[0] for one in ((), LearnedLaw(1.0, 0.0, Law((FLAP,)))))
     thrust = plain[8] + NOMINAL.g
-    np.testing.assert_allclose(law[13:16] - plain[13:16], [0.0, 0.01 * thrust * 3.0, 0.0], rtol=1e-4)
+    np.testing.assert_allclose(
+        law[13:16] - plain[13:16], [0.0, 0.01 * thrust * 3.0, 0.0], rtol=1e-4
+    )
 
 
 def test_time_since_the_start_acts() -> None:
@@ -109,7 +113,9 @@ def test_its_spread_can_be_drawn() -> None:
     states = [env.reset(jax.random.key(seed), params)[1] for seed in range(8)]
     spreads = [float(env.model(state, params).effect("learned_law").spread) for state in states]
     assert min(spreads) < -0.2 and max(spreads) > 0.2
-    assert all(float(env.model(state, params).effect("learned_law").scale) == 1.0 for state in states)
+    assert all(
+        float(env.model(state, params).effect("learned_law").scale) == 1.0 for state in states
+    )
 
 
 def test_every_quantity_has_a_value_and_every_shape_a_formula() -> None:
@@ -149,5 +155,7 @@ def test_a_file_with_networks_is_refused(tmp_path: Path) -> None:
     document = json.loads(path.read_text())
     document["effects"]["learned_residual"] = {"scale": 1.0, "networks": []}
     path.write_text(json.dumps(document))
-    with pytest.raises(ModelFileError, match=r"effects\.learned_residual: networks are no longer part"):
+    with pytest.raises(
+        ModelFileError, match=r"effects\.learned_residual: networks are no longer part"
+    ):
         load_model(path)

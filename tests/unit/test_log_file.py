@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 
 from flytrack_sysid.log import CHANNELS, FlightLog, LogError
 from flytrack_sysid.log_file import describe, gaps_of, load_log, save_log
-from tests.support.written_logs import NUM_ROWS, SUFFIXES, assert_same_log, columns_of, make_log, write
+from tests.support.written_logs import (
+    NUM_ROWS,
+    SUFFIXES,
+    assert_same_log,
+    columns_of,
+    make_log,
+    write,
+)
 
 
 @settings(max_examples=40, deadline=None)
@@ -51,7 +58,9 @@ def test_files_of_other_writers(tmp_path):
     log = make_log(names=("w",))
     columns = columns_of(log)
     path = tmp_path / "flight.npz"
-    np.savez_compressed(path, **{name: values.astype(np.float32) for name, values in columns.items()})
+    np.savez_compressed(
+        path, **{name: values.astype(np.float32) for name, values in columns.items()}
+    )
     np.testing.assert_allclose(load_log(path)["w"], log["w"], rtol=1e-6)
     path = tmp_path / "flight.CSV"
     write(path, columns)
@@ -64,7 +73,8 @@ def test_quaternions_drift_a_little_and_may_flip(tmp_path):
     log = make_log(names=("q",))
     factors = np.array([1.0, -1.0, 1.005, -0.995, 1.0, 1.0])[:, None]
     write(
-        tmp_path / "flight.csv", columns_of(replace(log, channels={**log.channels, "q": factors * log["q"]}))
+        tmp_path / "flight.csv",
+        columns_of(replace(log, channels={**log.channels, "q": factors * log["q"]})),
     )
     found = load_log(tmp_path / "flight.csv")["q"]
     np.testing.assert_allclose(found, np.sign(factors) * log["q"], atol=1e-12)
@@ -84,7 +94,8 @@ def test_what_would_be_refused_is_not_written(tmp_path):
 
 
 def test_gaps_are_long_steps_within_a_segment():
-    # Two flights at different rates with a pause between; one sample lost in the first, two in the second.
+    # Two flights at different rates with a pause between; one sample lost in the first, two in the
+    # second.
     first, second = np.delete(np.arange(10), 4) * 0.01, 9.0 + np.delete(np.arange(12), [6, 7]) * 0.1
     time = np.concatenate([first, second, [20.0]])
     segment = np.repeat([0, 1, 2], [len(first), len(second), 1])
@@ -92,7 +103,9 @@ def test_gaps_are_long_steps_within_a_segment():
     np.testing.assert_array_equal(gaps_of(log), [3, len(first) + 5])
     assert len(gaps_of(log.select(slice(0)))) == 0
     jitter = np.random.default_rng(0).uniform(-0.002, 0.002, 200)
-    steady = FlightLog(np.arange(200) * 0.01 + jitter, {"u": np.zeros((200, 4))}, np.zeros(200, int))
+    steady = FlightLog(
+        np.arange(200) * 0.01 + jitter, {"u": np.zeros((200, 4))}, np.zeros(200, int)
+    )
     assert len(gaps_of(steady)) == 0
     assert "gaps: none" in describe(steady)
 
@@ -112,19 +125,26 @@ def segments(*values: float) -> Callable[[dict], None]:
     return lambda columns: columns.update(segment=np.array(values))
 
 
-# What the message says after the file, {row} with the line in a CSV file; and what is done to the columns.
+# What the message says after the file, {row} with the line in a CSV file; and what is done to the
+# columns.
 BAD_COLUMNS = {
     r"column 'w_roll': unknown; .*\(known: t, segment, u_roll, ": rename("w_x", "w_roll"),
     "column t: missing; found ": rename("t", "segment"),
     "column u_yaw: missing; found t, segment, u_roll": lambda columns: columns.pop("u_yaw"),
     "column p_y: missing; found only p_x, p_z of it": lambda columns: columns.pop("p_y"),
     "{row 4}, column v_y: found '?nan'?, expected a finite number": set_cell("v_y", 4, np.nan),
-    "found no rows": lambda columns: columns.update({name: one[:0] for name, one in columns.items()}),
+    "found no rows": lambda columns: columns.update(
+        {name: one[:0] for name, one in columns.items()}
+    ),
     r"{row 4}, column t: found -1\.0, expected a later time": set_cell("t", 4, -1.0),
     r"{row 2}, column segment: found 0\.5, expected a whole number": segments(0, 0, 0.5, 1, 1, 1),
-    r"{row 3}, column segment: found 4\.0, expected each number in one piece": segments(4, 4, 2, 4, 2, 2),
+    r"{row 3}, column segment: found 4\.0, expected each number in one piece": segments(
+        4, 4, 2, 4, 2, 2
+    ),
     r"{row 0}, column q_w, q_x, q_y, q_z: found 1\.0.*, expected a quaternion of norm 1 within 0\.01": (
-        lambda columns: columns.update({f"q_{axis}": columns[f"q_{axis}"] * 1.02 for axis in "wxyz"})
+        lambda columns: columns.update(
+            {f"q_{axis}": columns[f"q_{axis}"] * 1.02 for axis in "wxyz"}
+        )
     ),
     r"{row 1}, column u_yaw: found -1\.00001, expected a command": set_cell("u_yaw", 1, -1.00001),
 }
@@ -150,7 +170,9 @@ def test_full_stick_within_rounding_is_fine(value, tmp_path):
 
 BAD_ARRAYS = {
     "w_x.npy: Object arrays cannot be loaded": np.array([print] * NUM_ROWS),
-    "column w_x: found an array of <U1, shape .* expected a row of numbers": np.array(["1"] * NUM_ROWS),
+    "column w_x: found an array of <U1, shape .* expected a row of numbers": np.array(
+        ["1"] * NUM_ROWS
+    ),
     "column w_x: found an array of complex128": np.ones(NUM_ROWS, complex),
     r"column w_x: found an array of float64, shape \(6, 1\)": np.ones((NUM_ROWS, 1)),
     "column w_x: found 5 rows, expected 6 as in t": np.ones(NUM_ROWS - 1),
@@ -166,7 +188,9 @@ BAD_TEXTS = {
     r"row 0 \(line 2\), column v_bat: found an empty cell": f"{HEADER}\n0,0,0,0,0, \n",
     "near line 1: not a CSV file": b"\xff\xfe\x00",
 }
-BAD_FILES = [(".npz", *one) for one in BAD_ARRAYS.items()] + [(".csv", *one) for one in BAD_TEXTS.items()]
+BAD_FILES = [(".npz", *one) for one in BAD_ARRAYS.items()] + [
+    (".csv", *one) for one in BAD_TEXTS.items()
+]
 BAD_FILES += [(name, "found suffix '.*', expected .npz or .csv", "") for name in (".txt", "")]
 
 

@@ -17,7 +17,12 @@ from flytrack_sysid.diagnosis.size import is_notable
 from flytrack_sysid.fit import what_is_fitted
 from flytrack_sysid.log import STATED, LogError
 from flytrack_sysid.log_motion import motion_notes, required_motion
-from flytrack_sysid.log_voltage import battery_of_craft, fitted_battery, flown_voltages, voltage_notes
+from flytrack_sysid.log_voltage import (
+    battery_of_craft,
+    fitted_battery,
+    flown_voltages,
+    voltage_notes,
+)
 from flytrack_sysid.parameters import DRAIN
 from flytrack_sysid.record import fill_gaps, make_record
 from flytrack_sysid.sensors import measure
@@ -36,11 +41,16 @@ def through_file(log: FlightLog, suffix: str, folder) -> FlightLog:
 
 
 OPERATIONS = {
-    **{suffix: lambda log, folder, suffix=suffix: through_file(log, suffix, folder) for suffix in SUFFIXES},
+    **{
+        suffix: lambda log, folder, suffix=suffix: through_file(log, suffix, folder)
+        for suffix in SUFFIXES
+    },
     "trimmed": lambda log, folder: log.select(slice(300, 900)),
     "one row of": lambda log, folder: log.select(np.arange(len(log)) == 7),
     "without": lambda log, folder: log.without("p", "a"),
-    "split and joined": lambda log, folder: joined([log.select(slice(0, 900)), log.select(slice(900, None))]),
+    "split and joined": lambda log, folder: joined(
+        [log.select(slice(0, 900)), log.select(slice(900, None))]
+    ),
     "gaps filled": lambda log, folder: fill_gaps(log.select(np.arange(len(log)) % 50 > 0)).log,
     "clocks aligned": lambda log, folder: align_clocks(log, True)[0],
     "on one clock": lambda log, folder: on_one_clock(log)[0],
@@ -65,15 +75,26 @@ def test_the_hash_is_of_the_rows_alone():
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({"measured": [2.0] * NUM_ROWS}, r"column measured: found 2\.0, expected 1 \(a real drone\) or 0"),
-        ({"measured": [1, 1, 1, 1, 0, 1]}, r"row 4.*column measured: found 0\.0, expected 1 as in row 0"),
+        (
+            {"measured": [2.0] * NUM_ROWS},
+            r"column measured: found 2\.0, expected 1 \(a real drone\) or 0",
+        ),
+        (
+            {"measured": [1, 1, 1, 1, 0, 1]},
+            r"row 4.*column measured: found 0\.0, expected 1 as in row 0",
+        ),
         ({"v_bat_low": [14.0] * NUM_ROWS}, "column v_bat_high: missing; found only v_bat_low"),
-        ({"v_bat_low": [17.0] * NUM_ROWS, "v_bat_high": [14.0] * NUM_ROWS}, "found 17 to 14 V, expected"),
+        (
+            {"v_bat_low": [17.0] * NUM_ROWS, "v_bat_high": [14.0] * NUM_ROWS},
+            "found 17 to 14 V, expected",
+        ),
     ],
 )
 def test_files_that_state_nonsense_are_refused(suffix, columns, message, tmp_path):
     path = tmp_path / f"log{suffix}"
-    write(path, columns_of(make_log()) | {name: np.array(values) for name, values in columns.items()})
+    write(
+        path, columns_of(make_log()) | {name: np.array(values) for name, values in columns.items()}
+    )
     with pytest.raises(LogError, match=message):
         load_log(path)
 
@@ -108,7 +129,13 @@ NOTES = [  # origin of the log, motion of the model, requested motion: the motio
     ),
     ("simulated", Motion.HANDOUT, None, None, []),
     ("simulated", Motion.HANDOUT, Motion.CONTINUOUS, Motion.CONTINUOUS, ["the model says handout"]),
-    (None, Motion.HANDOUT, None, None, ["motion: chosen so, since log does not say whether a drone"]),
+    (
+        None,
+        Motion.HANDOUT,
+        None,
+        None,
+        ["motion: chosen so, since log does not say whether a drone"],
+    ),
     (None, None, Motion.SEMI_IMPLICIT, Motion.SEMI_IMPLICIT, []),
 ]
 
@@ -130,7 +157,9 @@ def test_measured_logs_are_replayed_continuously(truth):
     assert what_is_fitted(log, NOMINAL)[0].motion is Motion.CONTINUOUS
     assert what_is_fitted(log, NOMINAL, motion=Motion.HANDOUT)[0].motion is Motion.HANDOUT
     parts = split(log, NOMINAL, None, None)
-    assert parts.moves.motion is parts.train.like.motion is parts.test.like.motion is Motion.CONTINUOUS
+    assert (
+        parts.moves.motion is parts.train.like.motion is parts.test.like.motion is Motion.CONTINUOUS
+    )
     assert any("the model says handout" in warning for warning in parts.warnings)
     errors, continuous = validate(NOMINAL, log), validate(CONTINUOUS, log)
     assert errors.one_step == continuous.one_step
@@ -141,7 +170,9 @@ def test_measured_logs_are_replayed_continuously(truth):
 
 
 def test_logs_of_different_origin_are_refused():
-    first, second = (replace(make_log(), origin=origin, source=str(origin)) for origin in ("measured", None))
+    first, second = (
+        replace(make_log(), origin=origin, source=str(origin)) for origin in ("measured", None)
+    )
     for refused in (lambda: joined([first, second]), lambda: diagnose_change(first, second)):
         with pytest.raises(
             LogError, match="None is not marked and measured is measured; expected logs of one"
@@ -173,7 +204,9 @@ def import_four_cells(folder, battery_v: float | None = None, voltage_v: tuple |
     force = rng.normal(0.0, 0.3, (len(time), 3))
     force[:, 2] += FORCE_PER_VOLT * (battery_v or MIDDLE_V) * (lagged(held[:, 3], 0.04) + 1.0) / 2.0
     columns = {"t": time, **dict(zip("abcd", command.T, strict=True))}
-    columns |= dict(zip(("wx", "wy", "wz", "fx", "fy", "fz"), np.column_stack([rates, force]).T, strict=True))
+    columns |= dict(
+        zip(("wx", "wy", "wz", "fx", "fy", "fz"), np.column_stack([rates, force]).T, strict=True)
+    )
     mapping = read_mapping("four_cells")
     if voltage_v is not None:
         mapping += f"voltage_v = {list(voltage_v)}\n"
@@ -187,7 +220,10 @@ def import_four_cells(folder, battery_v: float | None = None, voltage_v: tuple |
 
 def test_a_log_without_voltage_is_fitted_at_what_its_mapping_states(tmp_path):
     found = import_four_cells(tmp_path)
-    assert found.log.stated_voltage_v == FOUR_CELLS and found.nominal_model().motion is Motion.CONTINUOUS
+    assert (
+        found.log.stated_voltage_v == FOUR_CELLS
+        and found.nominal_model().motion is Motion.CONTINUOUS
+    )
     log = through_file(found.log, ".csv", tmp_path)
     np.testing.assert_array_equal(make_record(log).battery_v, MIDDLE_V)
     fitted = fit(log, found.nominal_model())
@@ -217,7 +253,8 @@ def test_validation_and_diagnosis_name_both_ranges(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("battery", "drain", "sag_v"), [(Battery(), 0.2, 0.3), (Battery(4.2, 3.2, 3.2, 4.2), 0.1, 0.0525)]
+    ("battery", "drain", "sag_v"),
+    [(Battery(), 0.2, 0.3), (Battery(4.2, 3.2, 3.2, 4.2), 0.1, 0.0525)],
 )
 def test_what_matters_is_a_share_of_the_battery(battery, drain, sag_v, truth):
     log = truth.without("v_bat")
@@ -233,11 +270,33 @@ def test_what_matters_is_a_share_of_the_battery(battery, drain, sag_v, truth):
 
 
 FOUR = Battery(16.8, 14.0, 14.2, 16.6)
-BATTERIES = [  # logged or stated voltages, the model's battery: the craft's, that of a fit, what is noted
+# logged or stated voltages, the model's battery: the craft's, that of a fit, what is noted
+BATTERIES = [
     ((14.5, 16.5), None, FOUR, FOUR, FOUR._replace(fitted_low_v=14.5, fitted_high_v=16.5), []),
-    ((13.6, 16.9), None, FOUR, FOUR, FOUR._replace(fitted_low_v=13.6, fitted_high_v=16.9), []),  # within 3 %
-    ((12.5, 16.0), None, FOUR, Battery(16.0, 12.5, 12.5, 16.0), Battery(16.0, 12.5, 12.5, 16.0), ["exceeds"]),
-    ((3.2, 4.1), None, Battery(), Battery(4.1, 3.2, 3.2, 4.1), Battery(4.1, 3.2, 3.2, 4.1), ["is outside"]),
+    (
+        (13.6, 16.9),
+        None,
+        FOUR,
+        FOUR,
+        FOUR._replace(fitted_low_v=13.6, fitted_high_v=16.9),
+        [],
+    ),  # within 3 %
+    (
+        (12.5, 16.0),
+        None,
+        FOUR,
+        Battery(16.0, 12.5, 12.5, 16.0),
+        Battery(16.0, 12.5, 12.5, 16.0),
+        ["exceeds"],
+    ),
+    (
+        (3.2, 4.1),
+        None,
+        Battery(),
+        Battery(4.1, 3.2, 3.2, 4.1),
+        Battery(4.1, 3.2, 3.2, 4.1),
+        ["is outside"],
+    ),
     (
         None,
         (3.2, 4.0),
@@ -246,8 +305,22 @@ BATTERIES = [  # logged or stated voltages, the model's battery: the craft's, th
         Battery(4.0, 3.2, 3.6, 3.6),
         ["3.6 V", "outside"],
     ),
-    (None, None, FOUR, FOUR, FOUR._replace(fitted_low_v=15.4, fitted_high_v=15.4), ["15.4 V, the middle"]),
-    (None, None, Battery(), Battery(), Battery(24.0, 22.0, 23.0, 23.0), ["23 V, the middle of the model's"]),
+    (
+        None,
+        None,
+        FOUR,
+        FOUR,
+        FOUR._replace(fitted_low_v=15.4, fitted_high_v=15.4),
+        ["15.4 V, the middle"],
+    ),
+    (
+        None,
+        None,
+        Battery(),
+        Battery(),
+        Battery(24.0, 22.0, 23.0, 23.0),
+        ["23 V, the middle of the model's"],
+    ),
 ]
 
 

@@ -35,7 +35,9 @@ def assert_same_model(a: ModelParameters, b: ModelParameters) -> None:
         nominal_parameters(),
         nominal_parameters()._replace(m=0.1, g=1.62, battery_drain_v_per_min=0.0),
         nominal_parameters().with_effects(CommandDelay(0.013), LinearDrag(0.1, 0.2, -0.05)),
-        nominal_parameters()._replace(motion=Motion.CONTINUOUS, battery=Battery(4.2, 3.4, 3.5, 4.1)),
+        nominal_parameters()._replace(
+            motion=Motion.CONTINUOUS, battery=Battery(4.2, 3.4, 3.5, 4.1)
+        ),
         nominal_parameters()._replace(thrust_coeffs=np.float32([0.1, -0.2, 1 / 3, 1e-7, 1e5, 0])),
     ],
 )
@@ -47,7 +49,9 @@ def test_round_trip(model: ModelParameters, tmp_path: Path) -> None:
     assert_same_model(load_model(str(path)), model)
     document = json.loads(path.read_text(encoding="utf-8"))
     assert document["provenance"] == provenance
-    assert set(document["parameters"]) | {"effects", "motion", "battery"} == set(ModelParameters._fields)
+    assert set(document["parameters"]) | {"effects", "motion", "battery"} == set(
+        ModelParameters._fields
+    )
     assert set(document["units"]) == set(document["parameters"]) | set(document["effects"])
 
 
@@ -69,7 +73,8 @@ def test_effects_by_hand_beside_or_among_the_parameters(tmp_path: Path) -> None:
     some = {"quadratic_drag": {"k_x": 0.1}, "command_delay": {"delay_s": 0.02}}
     for document in ({**FIELDS, "effects": some}, {"parameters": FIELDS, "effects": some}):
         path.write_text(json.dumps(document), encoding="utf-8")
-        # In the order of the list of effects, whatever the file's; neutral where the file says nothing.
+        # In the order of the list of effects, whatever the file's; neutral where the file says
+        # nothing.
         assert load_model(path).effects == (CommandDelay(0.02), QuadraticDrag(0.1, 0.0, 0.0))
     path.write_text(MINIMAL, encoding="utf-8")
     assert load_model(path).effects == ()
@@ -77,7 +82,10 @@ def test_effects_by_hand_beside_or_among_the_parameters(tmp_path: Path) -> None:
 
 BAD_VALUES = [
     *[("tau", bad, "number") for bad in ([1.0] * 3, [1.0] * 5, 1.0, "x", None, [1e39] * 4)],
-    *[("max_rate", [618.0, 618.0, bad], "a number") for bad in ("1", True, None, [1.0], float("nan"), 1e39)],
+    *[
+        ("max_rate", [618.0, 618.0, bad], "a number")
+        for bad in ("1", True, None, [1.0], float("nan"), 1e39)
+    ],
     *[("m", bad, "a number") for bad in ([1.0], "1", True, None, float("inf"), {}, [["x" * 5000]])],
     *[("m", bad, "a number above") for bad in (0, -1.0, 1e-300)],
     ("tau", [0.04, 0.04, 1e-50, 0.04], "a number above"),  # 0 in float32
@@ -91,7 +99,10 @@ BAD_FILES = [
     ({"version": 2, "parameters": FIELDS}, "version: found 2, expected 1"),
     (FIELDS | {"mass": 1}, "mass: unknown; expected one of tau, "),
     (FIELDS | {"effects": {"drag": {}}}, r"effects\.drag: unknown; expected one of comm"),
-    (FIELDS | {"effects": {"command_delay": {"delay_s": 0.07}}}, r"effects\.command_delay\.delay_s: found"),
+    (
+        FIELDS | {"effects": {"command_delay": {"delay_s": 0.07}}},
+        r"effects\.command_delay\.delay_s: found",
+    ),
 ]
 
 

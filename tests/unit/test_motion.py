@@ -28,7 +28,9 @@ PLAIN = ModelParameters(TAU, COEFFS, FULL_RATES, MASS, GRAVITY, DRAIN, motion=Mo
 DRAGGED = PLAIN.with_effects(DRAG, effects.YawReaction(0.05))
 LOOP = DRAGGED.with_effects(effects.SecondOrderRates(*[0.02] * 3, *[0.6] * 3))
 FULL = LOOP.with_effects(effects.CommandDelay(0.013))
-START = np.array([0, 0, 5, 3, -2, 1, 0, 0, 0, 0.9, 0.1, -0.3, 0.3, 0, 0, 0, 0.1, -0.2, 0.3, 0.2, 23.5])
+START = np.array(
+    [0, 0, 5, 3, -2, 1, 0, 0, 0, 0.9, 0.1, -0.3, 0.3, 0, 0, 0, 0.1, -0.2, 0.3, 0.2, 23.5]
+)
 START[9:13] /= np.linalg.norm(START[9:13])
 START[13:16] = np.radians(FULL_RATES) * START[16:19]
 AT_REST = state_of(HiddenDrone(Truth(TAU, COEFFS), LOW_START, np.random.default_rng(0)))
@@ -41,7 +43,9 @@ def held_commands() -> np.ndarray:
     return commands
 
 
-def flown(model: ModelParameters, dt: float, start: Any = START) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def flown(
+    model: ModelParameters, dt: float, start: Any = START
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return states (num_steps, 21), gyro and accelerometer readings (num_steps, 3) at steps of ``dt``."""
     commands = np.repeat(held_commands(), round(COMMAND_S / dt), axis=0)
     with jax.enable_x64(True):
@@ -72,8 +76,9 @@ def errors(model: ModelParameters, dt: float, exact: tuple[np.ndarray, ...]) -> 
     return np.array([np.abs(one - other).max() for one, other in zip(found, exact, strict=True)])
 
 
-# Largest errors of position, m, velocity, m/s, attitude and specific force, m/s^2, at steps of 10 ms; and how
-# many times smaller they are at 5 ms. A delay ends anywhere within a step: its error shrinks unevenly.
+# Largest errors of position, m, velocity, m/s, attitude and specific force, m/s^2, at steps of 10
+# ms; and how many times smaller they are at 5 ms. A delay ends anywhere within a step: its error
+# shrinks unevenly.
 @pytest.mark.parametrize(
     ("model", "most", "least_order"),
     [
@@ -130,7 +135,9 @@ def test_late_readings_are_those_of_a_moment_within_a_step(late_ms):
 def test_a_step_is_differentiable_and_batched(motion):
     def height(tau: jax.Array, stick: jax.Array) -> jax.Array:
         model = PLAIN._replace(tau=tau, motion=motion)
-        return move(unpack(jnp.asarray(START)), (), Action(0.1, 0.2, 0.3, stick), 0.01, model).after.vel_w.z
+        return move(
+            unpack(jnp.asarray(START)), (), Action(0.1, 0.2, 0.3, stick), 0.01, model
+        ).after.vel_w.z
 
     with jax.enable_x64(True):
         sticks = jnp.array([-0.5, 0.5])

@@ -40,7 +40,9 @@ def starts(seed, params=PARAMS):
 
 
 def with_drones(states, drones):
-    return states._replace(inner=states.inner._replace(plant=states.inner.plant._replace(drone=drones)))
+    return states._replace(
+        inner=states.inner._replace(plant=states.inner.plant._replace(drone=drones))
+    )
 
 
 def places_moved(tree, order):
@@ -62,7 +64,9 @@ def test_one_drone_flies_bit_for_bit_as_in_the_single_environment():
         alone_states, states = expected[1], flown[1]
         for one, other in zip((flown[0], *flown[2:5]), (expected[0], *expected[2:5]), strict=True):
             np.testing.assert_array_equal(one[:, 0], other)
-        np.testing.assert_array_equal(flown[5]["final_observation"][:, 0], expected[5]["final_observation"])
+        np.testing.assert_array_equal(
+            flown[5]["final_observation"][:, 0], expected[5]["final_observation"]
+        )
         num_ended += int(flown[5]["race_over"].sum())
     assert num_ended > 5
 
@@ -101,8 +105,12 @@ def test_drones_far_apart_fly_as_alone():
 def test_no_collision_passes_between_two_steps(direction, other_direction, offset, moment):
     """Two drones at 30 m/s that touch at some moment of the step do not get past each other."""
     fast = 30.0 * 0.01
-    moves = [fast * np.array(one) / max(np.linalg.norm(one), 1e-3) for one in (direction, other_direction)]
-    apart = 0.29 * np.array(offset) / max(np.linalg.norm(offset), 1.0)  # at that moment, within a diameter
+    moves = [
+        fast * np.array(one) / max(np.linalg.norm(one), 1e-3)
+        for one in (direction, other_direction)
+    ]
+    # At that moment, within a diameter.
+    apart = 0.29 * np.array(offset) / max(np.linalg.norm(offset), 1.0)
     paths = [
         Path(Vec3(*(at - moment * move)), Vec3(*(at + (1.0 - moment) * move)))
         for at, move in zip((np.zeros(3), apart), moves, strict=True)
@@ -129,7 +137,9 @@ def test_a_collision_puts_out_and_costs_what_a_crash_costs():
     vel_w = Vec3(0 * y, jnp.broadcast_to(jnp.array([5.0, -5.0, 0.0]), y.shape), 0 * y)
     states = with_drones(states, drone._replace(pos_w=drone.pos_w._replace(y=y), vel_w=vel_w))
     idle = jnp.zeros((RACES, DRONES, 4))
-    missed = step_all(states, idle, params._replace(rules=params.rules._replace(collision_radius=0.01)))
+    missed = step_all(
+        states, idle, params._replace(rules=params.rules._replace(collision_radius=0.01))
+    )
     flown = step_all(states, idle, params)
     hit = np.array([True, True, False])
     np.testing.assert_array_equal(flown[5]["collision"], np.tile(hit, (RACES, 1)))
@@ -137,7 +147,9 @@ def test_a_collision_puts_out_and_costs_what_a_crash_costs():
     cost = np.where(hit, params.flight.reward.termination, 0.0)
     np.testing.assert_allclose(flown[2] - missed[2], np.tile(cost, (RACES, 1)), atol=1e-5)
     after = step_all(flown[1], jnp.ones((RACES, DRONES, 4)), params)
-    assert (after[2][:, :2] == 0.0).all() and after[3][:, :2].all() and not after[5]["collision"].any()
+    assert (
+        (after[2][:, :2] == 0.0).all() and after[3][:, :2].all() and not after[5]["collision"].any()
+    )
     x, x_after = (one[1].inner.plant.drone.pos_w.x for one in (flown, after))
     np.testing.assert_array_equal(x[:, :2], x_after[:, :2])
 
@@ -163,7 +175,12 @@ def test_opponents_are_seen_nearest_first_in_the_gate_frame():
 
 
 def test_ranks_are_by_progress_and_those_that_are_out_come_last():
-    field = [standing(0, 2.5), standing(0, 4.0, is_out=True), standing(0, 3.0), standing(0, 1.0, is_out=True)]
+    field = [
+        standing(0, 2.5),
+        standing(0, 4.0, is_out=True),
+        standing(0, 3.0),
+        standing(0, 1.0, is_out=True),
+    ]
     ranks = [int(rank_of(one, [other for other in field if other is not one])) for one in field]
     assert ranks == [2, 3, 1, 4]
 
@@ -175,11 +192,16 @@ def test_a_ghost_flies_its_line_and_stops_for_nobody():
     length_m = np.linalg.norm(np.diff(states[:380, :3], axis=0), axis=1).sum()
     assert 40.0 < length_m < 120.0 and (np.diff(states[:, 3]) > -0.5).all()
     lap = shipped_reference("flytrack", "standing").time_s
-    assert abs(0.01 * np.argmax(states[:, 3] >= env.race.env.default_params.course.num_gates) - lap) < 0.03
+    assert (
+        abs(0.01 * np.argmax(states[:, 3] >= env.race.env.default_params.course.num_gates) - lap)
+        < 0.03
+    )
     observation, state = env.reset(jax.random.key(0))
     behind = []
     for step in range(60):
-        observation, state, *_, info = env.step(jax.random.key(step), state, jnp.array([0.0, 0.0, 0.0, -0.2]))
+        observation, state, *_, info = env.step(
+            jax.random.key(step), state, jnp.array([0.0, 0.0, 0.0, -0.2])
+        )
         behind.append(-float(info["gap_gates"]))
         assert not info["race_over"]
     assert behind[-1] > 0.5 and info["rank"] == 2
@@ -210,7 +232,9 @@ def test_drones_that_would_have_flown_on_are_truncated_when_the_race_is_over():
 
 def test_a_view_refuses_what_does_not_fit():
     def make_view(count, size, over="first"):
-        return Versus(MultiDroneRace(RACE.env, 2, over), [idle(RACE)._replace(observation_size=size)] * count)
+        return Versus(
+            MultiDroneRace(RACE.env, 2, over), [idle(RACE)._replace(observation_size=size)] * count
+        )
 
     for arguments, message in (
         ((2, 29), "opponents: found 2, expected 1"),
@@ -249,7 +273,9 @@ def test_a_learner_meets_its_opponents_alone_and_in_a_batch():
     np.testing.assert_allclose(batch[0], by_hand[0][:, 0], atol=2e-5)
 
 
-@pytest.mark.filterwarnings("ignore:The old environment creation API")  # PettingZoo's own, in its tests
+@pytest.mark.filterwarnings(
+    "ignore:The old environment creation API"
+)  # PettingZoo's own, in its tests
 def test_pettingzoo_accepts_the_race():
     pytest.importorskip("pettingzoo")
     from pettingzoo.test import parallel_api_test

@@ -12,7 +12,9 @@ from flytrack_sysid.log import FlightLog
 
 BLOCKS, TRIMMED = 60, 0.1
 GIVEN, OWN = [0, 1], [2, 3]
-AFTER = (np.arange(BLOCKS) >= np.arange(6, 55)[:, None]).astype(float)  # a tenth is left on each side
+AFTER = (np.arange(BLOCKS) >= np.arange(6, 55)[:, None]).astype(
+    float
+)  # a tenth is left on each side
 
 
 def scores(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -44,7 +46,9 @@ def test_a_slow_drift_gains_more_as_a_drift_than_as_a_step():
 def test_only_logs_of_one_clock_can_show_when():
     channels = {"u": np.zeros((4, 4))}
     for time, expected in (([0.0, 1.0, 5.0, 6.0], True), ([0.0, 1.0, 0.0, 1.0], False)):
-        assert is_one_flight(FlightLog(np.array(time), channels, np.array([0, 0, 1, 1]))) is expected
+        assert (
+            is_one_flight(FlightLog(np.array(time), channels, np.array([0, 0, 1, 1]))) is expected
+        )
 
 
 FREE = ("given", "first", "second")

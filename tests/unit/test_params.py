@@ -46,7 +46,9 @@ def test_ends_of_ranges_pass_and_what_lies_beyond_is_refused(name: str) -> None:
     for value in (below, above, np.nan, np.inf, -np.inf):
         wrong = np.full(shape, attrgetter(name)(PARAMS), float)
         wrong.reshape(-1)[-1] = value
-        with pytest.raises(ValueError, match=rf"(?s)^{name}: found .* to .* {re.escape(bounds.unit)}$"):
+        with pytest.raises(
+            ValueError, match=rf"(?s)^{name}: found .* to .* {re.escape(bounds.unit)}$"
+        ):
             with_value(name, wrong).check()
 
 

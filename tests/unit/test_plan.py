@@ -23,7 +23,9 @@ MODEL = nominal_parameters()
 GYRO, FORCE, ATTITUDE, VELOCITY, VOLTAGE = 0.1, 1.5, 0.009, 0.05, 0.01  # rad/s, m/s^2, rad, m/s, V
 LITTLE, SHORT_S = 0.05, 0.3  # what wanders, over the sensors' noise, and how long it lasts
 DIRECT, LEVEL = [GYRO] * 3 + [FORCE] * 3 + [1.0], [ATTITUDE] * 3 + [VELOCITY] * 3 + [VOLTAGE]
-NOISE = np.log([DIRECT, LEVEL, [LITTLE] * 7, [LITTLE] * 7, [SHORT_S] * 7, [1.0] * 7])  # as a problem has it
+NOISE = np.log(
+    [DIRECT, LEVEL, [LITTLE] * 7, [LITTLE] * 7, [SHORT_S] * 7, [1.0] * 7]
+)  # as a problem has it
 WANTED = {
     "wind": ("thrust_tilt", "accelerometer_bias"),
     "thrust_tilt": ("wind",),
@@ -90,4 +92,6 @@ def test_what_is_advised_shows_once_it_is_flown(hover):
     for effect, alike in WANTED.items():
         question = Question(hover.linearization, hover.model, effect, alike)
         before, after = question.shares()[0], question.shares(told(advice[effect]))[0]
-        assert before < 1.0 <= after, f"{effect}: {before} before and {after} after {advice[effect]}"
+        assert before < 1.0 <= after, (
+            f"{effect}: {before} before and {after} after {advice[effect]}"
+        )

@@ -26,11 +26,15 @@ def logs() -> dict[str, FlightLog]:
 
 
 def scaled(channel: str, factor: float | list[float]) -> Change:
-    return lambda log: replace(log, channels={**log.channels, channel: log[channel] * np.array(factor)})
+    return lambda log: replace(
+        log, channels={**log.channels, channel: log[channel] * np.array(factor)}
+    )
 
 
 def constant(channel: str, values: list[float]) -> Change:
-    return lambda log: replace(log, channels={**log.channels, channel: np.tile(values, (len(log), 1))})
+    return lambda log: replace(
+        log, channels={**log.channels, channel: np.tile(values, (len(log), 1))}
+    )
 
 
 def columns(channel: str) -> str:
@@ -40,7 +44,11 @@ def columns(channel: str) -> str:
 # What is done to a log -> the columns that the one problem names, and what else it says.
 WRONG = {
     "w in deg/s": (scaled("w", 180 / np.pi), columns("w"), "looks like deg/s"),
-    "t in ms": (lambda log: replace(log, time=1e3 * log.time), "t", "median step of 10, .* looks like ms"),
+    "t in ms": (
+        lambda log: replace(log, time=1e3 * log.time),
+        "t",
+        "median step of 10, .* looks like ms",
+    ),
     "q world to body": (scaled("q", [1.0, -1.0, -1.0, -1.0]), columns("q"), "looks like world to"),
     "q stuck": (constant("q", [1.0, 0.0, 0.0, 0.0]), columns("q"), "the attitude looks stuck"),
     "v_bat in mV": (scaled("v_bat", 1000.0), "v_bat", "looks like mV$"),
@@ -53,7 +61,11 @@ WRONG = {
         "gravity looks left in",
     ),
     "commands stuck": (constant("u", [0.0] * 4), columns("u"), "look stuck"),
-    "too few seconds": (lambda log: log.select(log.time < 0.06), "t", r"found \d+ rows and \d\.\d+ s, "),
+    "too few seconds": (
+        lambda log: log.select(log.time < 0.06),
+        "t",
+        r"found \d+ rows and \d\.\d+ s, ",
+    ),
     "too few rows": (lambda log: log.select(slice(0, FEWEST_ROWS - 1)), "t", "found 99 rows"),
 }
 
@@ -82,7 +94,9 @@ def turned(channel: str, change: Callable[[Rotation], Rotation]) -> Change:
     """Return a change of an attitude."""
 
     def apply(log: FlightLog) -> FlightLog:
-        quat = change(Rotation.from_quat(log[channel], scalar_first=True)).as_quat(scalar_first=True)
+        quat = change(Rotation.from_quat(log[channel], scalar_first=True)).as_quat(
+            scalar_first=True
+        )
         return replace(log, channels={**log.channels, channel: quat})
 
     return apply
@@ -119,7 +133,9 @@ def test_channels_that_contradict_each_other_are_read_right(name, noise, truth):
     log = replace(right, channels={**right.channels, "u": np.clip(right["u"], -1.0, 1.0)})
     assert find_problems(log) == []
     (problem,) = find_problems(change(log))
-    assert f": {columns(channel)}: found motion that contradicts itself" in problem and text in problem
+    assert (
+        f": {columns(channel)}: found motion that contradicts itself" in problem and text in problem
+    )
     with pytest.raises(LogError, match="contradicts itself"):
         check_plausible(change(log))
 
@@ -133,7 +149,9 @@ def test_right_logs_of_any_noise_contradict_nothing(truth):
         shaken = noisy(log, seed)
         channels = {name: log[name] + factor * (shaken[name] - log[name]) for name in log.channels}
         channels["q"] /= np.linalg.norm(channels["q"], axis=1, keepdims=True)
-        num_wrong += any("contradict" in one for one in find_problems(replace(log, channels=channels)))
+        num_wrong += any(
+            "contradict" in one for one in find_problems(replace(log, channels=channels))
+        )
     assert num_wrong == 0
 
 
@@ -142,7 +160,12 @@ def test_all_problems_are_listed(logs):
     for wrong in ("t in ms", "w in deg/s", "v_bat in mV", "f in g"):
         log = WRONG[wrong][0](log)
     problems = find_problems(log)
-    assert [problem.split(": ")[1] for problem in problems] == ["t", columns("w"), columns("f"), "v_bat"]
+    assert [problem.split(": ")[1] for problem in problems] == [
+        "t",
+        columns("w"),
+        columns("f"),
+        "v_bat",
+    ]
     with pytest.raises(LogError) as error:
         check_plausible(log)
     assert str(error.value).splitlines() == problems

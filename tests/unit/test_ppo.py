@@ -49,7 +49,9 @@ class Probe(environment.Environment):
         return jnp.zeros(2), ProbeState(time=jnp.int32(0))
 
     def action_space(self, params):
-        return spaces.Discrete(self.num_choices) if self.num_choices else spaces.Box(-1.0, 1.0, (1,))
+        return (
+            spaces.Discrete(self.num_choices) if self.num_choices else spaces.Box(-1.0, 1.0, (1,))
+        )
 
 
 def tiny(**changes) -> Config:
@@ -70,7 +72,9 @@ def train(env, params=None, **changes):
     """Return the trained network and its parameters."""
     config, params = tiny(**changes), env.default_params if params is None else params
     # Compiling takes all of the time, so that optimising does not pay.
-    train = jax.jit(make_train(env, params, config), compiler_options={"xla_backend_optimization_level": 0})
+    train = jax.jit(
+        make_train(env, params, config), compiler_options={"xla_backend_optimization_level": 0}
+    )
     runner, _ = train(jax.random.key(0))
     return ppo.make_network_for(env, params, config), runner.train_state.params
 
@@ -83,15 +87,20 @@ ALL_OFF = {"min_std": 0.0, **dict.fromkeys(SWITCHES, False)}
 
 # The clock is hidden, so a constant reward of 1 has one value: 1 / (1 - gamma) if it never ends.
 @pytest.mark.parametrize(
-    ("changes", "expected", "near"), [({}, 10.0, 0.05), (ALL_OFF, VALUE_OF_EIGHT, 0.1)], ids=["on", "all off"]
+    ("changes", "expected", "near"),
+    [({}, 10.0, 0.05), (ALL_OFF, VALUE_OF_EIGHT, 0.1)],
+    ids=["on", "all off"],
 )
 def test_value_bootstraps_through_truncation_unless_switched_off(changes, expected, near):
     network, params = train(Probe(terminates=False), **changes)
-    assert float(network.apply(params, jnp.zeros(2), method="value")) == pytest.approx(expected, rel=near)
+    assert float(network.apply(params, jnp.zeros(2), method="value")) == pytest.approx(
+        expected, rel=near
+    )
 
 
 def test_memory_tells_what_no_observation_shows():
-    # Reward 1 on the last of three steps, to be counted, from 0 again after every reset: values 0.81, 0.9, 1.
+    # Reward 1 on the last of three steps, to be counted, from 0 again after every reset: values
+    # 0.81, 0.9, 1.
     env = Probe(True, reward=lambda time, action, length: time == length - 1)
     network, params = train(env, ProbeParams(max_steps_in_episode=3), memory_size=8)
     unseen, first = jnp.zeros((1, 6, 2)), network.first_memory((1, 6))
@@ -129,7 +138,9 @@ def test_gae_equals_the_definition():
     reward, value = rng.normal(size=(2, 6, 3))
     done = rng.random((6, 3)) < 0.3
     last_value, gamma, lam = rng.normal(size=3), 0.97, 0.9
-    batch = ppo.Batch((), None, None, None, jnp.asarray(value), jnp.asarray(reward), jnp.asarray(done))
+    batch = ppo.Batch(
+        (), None, None, None, jnp.asarray(value), jnp.asarray(reward), jnp.asarray(done)
+    )
     found = ppo.generalized_advantages(batch, jnp.asarray(last_value), gamma, lam)
     next_value = np.concatenate([value[1:], last_value[None]])
     delta = reward + gamma * next_value * ~done - value

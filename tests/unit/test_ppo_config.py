@@ -29,9 +29,13 @@ def test_every_field_comes_back_from_toml_and_json(tmp_path):
     path = tmp_path / "run.toml"
     path.write_text("".join(f"{name} = {json.dumps(value)}\n" for name, value in OTHER.items()))
     assert read_config_file(path) == Config(**OTHER)
-    assert read_config("config", json.loads(json.dumps(Config(**OTHER).as_json()))) == Config(**OTHER)
+    assert read_config("config", json.loads(json.dumps(Config(**OTHER).as_json()))) == Config(
+        **OTHER
+    )
     path.write_text("seed = 1")
-    with pytest.raises(ConfigError, match=r"run\.toml: seed: unknown; expected one of total_timesteps, "):
+    with pytest.raises(
+        ConfigError, match=r"run\.toml: seed: unknown; expected one of total_timesteps, "
+    ):
         read_config_file(path)
 
 
@@ -51,7 +55,10 @@ def test_settings_that_cannot_be_trained_with_are_refused(tmp_path, content, mes
             {"hidden_sizes": (2**40,)},
             r"hidden_sizes\[0\]: found 1099511627776, expected a whole number .*up to 65536",
         ),
-        ({"memory_size": 2**40}, "memory_size: found 1099511627776, expected a whole number .*up to 65536"),
+        (
+            {"memory_size": 2**40},
+            "memory_size: found 1099511627776, expected a whole number .*up to 65536",
+        ),
         ({"num_envs": object()}, "num_envs: found '<object.*, expected a whole number"),
     ],
 )

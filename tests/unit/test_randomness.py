@@ -15,7 +15,9 @@ NUM_DRAWS = 1_000_000
 def normals() -> dict[str, np.ndarray]:
     """Draws under two names from a million words."""
     words = jax.random.bits(jax.random.key(0), (NUM_DRAWS,))
-    draw = jax.jit(jax.vmap(lambda word, name: Draws(word).normal(name), in_axes=(0, None)), static_argnums=1)
+    draw = jax.jit(
+        jax.vmap(lambda word, name: Draws(word).normal(name), in_axes=(0, None)), static_argnums=1
+    )
     return {name: np.asarray(draw(words, name), float) for name in ("position_0", "rates_2")}
 
 
@@ -38,18 +40,33 @@ def test_names_and_steps_are_independent(normals: dict[str, np.ndarray]) -> None
         chain.append(int(word))
         word = next_word(word)
     assert len(set(chain)) == 2000
-    series = np.asarray(jax.vmap(lambda word: Draws(word).normal("a"))(jnp.array(chain, jnp.uint32)))
+    series = np.asarray(
+        jax.vmap(lambda word: Draws(word).normal("a"))(jnp.array(chain, jnp.uint32))
+    )
     for lag in (1, 2, 3):
         assert abs(np.corrcoef(series[lag:], series[:-lag])[0, 1]) < 0.08
 
 
 # --- Uniform draws and words ------------------------------------------------------------------------
 
-NAMES = ("kind", "gate", "roll", "pitch", "along", "offset_x", "offset_y", "speed", "yaw", "battery")
+NAMES = (
+    "kind",
+    "gate",
+    "roll",
+    "pitch",
+    "along",
+    "offset_x",
+    "offset_y",
+    "speed",
+    "yaw",
+    "battery",
+)
 NUM_WORDS = 20_000
 WORDS = {
     "of keys": lambda: jax.vmap(seed_of)(jax.random.split(jax.random.key(0), NUM_WORDS)),
-    "of counted keys": lambda: jax.vmap(lambda i: seed_of(jax.random.key(i)))(jnp.arange(NUM_WORDS)),
+    "of counted keys": lambda: jax.vmap(lambda i: seed_of(jax.random.key(i)))(
+        jnp.arange(NUM_WORDS)
+    ),
     "of one key": lambda: seeds_of(seed_of(jax.random.key(0)), jnp.arange(NUM_WORDS)),
     "of a counter": lambda: jnp.arange(NUM_WORDS, dtype=jnp.uint32),
 }
@@ -59,7 +76,9 @@ WORDS = {
 def test_draws_are_uniform_and_uncorrelated(source: str) -> None:
     words = WORDS[source]()
     assert words.dtype == jnp.uint32
-    draw_all = jax.vmap(lambda word: jnp.stack([Draws(word).uniform(name, 0.0, 1.0) for name in NAMES]))
+    draw_all = jax.vmap(
+        lambda word: jnp.stack([Draws(word).uniform(name, 0.0, 1.0) for name in NAMES])
+    )
     values = np.asarray(jax.jit(draw_all)(words), float)
     assert values.min() >= 0.0 and values.max() < 1.0
     for column in values.T:

@@ -47,14 +47,24 @@ def dragged():
 
 def test_values_are_refined_by_flights(dragged):
     *_, problem, found = dragged
-    assert [one.effect for one in found.kept] == ["linear_drag", "accelerometer_bias"] and not found.removed
+    assert [one.effect for one in found.kept] == [
+        "linear_drag",
+        "accelerometer_bias",
+    ] and not found.removed
     half_widths = dict(zip(found.fit.places, found.fit.half_widths, strict=True))
     for name, value in TRUE_DRAG.items():
         place = problem.names.index(f"linear_drag.{name}")
         assert abs(found.fit.vector[place] - value) < max(1.5 * half_widths[place], 0.05 * value)
-    assert found.fit.vector[problem.names.index("accelerometer_bias.x")] == 0.3  # no flight shows it
-    assert found.vector_without("accelerometer_bias")[problem.names.index("accelerometer_bias.x")] == 0.0
-    assert found.removal_costs["linear_drag"] > 0.1 and "accelerometer_bias" not in found.removal_costs
+    assert (
+        found.fit.vector[problem.names.index("accelerometer_bias.x")] == 0.3
+    )  # no flight shows it
+    assert (
+        found.vector_without("accelerometer_bias")[problem.names.index("accelerometer_bias.x")]
+        == 0.0
+    )
+    assert (
+        found.removal_costs["linear_drag"] > 0.1 and "accelerometer_bias" not in found.removal_costs
+    )
     assert found.judge.worst_ratio(found.fit.vector) < 1.0
 
 
@@ -81,11 +91,15 @@ def circle() -> FlightLog:
     zero = np.zeros_like(phase)
     pos_w = RADIUS_M * np.stack([np.cos(phase), np.sin(phase), zero + 1.0], axis=1)
     vel_w = speed * np.stack([-np.sin(phase), np.cos(phase), zero], axis=1)
-    quat = Rotation.from_rotvec(phase[:, None] * np.array([0.0, 0.0, 1.0])).as_quat(scalar_first=True)
+    quat = Rotation.from_rotvec(phase[:, None] * np.array([0.0, 0.0, 1.0])).as_quat(
+        scalar_first=True
+    )
     rates_b = np.stack([zero, zero, zero + 2.0 * np.pi / CIRCLE_S], axis=1)
     commands = np.clip(0.3 * rng.standard_normal((len(time), 4)), -1.0, 1.0)
     channels = {"u": commands, "p": pos_w, "v": vel_w, "q": quat, "w": rates_b}
-    noisy = {name: values + 1e-3 * rng.standard_normal(values.shape) for name, values in channels.items()}
+    noisy = {
+        name: values + 1e-3 * rng.standard_normal(values.shape) for name, values in channels.items()
+    }
     return FlightLog(time, noisy | {"u": commands}, np.zeros(len(time), int))
 
 

@@ -71,7 +71,9 @@ def test_animation_shows_the_flying_lap_beside_the_time_optimal_one(tmp_path, mo
     track = load_track("flytrack")
     references = shipped_references(track, ("nominal",))
     states, commands = (np.asarray(part, np.float32) for part in ghost_rollout(references, 820))
-    path = write_animation(make_flight("ghost", states, commands, track), references["flying"], tmp_path)
+    path = write_animation(
+        make_flight("ghost", states, commands, track), references["flying"], tmp_path
+    )
     assert path == tmp_path / "ghost.gif" and path.stat().st_size < 900 * 2**10
     with Image.open(io.BytesIO(path.read_bytes())) as gif:
         assert gif.size == (840, 480) and gif.n_frames == 8

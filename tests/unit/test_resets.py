@@ -26,7 +26,9 @@ def sample(env: FlyTrack, params: EnvParams):
         keys = jax.random.split(jax.random.key(0), NUM_STARTS)
         _, state = reset_many(keys, params.replace(reset=ResetParams(**fields)))
         assert not np.asarray(state.time).any()
-        return np.asarray(jax.vmap(pack)(state.plant.drone), float), np.asarray(state.race.gate_index)
+        return np.asarray(jax.vmap(pack)(state.plant.drone), float), np.asarray(
+            state.race.gate_index
+        )
 
     return draw
 

@@ -15,7 +15,9 @@ MODEL = nominal_parameters()._replace(tau=TAU)
 
 def test_a_first_order_lag_takes_ln_2_of_its_time_constant_and_delays_add() -> None:
     np.testing.assert_allclose(half_response_s(MODEL), TAU * np.log(2.0), atol=1e-5)
-    late = MODEL.with_effects(effects.CommandDelay(0.0137, 0.021, -0.02), effects.ThrustLagAsymmetry(2.0))
+    late = MODEL.with_effects(
+        effects.CommandDelay(0.0137, 0.021, -0.02), effects.ThrustLagAsymmetry(2.0)
+    )
     np.testing.assert_allclose(
         half_response_s(late), TAU * np.log(2.0) + [0.0137, 0.0137, 0.0347, 0], atol=1e-5
     )
@@ -35,16 +37,22 @@ def test_a_second_order_behind_the_lag(lag_s: float, damping: float) -> None:
 def test_a_limit_on_acceleration_delays_large_steps_only() -> None:
     full_s, tau = 0.2, TAU[0]
     model = MODEL.with_effects(
-        effects.RateSlewLimit(roll_s=full_s), effects.RateExpo(yaw=0.4), effects.LinearDrag(0.5, 0.5, 0.5)
+        effects.RateSlewLimit(roll_s=full_s),
+        effects.RateExpo(yaw=0.4),
+        effects.LinearDrag(0.5, 0.5, 0.5),
     )
     small, full = half_response_s(model), half_response_s(model, FULL_STEP)
     half = brentq(lambda t: (t - tau * (1.0 - np.exp(-t / tau))) / full_s - 0.5, 0.0, full_s)
-    assert full[0] == pytest.approx(half, abs=1e-4) and small[0] == pytest.approx(tau * np.log(2.0), abs=3e-4)
+    assert full[0] == pytest.approx(half, abs=1e-4) and small[0] == pytest.approx(
+        tau * np.log(2.0), abs=3e-4
+    )
     np.testing.assert_allclose(full[1:3], small[1:3], atol=1e-5)  # the curve comes before the lag
 
 
 def test_what_turns_the_drone_anyway_and_what_its_sensors_read_do_not_matter() -> None:
-    still = MODEL.with_effects(effects.MotorImbalance(0.01, -0.02), effects.GyroScale(1.1, 0.9, 1.0))
+    still = MODEL.with_effects(
+        effects.MotorImbalance(0.01, -0.02), effects.GyroScale(1.1, 0.9, 1.0)
+    )
     np.testing.assert_allclose(half_response_s(still), half_response_s(MODEL), atol=1e-7)
 
 

@@ -48,7 +48,9 @@ def flown(env: Any, is_constant: bool) -> Any:
     def fly(params: Any) -> Any:
         _, states = jax.vmap(env.reset, in_axes=(0, None))(keys, params)
         step = jax.vmap(env.step, in_axes=(0, 0, 0, None))
-        return jax.lax.scan(lambda states, action: step(keys, states, action, params)[1::-1], states, actions)
+        return jax.lax.scan(
+            lambda states, action: step(keys, states, action, params)[1::-1], states, actions
+        )
 
     run = jax.jit(lambda: fly(params)) if is_constant else partial(jax.jit(fly), params)
     return jax.block_until_ready(run())
@@ -60,7 +62,9 @@ def test_the_kernel_is_the_same_step(monkeypatch: pytest.MonkeyPatch, name: str)
     monkeypatch.setenv(SWITCH, "0")
     without = flown(VARIANTS[name](), is_constant=False)
     leaves = jax.tree_util.tree_leaves_with_path(without)
-    sizes = {jax.tree_util.keystr(path): max(float(np.abs(leaf).max()), 1.0) for path, leaf in leaves}
+    sizes = {
+        jax.tree_util.keystr(path): max(float(np.abs(leaf).max()), 1.0) for path, leaf in leaves
+    }
     for found, (path, expected) in zip(jax.tree.leaves(with_kernel), leaves, strict=True):
         # A bend is a second difference of forces, and rounds as they do.
         size = sizes[jax.tree_util.keystr(path).replace("force_bends_b", "forces_b")]
@@ -94,7 +98,9 @@ TRANSFORMS = {
     "jit": jax.jit,
     "vmap": lambda f: lambda x: jax.vmap(f)(jnp.stack([x, x]))[1],
     "jit of vmap": lambda f: lambda x: jax.jit(jax.vmap(f))(jnp.stack([x, x]))[1],
-    "vmap along the last axis": lambda f: lambda x: jax.vmap(f, -1, -1)(jnp.stack([x, x], -1))[..., 1],
+    "vmap along the last axis": lambda f: (
+        lambda x: jax.vmap(f, -1, -1)(jnp.stack([x, x], -1))[..., 1]
+    ),
     "scan": lambda f: lambda x: jax.lax.scan(lambda c, _: (f(c), None), x, None, length=3)[0],
     "cond": lambda f: lambda x: jax.lax.cond(jnp.asarray(True), f, lambda y: y, x),
     "remat": jax.checkpoint,
@@ -114,7 +120,9 @@ def test_identity(leaf: str, transform: str) -> None:
 
 def swung(x: jax.Array, steps: jax.Array, unread: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return what a loop of simple operations makes of numbers; the last one is not read."""
-    return jax.lax.fori_loop(0, 3, lambda _, y: jnp.where(y > 0.3, jnp.sin(y), y * steps), x), x + 1.0
+    return jax.lax.fori_loop(
+        0, 3, lambda _, y: jnp.where(y > 0.3, jnp.sin(y), y * steps), x
+    ), x + 1.0
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -155,7 +163,9 @@ def test_what_only_xla_finds_unread_and_constants_abort_no_process() -> None:
         np.testing.assert_allclose(
             jax.jit(one_kernel(found))(own, unread, one, two, two), expected, rtol=1e-5
         )
-        constant = jax.jit(lambda own=own, unread=unread: one_kernel(found)(own, unread, one, two, two))()
+        constant = jax.jit(
+            lambda own=own, unread=unread: one_kernel(found)(own, unread, one, two, two)
+        )()
         np.testing.assert_allclose(constant, expected, rtol=1e-5)
 
 

@@ -44,8 +44,8 @@ def replace_stamps(values: list[float], first: int = ROW) -> Callable[[np.ndarra
 class Fault(NamedTuple):
     """A fault of a clock.
 
-    apply: from right stamps to those that are written, s. num_lost: rows that cannot be used. segments: rows
-    of each segment. said: parts of a note. error_s: of the times that are read.
+    apply: from right stamps to those that are written, s. num_lost: rows that cannot be used.
+    segments: rows of each segment. said: parts of a note. error_s: of the times that are read.
     """
 
     apply: Callable[[np.ndarray], np.ndarray]
@@ -58,7 +58,11 @@ class Fault(NamedTuple):
 def lost(num_rows: int, reason: str = "with a stamp far from their neighbours'") -> dict[str, Any]:
     """Return what is expected where a number of rows is left out."""
     said = f"{num_rows} of {NUM_ROWS} rows"
-    return {"num_lost": num_rows, "segments": (NUM_ROWS - num_rows,), "said": f"{said}|{num_rows} {reason}"}
+    return {
+        "num_lost": num_rows,
+        "segments": (NUM_ROWS - num_rows,),
+        "said": f"{said}|{num_rows} {reason}",
+    }
 
 
 HALVES = (ROW, NUM_ROWS - ROW)
@@ -69,7 +73,9 @@ FAULTS = {
     "a stray stamp half a second earlier": Fault(shift(slice(ROW, ROW + 1), -0.5), **lost(1)),
     "a stray stamp in the first row": Fault(shift(slice(1), 3600.0), **lost(1)),
     "a stray stamp in the last row": Fault(shift(slice(-1, None), 3600.0), **lost(1)),
-    "five different stray stamps in a row": Fault(replace_stamps([9.0, 3e3, 77.0, 4e3, 2.0]), **lost(5)),
+    "five different stray stamps in a row": Fault(
+        replace_stamps([9.0, 3e3, 77.0, 4e3, 2.0]), **lost(5)
+    ),
     "twenty stamps in a row an hour later": Fault(shift(slice(ROW, ROW + 20), 3600.0), **lost(20)),
     "0 in the first five rows": Fault(replace_stamps([0.0] * 5, 0), **lost(5, "")),
     "a repeated stamp": Fault(
@@ -77,7 +83,9 @@ FAULTS = {
         **lost(1, "with a repeated stamp"),
     ),
     "two swapped stamps": Fault(
-        lambda stamps: stamps[np.r_[:ROW, ROW + 1, ROW, ROW + 2 : NUM_ROWS]], **lost(1), error_s=STEP_S + 2e-6
+        lambda stamps: stamps[np.r_[:ROW, ROW + 1, ROW, ROW + 2 : NUM_ROWS]],
+        **lost(1),
+        error_s=STEP_S + 2e-6,
     ),
     "set back by 1.5 s": Fault(shift(slice(ROW, None), -1.5), 0, HALVES, "set back 1 times"),
     "set back by 50 ms": Fault(shift(slice(ROW, None), -0.05), 0, HALVES, "set back 1 times"),
@@ -85,13 +93,21 @@ FAULTS = {
     "a pause of 30 s": Fault(shift(slice(ROW, None), 30.0), 0, HALVES, "1 gaps above 1 s"),
     "set to the time of day": Fault(shift(slice(ROW, None), 1.7e6), 0, HALVES, "1 gaps above 1 s"),
     "a roll-over of us": Fault(
-        lambda stamps: (stamps + PERIOD_US_S - START_S - 1.602) % PERIOD_US_S, 0, (NUM_ROWS,), "rolled over 1"
+        lambda stamps: (stamps + PERIOD_US_S - START_S - 1.602) % PERIOD_US_S,
+        0,
+        (NUM_ROWS,),
+        "rolled over 1",
     ),
     "a roll-over of ms": Fault(
-        lambda stamps: (stamps + PERIOD_MS_S - START_S - 1.602) % PERIOD_MS_S, 0, (NUM_ROWS,), "rolled over 1"
+        lambda stamps: (stamps + PERIOD_MS_S - START_S - 1.602) % PERIOD_MS_S,
+        0,
+        (NUM_ROWS,),
+        "rolled over 1",
     ),
     "a roll-over with a stray stamp before it": Fault(
-        lambda stamps: replace_stamps([77.0])((stamps + PERIOD_US_S - START_S - 1.606) % PERIOD_US_S),
+        lambda stamps: replace_stamps([77.0])(
+            (stamps + PERIOD_US_S - START_S - 1.606) % PERIOD_US_S
+        ),
         1,
         (NUM_ROWS - 1,),
         "rolled over 1",
@@ -148,7 +164,9 @@ def test_the_case_of_one_stray_stamp() -> None:
     folder = shared("../cases/ulog_one_stray_stamp")
     found = import_log(folder / "stray.ulg", "ulog", align=False)
     assert 2985 <= len(found.log) <= 2999 and found.log.time[-1] == pytest.approx(11.97, abs=0.02)
-    assert any("1 of 3000 rows of vehicle_angular_velocity left out" in note for note in found.notes)
+    assert any(
+        "1 of 3000 rows of vehicle_angular_velocity left out" in note for note in found.notes
+    )
     assert "of 3000 samples of the rates have all other topics" in found.notes[0]
 
 
@@ -165,13 +183,20 @@ def test_what_is_no_clock_is_refused() -> None:
 @pytest.mark.parametrize(
     ("apply", "message"),
     [
-        (shift(slice(None), 1.7e9), r"clock of q: found 17\d+\.\d+ to .*, that of w 100\.0+ to .* in common"),
-        (shift(slice(ROW, None), -1.5), "clock of q: set back 1 times, that of w 0 times; which rows belong"),
+        (
+            shift(slice(None), 1.7e9),
+            r"clock of q: found 17\d+\.\d+ to .*, that of w 100\.0+ to .* in common",
+        ),
+        (
+            shift(slice(ROW, None), -1.5),
+            "clock of q: set back 1 times, that of w 0 times; which rows belong",
+        ),
     ],
 )
 def test_streams_that_share_no_time_are_refused(apply: Any, message: str) -> None:
     clocks = {
-        name: read_clock("a.log", name, stamps) for name, stamps in (("w", STAMPS_S), ("q", apply(STAMPS_S)))
+        name: read_clock("a.log", name, stamps)
+        for name, stamps in (("w", STAMPS_S), ("q", apply(STAMPS_S)))
     }
     with pytest.raises(LogError, match=message):
         put_on_one_line("a.log", clocks, "w")
@@ -180,7 +205,10 @@ def test_streams_that_share_no_time_are_refused(apply: Any, message: str) -> Non
 def test_streams_of_other_rates_are_set_back_together() -> None:
     """A slow stream has no row near the jump; later rows of both stay together."""
     set_back = shift(slice(ROW, None), -1.5)(STAMPS_S)
-    clocks = {"w": read_clock("a.log", "w", set_back), "q": read_clock("a.log", "q", set_back[::25])}
+    clocks = {
+        "w": read_clock("a.log", "w", set_back),
+        "q": read_clock("a.log", "q", set_back[::25]),
+    }
     times = put_on_one_line("a.log", clocks, "w")
     np.testing.assert_allclose(times["q"], times["w"][::25])
     assert np.all(np.diff(times["w"]) > 0.0)

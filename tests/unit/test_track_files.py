@@ -67,7 +67,9 @@ def test_unknown_names_are_refused_with_the_shipped_ones_and_lead_to_no_other_fi
         with pytest.raises(TrackError, match=rf"track: found '{name}', expected one of .*flytrack"):
             load_track(name)
     for name in ("../references/flytrack", "x" * 300, "a\0b"):
-        with pytest.raises(ReferenceFileError, match=r"reference: found no .{1,60}, expected one of"):
+        with pytest.raises(
+            ReferenceFileError, match=r"reference: found no .{1,60}, expected one of"
+        ):
             shipped_reference(name)
 
 
@@ -85,7 +87,9 @@ def any_track(seed):
     gates = []
     for gate_id in rng.permutation(100)[: rng.integers(2, 7)].tolist():
         opening, sign = rng.uniform(0.1, 3.0), float(rng.choice([-1.0, 1.0]))
-        gates.append(Gate(gate_id, inside(), turn(), sign, opening, opening + rng.uniform(0.1, 2.0)))
+        gates.append(
+            Gate(gate_id, inside(), turn(), sign, opening, opening + rng.uniform(0.1, 2.0))
+        )
     return Track("any", tuple(gates), inside(), turn(), tuple(low.tolist()), tuple(high.tolist()))
 
 
@@ -111,6 +115,8 @@ def test_what_would_not_come_back_is_not_saved(reason, tmp_path):
     gates = (replace(track.gates[0], **UNSAVEABLE[reason]), *track.gates[1:])
     with pytest.raises(TrackError, match=rf"{re.escape(str(path))}.*{re.escape(reason)}"):
         save_track(path, replace(track, gates=gates))
-    with pytest.raises(TrackError, match=r"path: found '.*track.json', expected one that ends in .toml"):
+    with pytest.raises(
+        TrackError, match=r"path: found '.*track.json', expected one that ends in .toml"
+    ):
         save_track(tmp_path / "track.json", track)
     assert not list(tmp_path.iterdir())

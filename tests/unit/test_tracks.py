@@ -67,7 +67,12 @@ def ring(radius: float = RADIUS, num_gates: int = NUM_GATES) -> tracks.Track:
         gates.append(tracks.Gate(10 + i, centre, yaw_of(math.degrees(angle) + 90.0), 1.0, 1.5, 2.7))
     wall = radius + 5.0
     return tracks.Track(
-        "ring", tuple(gates), (radius, -5.0, 0.1), yaw_of(180.0), (-wall, -wall, 0.0), (wall, wall, 7.0)
+        "ring",
+        tuple(gates),
+        (radius, -5.0, 0.1),
+        yaw_of(180.0),
+        (-wall, -wall, 0.0),
+        (wall, wall, 7.0),
     )
 
 
@@ -80,7 +85,9 @@ def changed(index: int, **fields: Any) -> tracks.Track:
 
 RING = ring()
 ALIKE = {"quaternion": RING.gates[0].quaternion}  # flown the same way as gate 10
-ON_WAY = tuple(tracks.sample_way(tracks.build_course(RING), 1001)[0][505].tolist())  # from gate 10 to 11
+ON_WAY = tuple(
+    tracks.sample_way(tracks.build_course(RING), 1001)[0][505].tolist()
+)  # from gate 10 to 11
 
 
 # How the message about a break of the ring begins, the course, and the demand that it breaks.
@@ -90,7 +97,8 @@ BREAKS = {
     "gates 15 and 10: 41.00 m apart, expected 5 to 40 m": (ring(41.0), "spacing"),
     "gate 12: 150 deg between its direction of flight and": (changed(2, direction=-1.0), "turn"),
     "gate 12: the way from gate 11 to 12 ": (changed(2, direction=-1.0), "own gate"),  # from behind
-    # 8 m beside gate 10, 0.3 m ahead, and flown the same way: its plane is crossed at once, far to the side.
+    # 8 m beside gate 10, 0.3 m ahead, and flown the same way: its plane is crossed at once, far to
+    # the side.
     "gate 11: the way from gate 10 to 11 misses it": (
         changed(1, position=(RADIUS - 8.0, 0.3, HEIGHT), **ALIKE),
         "own gate",
@@ -99,11 +107,23 @@ BREAKS = {
         changed(3, position=ON_WAY, quaternion=yaw_of(120.0)),  # across it
         "path",
     ),
-    "gates 10 and 13: frames 0.20 m apart": (changed(3, position=(12.9, 0.0, HEIGHT), **ALIKE), "frames"),
-    "gate 10: frame 0.85 m out of bounds (high x)": (replace(RING, bounds_high=(10.5, 15, 7)), "bounds"),
-    "start: 180 deg off the direction of": (replace(RING, start_position=(RADIUS, 5.0, HEIGHT)), "start"),
+    "gates 10 and 13: frames 0.20 m apart": (
+        changed(3, position=(12.9, 0.0, HEIGHT), **ALIKE),
+        "frames",
+    ),
+    "gate 10: frame 0.85 m out of bounds (high x)": (
+        replace(RING, bounds_high=(10.5, 15, 7)),
+        "bounds",
+    ),
+    "start: 180 deg off the direction of": (
+        replace(RING, start_position=(RADIUS, 5.0, HEIGHT)),
+        "start",
+    ),
     "start: gate 13 is 0.00 m from": (changed(3, position=(11.0, -2.5, HEIGHT), **ALIKE), "start"),
-    "start: 0.25 m too near the bounds or beyond": (replace(RING, bounds_low=(-15, -5.2, 0)), "start"),
+    "start: 0.25 m too near the bounds or beyond": (
+        replace(RING, bounds_low=(-15, -5.2, 0)),
+        "start",
+    ),
 }
 
 
@@ -154,7 +174,9 @@ def assert_flies_through(track: tracks.Track) -> None:
     # From just behind a gate to just behind the next one.
     points = np.concatenate([way[:, 1:], np.roll(way, -1, axis=0)[:, 1:BEYOND]], axis=1)
     # Every segment of every way against every gate: (N, M, 1) against (num_gates,).
-    starts, ends = (Vec3(*np.moveaxis(part[:, :, None], -1, 0)) for part in (points[:, :-1], points[:, 1:]))
+    starts, ends = (
+        Vec3(*np.moveaxis(part[:, :, None], -1, 0)) for part in (points[:, :-1], points[:, 1:])
+    )
     crossing = CROSS(course.gates, starts, ends, DRONE_RADIUS)
     events = (crossing.is_pass, crossing.is_frame, crossing.is_miss)
     passes, frames, misses = (np.asarray(event).sum(axis=1) for event in events)
@@ -173,7 +195,9 @@ def test_only_such_courses_are_drawn_and_all_differ(drawn: list[tracks.Track]) -
     for track in drawn:
         assert tracks.find_problems(track) == ()
         assert_flies_through(track)
-    assert len({track.gates for track in drawn}) == len({track.name for track in drawn}) == NUM_SEEDS
+    assert (
+        len({track.gates for track in drawn}) == len({track.name for track in drawn}) == NUM_SEEDS
+    )
 
 
 def test_course_is_a_function_of_the_key(drawn: list[tracks.Track]) -> None:
@@ -183,7 +207,9 @@ def test_course_is_a_function_of_the_key(drawn: list[tracks.Track]) -> None:
     keys = jax.random.split(jax.random.key(0), 3)
     assert len({tracks.random_track(key).gates for key in keys}) == 3
     assert tracks.random_track(np.int64(4)) == drawn[4]
-    assert tracks.random_track(2**32 - 1) == tracks.random_track(jax.random.key(np.uint32(2**32 - 1)))
+    assert tracks.random_track(2**32 - 1) == tracks.random_track(
+        jax.random.key(np.uint32(2**32 - 1))
+    )
 
 
 def test_course_of_a_seed_stays_the_same() -> None:
@@ -206,11 +232,19 @@ UNMET = {
     [
         ({"num_gates": 2}, "num_gates: found 2, expected at least 3"),
         ({"size": (30.0, 10.0)}, r"size: found \(30.0, 10.0\), expected more than 10 m each"),
-        ({"heights": (1.0, 3.0)}, r"heights: found \(1.0, 3.0\), expected a range from 1.35 m upwards"),
+        (
+            {"heights": (1.0, 3.0)},
+            r"heights: found \(1.0, 3.0\), expected a range from 1.35 m upwards",
+        ),
         ({"key": -1}, "key: found -1, expected 0 to 4294967295"),
-        ({"key": jnp.zeros((3, 2), jnp.uint32)}, r"key: found uint32 of shape \(3, 2\), expected one key"),
+        (
+            {"key": jnp.zeros((3, 2), jnp.uint32)},
+            r"key: found uint32 of shape \(3, 2\), expected one key",
+        ),
         *(
-            pytest.param(one, rf"in 300 attempts; .* most often: {demand} \(", marks=pytest.mark.slow)
+            pytest.param(
+                one, rf"in 300 attempts; .* most often: {demand} \(", marks=pytest.mark.slow
+            )
             for demand, one in UNMET.items()
         ),
     ],

@@ -89,7 +89,9 @@ def test_the_largest_steps_are_found(exact):
         assert len(others) + 1 == MOST_PER_AXIS
         assert (first.command_before, first.command_after) == (0.4, -0.4)
         assert first.time_s == pytest.approx(1.0) and first.segment == segment
-        assert first.since_step[0] == pytest.approx(-0.09) and first.since_step[-1] == pytest.approx(0.4)
+        assert first.since_step[0] == pytest.approx(-0.09) and first.since_step[
+            -1
+        ] == pytest.approx(0.4)
 
 
 def test_wrong_lag_shows_in_rates_and_steps_only_of_its_axis(log):
@@ -129,7 +131,9 @@ def test_thrust_is_measured_with_an_accelerometer_without_an_acceleration(exact,
     channels = {**log.without("a").channels, "f": specific_force_b(log, TRUTH.g)}
     measured = replace(log, channels=channels)
     same = validate(TRUTH, measured)
-    assert exact.thrust.source == "a" and same.thrust.source == "f" and same.thrust.total_rms_n < 1e-5
+    assert (
+        exact.thrust.source == "a" and same.thrust.source == "f" and same.thrust.total_rms_n < 1e-5
+    )
     coeffs = TRUTH.thrust_coeffs - 1.5 * np.eye(6)[0]
     wrong = validate(TRUTH._replace(thrust_coeffs=coeffs), measured)
     assert wrong.thrust.total_mean_n == pytest.approx(1.5, rel=0.02)
@@ -147,7 +151,9 @@ def test_applied_action_is_recovered_from_commands(log):
     prediction = predict(TRUTH, fill_gaps(bare))
     applied = columns(prediction.before.applied)
     is_settled = prediction.is_settled
-    np.testing.assert_allclose(applied[is_settled], log["uprev"][is_settled], atol=2 * LARGEST_DOUBT)
+    np.testing.assert_allclose(
+        applied[is_settled], log["uprev"][is_settled], atol=2 * LARGEST_DOUBT
+    )
     # exp(-t / slowest lag) of what the applied action may have been is left.
     longest = np.log(1 / LARGEST_DOUBT) * np.max(TRUTH.tau)
     assert np.sum(~is_settled) == 5 * np.ceil(longest / DT)

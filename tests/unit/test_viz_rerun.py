@@ -44,7 +44,9 @@ def test_handouts_function_has_its_defaults(tmp_path, monkeypatch):
 def test_handouts_function_records_the_numbers_that_it_is_given(tmp_path):
     handout = record(tmp_path, make_sequence(100), app_id="test_app")
     x, u = (np.array(part, float) for part in zip(*make_sequence(100), strict=True))
-    np.testing.assert_array_equal(handout.series("/world/drone", "Transform3D:translation"), x[:, 0:3])
+    np.testing.assert_array_equal(
+        handout.series("/world/drone", "Transform3D:translation"), x[:, 0:3]
+    )
     rotation = handout.series("/world/drone", "Transform3D:quaternion")
     np.testing.assert_allclose(rotation, x[:, [10, 11, 12, 9]], atol=1e-6)  # scalar last
     speeds = np.linalg.norm(x[:, 3:6], axis=1), np.linalg.norm(x[:, 13:16], axis=1)
@@ -126,7 +128,9 @@ def test_failures_to_write_keep_the_old_recording(tmp_path, monkeypatch):
     path.write_bytes(b"old")
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", fail)
-        with pytest.raises(ValueError, match=r"recording_path .*cannot be written.*disk full.*expected"):
+        with pytest.raises(
+            ValueError, match=r"recording_path .*cannot be written.*disk full.*expected"
+        ):
             viz.visualize_state_action_sequence(make_sequence(3), GATES, str(path))
     monkeypatch.setenv("RERUN", "0")
     with pytest.raises(ValueError, match="RERUN: found it turned off"):
@@ -138,10 +142,14 @@ def test_passes_laps_events_and_table_are_the_races(tmp_path):
     """Of two flights on one time line; the second has its own end and is shorter."""
     aside = STATES[:300] + 0.2 * np.eye(21, dtype=STATES.dtype)[1]  # to the side of the first
     second = viz.Trajectory("plant / 2", aside, ACTIONS[:300], ended="battery")
-    viz.write_recording(tmp_path / "two.rrd", [viz.Trajectory("policy", STATES, ACTIONS), second], TRACK)
+    viz.write_recording(
+        tmp_path / "two.rrd", [viz.Trajectory("policy", STATES, ACTIONS), second], TRACK
+    )
     recording = Recording(tmp_path / "two.rrd")
     rows = recording.rows["/world/passes", "Points3D:positions"]
-    assert [step for step, _ in recording.times["/world/passes"]] == [one.row for one in RACE.passes]
+    assert [step for step, _ in recording.times["/world/passes"]] == [
+        one.row for one in RACE.passes
+    ]
     for count, points in enumerate(rows, start=1):
         np.testing.assert_allclose(points, [one.pos_w for one in RACE.passes[:count]], rtol=1e-6)
     first, lap = RACE.passes[0], RACE.passes[7]
@@ -154,7 +162,9 @@ def test_passes_laps_events_and_table_are_the_races(tmp_path):
     assert texts[-1] == "policy: ended, all steps flown"
     assert recording.rows[f"/events/{SECOND}", "TextLog:text"][-1] == ["plant / 2: ended, battery"]
     (table,) = recording.once("/about", "TextDocument:text")
-    assert f"| policy | {lap.lap_time_s:.3f} | 4.49 | {len(RACE.passes)} | all steps flown |" in table
+    assert (
+        f"| policy | {lap.lap_time_s:.3f} | 4.49 | {len(RACE.passes)} | all steps flown |" in table
+    )
 
 
 def test_command_shows_rollouts_beside_the_ghost(tmp_path, capsys):

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from flytrack_env.dynamics import nominal_parameters
-from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, ThrustScale, Wind, effect_of
+from flytrack_env.effects import (
+    CommandDelay,
+    LinearDrag,
+    QuadraticDrag,
+    ThrustScale,
+    Wind,
+    effect_of,
+)
 from flytrack_env.env import FlyTrack
 from flytrack_env.randomness import next_word
 from flytrack_env.state import Action
@@ -70,7 +77,9 @@ def quiet_flights() -> dict[str, Flight]:
     }
 
 
-def test_neutral_wrappers_fly_as_none_and_the_delay_as_effect(quiet_flights: dict[str, Flight]) -> None:
+def test_neutral_wrappers_fly_as_none_and_the_delay_as_effect(
+    quiet_flights: dict[str, Flight],
+) -> None:
     plain, found = fly(wrapped()), quiet_flights["neither"]
     np.testing.assert_allclose(found.observations[..., :SIZE], plain.observations, atol=1e-4)
     np.testing.assert_allclose(found.rewards, plain.rewards, atol=1e-4)
@@ -113,7 +122,9 @@ def test_commands_are_remembered_the_latest_first_within_the_episode(flight: Fli
     np.testing.assert_array_equal(first[:, SIZE + 4 :].reshape(-1, 3, 4), expected)
     for i, is_end in enumerate(flight.ended):
         shifted = np.concatenate([np.asarray(flight.actions[i])[:, None], expected[:, :-1]], axis=1)
-        expected = np.where(is_end[:, None, None], np.repeat(applied[i][:, None], 3, axis=1), shifted)
+        expected = np.where(
+            is_end[:, None, None], np.repeat(applied[i][:, None], 3, axis=1), shifted
+        )
         np.testing.assert_allclose(three[i].reshape(-1, 3, 4), expected, atol=1e-6)
 
 
@@ -147,10 +158,16 @@ def test_noise_has_the_stated_deviations_and_is_white() -> None:
     both = np.asarray(jax.jit(jax.vmap(observations))(jnp.arange(4000, dtype=jnp.uint32)), float)
     plain = np.asarray(env.env.observe(None, env.env.begin(drone, 0, params), None, params), float)
     error, next_error = (both - plain).swapaxes(0, 1)
-    for rows, deviation in ((slice(0, 3), 0.1 / 3), (slice(3, 6), 0.2 / 5), (slice(15, 18), 0.3 / 5)):
+    for rows, deviation in (
+        (slice(0, 3), 0.1 / 3),
+        (slice(3, 6), 0.2 / 5),
+        (slice(15, 18), 0.3 / 5),
+    ):
         np.testing.assert_allclose(error[:, rows].std(axis=0), deviation, rtol=0.05)
         np.testing.assert_allclose(error[:, rows].mean(axis=0), 0.0, atol=0.08 * deviation)
-        for axis in range(rows.start, rows.stop):  # white: the next step's noise does not know this one's
+        for axis in range(
+            rows.start, rows.stop
+        ):  # white: the next step's noise does not know this one's
             assert abs(np.corrcoef(error[:, axis], next_error[:, axis])[0, 1]) < 0.06
     twist = np.einsum("ji,njk->nik", plain[6:15].reshape(3, 3), both[:, 0, 6:15].reshape(-1, 3, 3))
     assert np.rad2deg(0.5 * (twist[:, 2, 1] - twist[:, 1, 2])).std() == pytest.approx(2.0, rel=0.05)
@@ -164,7 +181,9 @@ def test_noise_stays_inside_the_space_and_off_the_flight(quiet_flights: dict[str
     attitude = np.asarray(loud.observations)[..., 6:15].reshape(-1, 3, 3)
     eye = np.broadcast_to(np.eye(3), attitude.shape)
     np.testing.assert_allclose(attitude @ attitude.transpose(0, 2, 1), eye, atol=1e-5)
-    np.testing.assert_array_equal(loud.rewards, quiet_flights["neither"].rewards)  # of the true flight
+    np.testing.assert_array_equal(
+        loud.rewards, quiet_flights["neither"].rewards
+    )  # of the true flight
 
 
 def sampled_models(model: Any, num: int) -> Any:
@@ -199,8 +218,16 @@ def test_what_the_model_itself_has_is_drawn_around_it() -> None:
     """An identified effect is known: scaled, within its range. What is not among the ranges stays."""
     known = (CommandDelay(0.036), ThrustScale(0.6), LinearDrag(1.0, -0.5, 0.0), QuadraticDrag(0.1))
     models = sampled_models(nominal_parameters().with_effects(*known), 500)
-    by_name = {effect_of(effect).name: jax.tree.map(np.asarray, effect) for effect in models.effects}
-    assert set(by_name) == {"command_delay", "thrust_scale", "wind", "linear_drag", "quadratic_drag"}
+    by_name = {
+        effect_of(effect).name: jax.tree.map(np.asarray, effect) for effect in models.effects
+    }
+    assert set(by_name) == {
+        "command_delay",
+        "thrust_scale",
+        "wind",
+        "linear_drag",
+        "quadratic_drag",
+    }
     delay_s = by_name["command_delay"].delay_s
     assert 0.8 * 0.036 <= delay_s.min() < 0.03 and 0.042 < delay_s.max() <= 0.0432 + 1e-6
     factor, drag = by_name["thrust_scale"].factor, by_name["linear_drag"]
@@ -213,11 +240,27 @@ def test_what_the_model_itself_has_is_drawn_around_it() -> None:
 OK = RandomizationParams()
 LATE = CommandDelay(0.1)
 REFUSALS: list[tuple[Any, Any, str]] = [
-    (DomainRandomization, OK._replace(mass_factor_low=1.3), r"mass_factor: found a range from 1\.3 to 1\.2"),
-    (DomainRandomization, OK._replace(low=OK.low[1:]), r"high: found effects \['CommandDelay', .* of low"),
-    (DomainRandomization, OK._replace(high=(LATE, *OK.high[1:])), r"delay_s: found 0\.1, expected 0 to 0"),
+    (
+        DomainRandomization,
+        OK._replace(mass_factor_low=1.3),
+        r"mass_factor: found a range from 1\.3 to 1\.2",
+    ),
+    (
+        DomainRandomization,
+        OK._replace(low=OK.low[1:]),
+        r"high: found effects \['CommandDelay', .* of low",
+    ),
+    (
+        DomainRandomization,
+        OK._replace(high=(LATE, *OK.high[1:])),
+        r"delay_s: found 0\.1, expected 0 to 0",
+    ),
     (ActionDelay, CommandDelay(-0.01), r"delay_s: found -0\.01"),
-    (ObservationNoise, NO_NOISE._replace(position_m=-0.1), r"\.position_m: found -0.1, expected finite"),
+    (
+        ObservationNoise,
+        NO_NOISE._replace(position_m=-0.1),
+        r"\.position_m: found -0.1, expected finite",
+    ),
 ]
 
 
@@ -242,7 +285,9 @@ def test_bad_arguments_are_refused() -> None:
 def step(keys: jax.Array, states: Any, actions: Any) -> Any:
     """Step a batch in every wrapper."""
     env = wrapped(*ALL)
-    return steps_of(env)(keys, states, jnp.asarray(actions, jnp.float32), arrays(env.default_params))
+    return steps_of(env)(
+        keys, states, jnp.asarray(actions, jnp.float32), arrays(env.default_params)
+    )
 
 
 def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been() -> None:
@@ -261,7 +306,9 @@ def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been() -> N
     last = np.asarray(info["final_observation"])
     assert np.isfinite(last).all() and (last != np.asarray(observation)).any(axis=1).all()
     # What is no number is remembered as 0, and the rest of the action clipped.
-    np.testing.assert_allclose(last[list(ends).index("nan roll"), SIZE + 4 : SIZE + 8], [0.0, 1.0, -1.0, 0.5])
+    np.testing.assert_allclose(
+        last[list(ends).index("nan roll"), SIZE + 4 : SIZE + 8], [0.0, 1.0, -1.0, 0.5]
+    )
     starts = np.stack(jax.tree.leaves(env.drone(after).pos_w), -1)
     assert len(np.unique(starts, axis=0)) == NUM_ENVS
 
@@ -280,7 +327,12 @@ def poisoned(states: Any, poison: str, rng: np.random.Generator) -> Any:
         if jnp.issubdtype(leaf.dtype, jnp.integer):
             return rng.integers(0, 1000, leaf.shape).astype(leaf.dtype)
         values = rng.normal(size=leaf.shape)
-        fill = {"nan": np.nan, "infinite": np.inf * values, "huge": 3e38 * np.sign(values), "zero": 0.0}
+        fill = {
+            "nan": np.nan,
+            "infinite": np.inf * values,
+            "huge": 3e38 * np.sign(values),
+            "zero": 0.0,
+        }
         return np.broadcast_to(fill.get(poison, values), leaf.shape).astype(leaf.dtype)
 
     return jax.tree_util.tree_map_with_path(anything, states)
