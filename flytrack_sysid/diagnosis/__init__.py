@@ -1,4 +1,7 @@
-"""What a simulation gets wrong, from a flight log: named causes, what cannot be told apart, what is left."""
+"""Find what a simulation gets wrong from a flight log.
+
+A diagnosis names causes, says which of them cannot be told apart, and what is left unexplained.
+"""
 
 from flytrack_sysid.diagnosis.before import diagnose_change
 from flytrack_sysid.diagnosis.diagnose import DiagnosisError, diagnose, joined

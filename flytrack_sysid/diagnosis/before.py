@@ -60,7 +60,10 @@ def _logs(logs: Logs) -> Sequence[FlightLog]:
 
 
 class Change(NamedTuple):
-    """How far parameters are from those before, half of the 95 % intervals of that, and its chi2."""
+    """The change of parameters from the earlier log to the later one.
+
+    half: half of the 95 % interval of each change. chi2: of all changes.
+    """
 
     size: np.ndarray
     half: np.ndarray
@@ -198,7 +201,10 @@ def _calm(problem: Problem) -> Problem:
 
 
 class Refit(NamedTuple):
-    """Both logs refitted with one more effect; merit: chi2 that only the log after gains, less a price."""
+    """Both logs refitted with one more effect.
+
+    merit: chi2 gained on the later log, less that gained on the earlier one and a price.
+    """
 
     candidate: Candidate
     later: Estimate
@@ -241,7 +247,7 @@ def next_change(later: Estimate, earlier: Estimate) -> tuple[Refit, tuple[str, .
 
 
 def promise_of(candidate: Candidate, later: Estimate, earlier: Estimate) -> float:
-    """Return what an effect explains of the log after to first order; 0 where its change is not promising.
+    """Return the first-order gain of an effect on the later log; 0 unless its change is promising.
 
     A change shows between the logs, and in the log after against the model.
     """
@@ -278,7 +284,10 @@ def promise_of(candidate: Candidate, later: Estimate, earlier: Estimate) -> floa
 
 
 def is_large(candidate: Candidate, change: np.ndarray, later: Estimate) -> bool:
-    """Return whether a change, of shares of the ways to probes and of other parameters, is notable."""
+    """Return whether a change is notable in any of a candidate's parameters.
+
+    change: of probed parameters as a share of the way to the probe, of others in their units.
+    """
     problem = later.state.problem
     ways = [
         probe.value - problem.start[problem.index([probe.field])[0]] for probe in candidate.probes
@@ -291,7 +300,10 @@ def is_large(candidate: Candidate, change: np.ndarray, later: Estimate) -> bool:
 
 
 def selection_of(later: Estimate, earlier: Estimate) -> Selection:
-    """Return the model of the log after as selected; unexplained: what was not, or much less, before."""
+    """Return the model of the later log as a selection.
+
+    Its unexplained part is what was not unexplained, or much less, in the earlier log.
+    """
     state, model = later.state, later.model
     ablations = {
         name: ablate(state, model, later.linearization, name) for name in sorted(model.effects)
@@ -333,7 +345,7 @@ def changed_cause(cause: Cause, later: Estimate, earlier: Estimate) -> list[Caus
 def changed_values(
     cause: Cause, fields: Sequence[str], later: Estimate, earlier: Estimate
 ) -> dict[str, Estimated]:
-    """Return the values that a cause's parameters changed to; none where they are as they were before."""
+    """Return the values that a cause's parameters changed to; none without a clear change."""
     problem, name = later.state.problem, cause.effect
     change = change_between(later, earlier, fields)
     places, vector = problem.index(fields), problem.start.copy()

@@ -93,7 +93,7 @@ def with_learned(model: ModelParameters, learned: Learned | None) -> ModelParame
 def with_and_without(
     learned: Learned, vectors: Mapping[str, np.ndarray], change: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return vectors by model of ``Problem.with_law``, with an extended one without what was learnt.
+    """Return each model's vector for ``Problem.with_law``, and the extended one without the law.
 
     change: of the extended model's other parameters, fitted beside what was learnt.
     """

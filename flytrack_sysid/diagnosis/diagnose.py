@@ -1,4 +1,4 @@
-"""A log and a model in, a diagnosis out: what is wrong, why, how certain that is, and what it gains."""
+"""Diagnose a model from a log: what is wrong, why, how certainly, and what correcting it gains."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -49,11 +49,11 @@ Report = Callable[[int, int], None]
 
 
 class DiagnosisError(ValueError):
-    """A log that cannot be diagnosed; the message names the file and channel, found and expected."""
+    """A log that cannot be diagnosed; the message says file, channel, found and expected."""
 
 
 class Split(NamedTuple):
-    """A log, its rows held out, (num_rows,) bool, and the problems of learning from and judging by it.
+    """A log, its held-out rows, (num_rows,) bool, and the problems to learn from and to judge by.
 
     log: with all clocks together. logged: as it was, maybe more rows. as_logged: the lanes of both
     problems with poses as logged; empty where these were in time. moves: how late they were.
@@ -76,7 +76,7 @@ def diagnose(
     report: Report = lambda done, stages: None,
     motion: Motion | None = None,
 ) -> Diagnosis:
-    """Return what is wrong with a model, from a log: causes, what is unexplained or not identifiable, errors.
+    """Diagnose a model from a log: causes, what is unexplained or not identifiable, errors.
 
     log: one or several, taken together. model: the simulator's nominal one if None; causes are
     differences from it. held_out: (num_rows,) bool, rows to judge by and not to learn from; the
@@ -169,7 +169,7 @@ def split(
 
 
 def held_out_under(selection: Selection, test: Problem) -> Problem:
-    """Return the problem of held-out rows with a selection's noise, and its effects when they act."""
+    """Return the problem of held-out rows with a selection's noise and effect windows."""
     problem = selection.state.problem
     return replace(test.with_noise(problem.noise), windows=problem.windows)
 
@@ -240,7 +240,7 @@ def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
 
 
 def summarize(judged: Judged, parts: Split) -> Diagnosis:
-    """Return the diagnosis of a refined model, in float64; the nominal model in float64 stands in it."""
+    """Return the diagnosis of a refined model, in float64; so is the nominal model in it."""
     test, refined = parts.test, judged.refined
     assert refined is not None, "refined_within_range comes first"
     selection = reduced(judged.selection, refined)
@@ -331,7 +331,7 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
 
 
 def check_log(log: FlightLog) -> None:
-    """Raise DiagnosisError for a log without rows, or without a channel that shows how the drone turns."""
+    """Raise DiagnosisError for a log without rows, or with neither gyro nor attitude."""
     if not len(log):
         raise DiagnosisError(f"{log.source}: found 0 rows, expected some seconds of flight")
     if "w" not in log and "q" not in log:

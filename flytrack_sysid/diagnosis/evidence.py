@@ -89,7 +89,10 @@ def without(extended: ModelParameters, nominal: ModelParameters, cause: str) -> 
 def words_of(cause: str) -> str:
     """Return a cause in plain words; its own name where there are none."""
     if cause == DRIFT:
-        return "a drift of the thrust, as while motors warm up; fly again with warm motors and a full battery"
+        return (
+            "a drift of the thrust, as while motors warm up; fly again with warm motors and a full "
+            "battery"
+        )
     return EVIDENCE[cause].words if cause in EVIDENCE else cause.replace("_", " ")
 
 
@@ -99,7 +102,10 @@ def list_words(causes: Sequence[str]) -> str:
 
 
 class Binned(NamedTuple):
-    """Means by bin, (num_bins,) each; only bins with two rows or more. ends95: half of the 95 % interval."""
+    """Means by bin, (num_bins,) each; only bins with two rows or more.
+
+    ends95: half of the 95 % interval.
+    """
 
     at: np.ndarray
     means: np.ndarray

@@ -106,7 +106,7 @@ class Question:
         return found
 
     def shares(self, information: np.ndarray | float = 0.0) -> np.ndarray:
-        """Return how well the effect would show at its notable size, the worst first; from 1 on it does.
+        """Return how well the effect would show at its notable size, ascending; 1 or more suffices.
 
         Noncentrality of each of its parameters over DETECTED, and beside each look-alike over
         SEPARATE. information: added to the log's.
@@ -192,7 +192,10 @@ def _absent_channels(lanes: Lanes) -> list[str]:
 
 
 def _seen_flights(problem: Problem, vector: np.ndarray) -> tuple[FlightLog, np.ndarray]:
-    """Return all manoeuvres flown by a model, seen by the sensors of a problem's log, and rows that count."""
+    """Return all manoeuvres as flown by a model, and which rows count, (num_rows,) bool.
+
+    The log of the flights has the channels of the problem's log.
+    """
     model = problem.like._replace(thrust_coeffs=vector[problem.index(THRUST_COEFFS)])
     voltages = voltages_of(problem.lanes) or _battery_range(problem.like)
     flights = flights_of(MANOEUVRES, hover_action(model, voltages), voltages=voltages)
@@ -219,7 +222,7 @@ def _in_parts(lanes: Lanes, size: int) -> Iterator[Lanes]:
 def _information_along(
     linearization: Linearization, columns: Sequence[int], ahead: Problem, vector: np.ndarray
 ) -> np.ndarray:
-    """Return the information of lanes about some columns of a linearization, (lanes, columns, columns)."""
+    """Return the information by lane about some columns, (lanes, columns, columns)."""
     end = len(linearization.places)
     places = [linearization.places[column] for column in columns if column < end]
     probes = [linearization.probes[column - end] for column in columns if column >= end]
@@ -234,7 +237,7 @@ def _information_along(
 def information_of_manoeuvres(
     problem: Problem, model: FittedModel, linearization: Linearization, columns: Sequence[int]
 ) -> dict[str, np.ndarray]:
-    """Return the information that each manoeuvre would add to columns of a linearization's ``total``.
+    """Return the information about columns that each manoeuvre would add, shaped like ``total``.
 
     Fisher information at the fitted model, with the noise and the channels of the problem's log;
     eight flights of 2.5 s each. 0 for other columns. Inside ``jax.enable_x64(True)``.
@@ -342,7 +345,7 @@ def _battery_range(model: ModelParameters) -> tuple[float, float]:
 
 
 def _voltages(path: Path, content: dict[str, Any], model: ModelParameters) -> tuple[float, float]:
-    """Return the voltages that a diagnosis has seen; those of the model's battery where it saw none."""
+    """Return the voltages that a diagnosis has seen, else those of the model's battery."""
     data = content.get("data")
     found = data.get("voltages") if isinstance(data, dict) else None
     if found is None:
@@ -360,7 +363,7 @@ def _voltages(path: Path, content: dict[str, Any], model: ModelParameters) -> tu
 
 
 def next_flight(path: str | Path, model: ModelParameters, seed: int = 0) -> NextFlight:
-    """Return the flights that a ``diagnosis.json`` asks for, for a drone that hovers as a model does.
+    """Return the flights that a ``diagnosis.json`` asks for, starting at a model's hover action.
 
     Raises:
         ScriptError: a file that cannot be read or is no diagnosis, or that asks for no flight.

@@ -140,7 +140,7 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
 
 
 def lanes_of(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Lanes:
-    """Return the lanes of a log of which some rows, (num_rows,) bool, count, with the lags of a model."""
+    """Return the lanes of a log, with the rows that count, (num_rows,) bool, and a model's lags."""
     return make_lanes(
         with_voltage(log, model), judged, np.asarray(model.tau, float), float(model.g)
     )
@@ -153,7 +153,7 @@ def voltages_of(lanes: Lanes) -> tuple[float, float] | None:
 
 
 def thinned(lanes: Lanes, most: int | None = None) -> Lanes:
-    """Return lanes evenly spread, of MOST_ROWS or so many lanes at most, in place of those of a long log."""
+    """Return at most ``most`` lanes, evenly spread over a log; by default MOST_ROWS rows."""
     rows, number = lanes.row.shape
     most = (
         most or max(MOST_ROWS // (rows - lead_in_of(rows)) // LANES_PADDED_TO, 1) * LANES_PADDED_TO

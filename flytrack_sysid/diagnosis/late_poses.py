@@ -1,4 +1,4 @@
-"""Late poses as a cause: what the correction of the log was, with its interval and what it gains."""
+"""Late poses as a cause: by how much the log was corrected, the interval, and what it gains."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,7 +18,10 @@ BOUNDS = EFFECT.ranges["latency_s"]
 
 
 def gain_of(problem: Problem, as_logged: Lanes, vector: np.ndarray) -> float:
-    """Return what poses in time gain over logged ones, of minus twice the log likelihood, not refitted."""
+    """Return the gain of corrected over logged poses, in minus twice the log likelihood.
+
+    Nothing is refitted.
+    """
     counts = problem.counts & as_logged.counts
 
     def cost(one: Problem) -> float:

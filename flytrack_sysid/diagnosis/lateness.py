@@ -1,4 +1,6 @@
-"""Poses that are late against the gyro, in the residuals: position, velocity and attitude on another clock.
+"""Residuals of poses that are late against the gyro.
+
+Position, velocity and attitude are then on another clock than the gyro.
 
 The replay is fed with corrected poses, interpolated at the time of each row. What is judged are the
 poses as they were logged: interpolation smooths noise, which would change the likelihood by more
@@ -40,7 +42,10 @@ class Late(NamedTuple):
     constant: np.ndarray
 
     def residuals(self, left: np.ndarray) -> np.ndarray:
-        """Return residuals (models, rows, lanes, NUM_AXES, 2) of corrected lanes as those of the log."""
+        """Return the log's residuals from those of corrected lanes.
+
+        left: (models, rows, lanes, NUM_AXES, 2).
+        """
         found = left.copy()
         found[..., :-1, 1] = _delayed(left[..., :-1, 1], self.weights, -3) + self.constant[..., :-1]
         return found
@@ -52,7 +57,7 @@ def latency_of(model: ModelParameters) -> float:
 
 
 def read_poses(log: FlightLog, late_s: float) -> tuple[FlightLog, np.ndarray]:
-    """Return a log whose poses were so late in time, and the rows where they are known, (num_rows,) bool."""
+    """Return a log with late poses moved in time, and where they are known, (num_rows,) bool."""
     if not late_s:
         return log, np.ones(len(log), bool)
     return read_later(log, [name for name in POSES if name in log], late_s)
@@ -76,7 +81,10 @@ def _weights(share: np.ndarray, motion: Motion) -> np.ndarray:
 
 
 def _changes(record: Record) -> np.ndarray:
-    """Return the turn, rad, and the change of velocity, m/s, since the row before, world, (num_rows, 6)."""
+    """Return the turn, rad, and velocity change, m/s, since the row before, (num_rows, 6).
+
+    Both are in the world frame.
+    """
     quat = Rotation.from_quat(record.quat, scalar_first=True)
     before = Rotation.from_quat(np.roll(record.quat, 1, axis=0), scalar_first=True)
     faster = record.vel_w - np.roll(record.vel_w, 1, axis=0)
@@ -87,7 +95,7 @@ def _changes(record: Record) -> np.ndarray:
 def judged_as_logged(
     lanes: Lanes, corrected: FlightLog, logged: FlightLog, late_s: float, motion: Motion
 ) -> tuple[Lanes, Late]:
-    """Return lanes of a corrected log, judged where poses were logged, and how their residuals are late.
+    """Return lanes of a corrected log that are judged where poses were logged, and their lateness.
 
     late_s: of the logged poses; ``corrected`` has them in time and may lack some of the rows.
     """

@@ -1,4 +1,4 @@
-"""A law for what no effect of the list explains: sparse regression over terms that make physical sense.
+"""Search for a law where no effect explains a log, by sparse regression over physical terms.
 
 Every candidate is a term of ``flytrack_env.effects.grammar``: a product of shapes of quantities
 times a free vector. All are scored beside what the model may change (as the diagnosis scores
@@ -52,7 +52,10 @@ LEAST_EXPECTED = 10.0  # of that gain: with less, held-out rows say nothing of a
 
 
 def moment_of_flight(problem: Problem, vector: np.ndarray, flight: Flown) -> Moment:
-    """Return what a law may look at, at the beginning of the step to each row, arrays (rows, lanes)."""
+    """Return the quantities a law may depend on, at the beginning of the step to each row.
+
+    Arrays are (rows, lanes).
+    """
     model, record = from_vector(vector, problem.like), problem.lanes.record
     wind = model.effect("wind")
     air_w = np.array([float(wind.v_x), float(wind.v_y), float(wind.v_z)])
@@ -82,7 +85,7 @@ def moment_of_flight(problem: Problem, vector: np.ndarray, flight: Flown) -> Mom
 
 
 def directions_of(term: Term, moment: Moment, rotation: np.ndarray) -> np.ndarray:
-    """Return where unit coefficients of a term point, world frame, (coefficients, rows, lanes, 3)."""
+    """Return a term's unit directions in the world frame, (coefficients, rows, lanes, 3)."""
     body = [
         np.stack(np.broadcast_arrays(*unit, moment.time_s)[:-1], axis=-1)
         for unit in term.basis(moment)
@@ -125,7 +128,10 @@ class Side(NamedTuple):
         return whitened(self.problem, directions * signal, self.name)
 
     def vector_beside(self, given: np.ndarray) -> np.ndarray:
-        """Return the model's vector beside what was fitted; given: the step of its numbers that act."""
+        """Return the model's vector beside fitted terms.
+
+        given: the step of its acting parameters, which is subtracted.
+        """
         vector = self.vector.copy()
         vector[list(self.acting)] -= given
         return self.problem.clipped(vector)
@@ -277,7 +283,7 @@ def refine_shapes(side: Side, test: SideTest, start: Trial) -> Trial:
 
 
 def refine_jointly(side: Side, terms: Sequence[Term], places: Iterable[int]) -> list[Term]:
-    """Return terms with the numbers of some of their shapes where each gains most beside the others."""
+    """Refine the shapes of some terms, each beside all others; ``places`` says which."""
     result = list(terms)
     for place in places:
         term = terms[place]
@@ -341,7 +347,7 @@ def fit_terms(side: Side, terms: Sequence[Term]) -> tuple[tuple[Term, ...], Side
 
 
 def held_out(side: Side, held: Side, learnt: np.ndarray, vector: np.ndarray) -> tuple[float, float]:
-    """Return what something learnt gains on held-out rows, and what it would if it were right there.
+    """Return what something learnt gains on held-out rows, and what it would gain if it were right.
 
     learnt: what it adds there, whitened. vector: of the model beside it.
     """
@@ -353,7 +359,9 @@ def held_out(side: Side, held: Side, learnt: np.ndarray, vector: np.ndarray) -> 
 
 
 def cross_validate(side: Side, terms: Sequence[Term]) -> tuple[float, float]:
-    """Return what coefficients fitted to each half of the blocks gain on the other, and should if right.
+    """Return the cross-validated gain of a law's terms, and the gain expected if they are right.
+
+    Coefficients fitted to each half of the blocks are tested on the other half.
 
     For a law that does not act in held-out rows, such as a thermal that they do not pass.
     """
@@ -379,7 +387,10 @@ def judge_law(side: Side, held: Side, terms: tuple[Term, ...], fit: SideFit) -> 
 
 
 def is_confirmed(side: Side, law: Found) -> bool:
-    """Return whether held-out rows confirm a law, or where those say nothing, halves of the others."""
+    """Return whether held-out rows confirm a law.
+
+    Where the law hardly acts in them, cross-validation on the other rows decides.
+    """
     gain, expected = law.held_out_gain, law.expected
     if expected < LEAST_EXPECTED:
         gain, expected = cross_validate(side, law.terms)
@@ -387,7 +398,7 @@ def is_confirmed(side: Side, law: Found) -> bool:
 
 
 def drop_weak_terms(side: Side, held: Side, law: Found, number: int) -> Found | None:
-    """Return a law of terms that each gain, beside all others, what one more has to; the best term first.
+    """Drop terms that gain too little beside all others; return the rest, the best first.
 
     A first term may only have stood in for later ones. None where held-out rows do not confirm the
     rest. number: of terms among which they were chosen.
@@ -433,7 +444,7 @@ def find_law(side: Side, held: Side) -> Found | None:
 
 
 def best_of(side: Side, test: SideTest, pool: Sequence[Term]) -> tuple[list[Trial], list[Term]]:
-    """Return the best terms of different kinds, refined, the best first, and the pool in that order."""
+    """Return the best terms of different kinds, refined, and the whole pool, each best first."""
     trials = sorted((score_term(side, test, term) for term in pool), key=lambda one: -one.merit)
     best = [refine_shapes(side, test, one) for one in _of_different_kinds(trials)[:MOST_REFINED]]
     return sorted(best, key=lambda one: -one.merit), [one.term for one in trials]

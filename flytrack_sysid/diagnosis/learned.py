@@ -77,7 +77,10 @@ def _with_side(learned: Learned | None, name: str, law: Found) -> Learned:
 
 
 def thinned_problem(problem: Problem) -> Problem:
-    """Return a problem of fewer lanes, evenly spread, where a log is long: hundreds of terms are tried."""
+    """Return a problem of fewer lanes, evenly spread, where a log is long.
+
+    Hundreds of terms are tried.
+    """
     lanes = thinned(problem.lanes, max(MOST_ROWS // len(problem.lanes.row), 2))
     if lanes is problem.lanes or problem.late is not None or problem.noise is None:
         return problem
@@ -91,7 +94,7 @@ def _predicts(
     after: tuple[Learned | None, np.ndarray],
     acts_there: bool,
 ) -> bool:
-    """Return whether held-out flights are predicted no worse with what was learnt, and better in all.
+    """Return whether what was learnt predicts held-out flights no worse, and better overall.
 
     before, after: what was learnt, and the model's vector beside it. acts_there: whether it acts in
     them enough to be judged.
@@ -113,7 +116,7 @@ def _flight_errors(
 
 
 def improves_flights(ratio: np.ndarray, lost: np.ndarray, acts_there: bool) -> bool:
-    """Return whether flights are predicted no worse anywhere and, if it acts in them, better in all.
+    """Return whether flights are predicted no worse anywhere and, if it acts there, better overall.
 
     ratio: of errors with what was learnt over those without, by horizon and quantity. lost: by how
     many standard errors each is larger.

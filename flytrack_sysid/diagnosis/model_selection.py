@@ -1,4 +1,4 @@
-"""Model selection: is each effect needed, does a rival explain as much, can one replace base changes?"""
+"""Select effects: drop those not needed, swap rivals, and replace base changes by one effect."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -120,9 +120,9 @@ def with_candidate(
 
 
 def other_groups(linearization: Linearization, model: FittedModel, effect: str) -> list[Candidate]:
-    """Return an effect in groups of its parameters, more, fewer or others, that to first order are cheaper.
+    """Return an effect with more, fewer or other parameters that are cheaper to first order.
 
-    Others may be: they gain something beside the effect's own.
+    Others are included if they gain something beside the effect's own.
     """
     problem, now = linearization.problem, model.candidate(effect)
     own, result = set(now.fields), []
@@ -149,7 +149,7 @@ def other_groups(linearization: Linearization, model: FittedModel, effect: str) 
 def select_effects(
     state: SearchState, model: FittedModel
 ) -> tuple[SearchState, FittedModel, dict[str, Ablation]]:
-    """Return the model without effects that it does not need and with better ones swapped in, ablated."""
+    """Return the model with unneeded effects removed and better ones swapped in, and ablations."""
     while True:
         state, linearization = state.linearized(model.vector)
         ablations = {
@@ -220,7 +220,7 @@ def separation(linearization: Linearization, model: FittedModel, effect: str) ->
 
 
 def equivalents(ablation: Ablation, own: Separation) -> tuple[str, ...]:
-    """Return rivals that a log cannot tell from an effect: they explain as much, or chance alone decides."""
+    """Return rivals that a log cannot tell from an effect: equal fit, or a difference by chance."""
 
     def is_equivalent(rival: str, worse: float) -> bool:
         is_lost = own.beside.get(rival, own.noncentrality) < EQUIVALENT
@@ -244,11 +244,13 @@ class Marginal:
         self.inflation = inflation_of(self.information, self.scores)
 
     def covariance(self) -> np.ndarray:
-        """Return the parameters' covariance: that of the information, as much larger as seconds disagree."""
+        """Return the parameters' covariance, that of the information times its inflation."""
         return self.inflation * solve(self.information, np.eye(len(self.information)))
 
     def half_widths(self, ways: np.ndarray | None = None) -> np.ndarray:
-        """Return half of each parameter's 95 % interval, or of sums of them, ways (num_sums, parameters).
+        """Return half of each parameter's 95 % interval, or of weighted sums of parameters.
+
+        ways: the weights of the sums, (num_sums, parameters).
 
         Its standard deviation is that of the information or, where it is larger, the sandwich
         estimate from the scores of blocks; Student's t for so many blocks.
@@ -265,7 +267,7 @@ class Marginal:
 
 
 class BaseChange(NamedTuple):
-    """Base parameters that differ from their nominal values: names, information, chi2 of the difference."""
+    """Base parameters that differ from nominal: names, information, chi2 of the difference."""
 
     fields: list[str]
     marginal: Marginal
@@ -273,7 +275,10 @@ class BaseChange(NamedTuple):
 
 
 def _is_immaterial(problem: Problem, fields: Sequence[str], model: FittedModel) -> bool:
-    """Return whether a lag, drain or thrust curve differs by less than matters; rounding does as much."""
+    """Return whether a lag, drain or thrust curve differs by too little to matter.
+
+    Rounding causes differences as large.
+    """
     places = problem.index(fields)
     change = model.vector[places] - problem.start[places]
     if fields != THRUST_COEFFS:
@@ -290,7 +295,7 @@ def _is_immaterial(problem: Problem, fields: Sequence[str], model: FittedModel) 
 def base_change(
     state: SearchState, linearization: Linearization, model: FittedModel, fields: Sequence[str]
 ) -> BaseChange | None:
-    """Return how the log contradicts nominal values of base parameters; None where it does not, or hardly."""
+    """Return how the log contradicts nominal base parameters; None where it hardly does."""
     problem, free = state.problem, set(state.base_places)
     acting = [
         field
@@ -322,7 +327,7 @@ def base_changes(
 def explain_base_by_effect(
     state: SearchState, model: FittedModel
 ) -> tuple[SearchState, FittedModel | None]:
-    """Return a model with one effect more and base parameters held at nominal, if it explains as much.
+    """Return a model with one more effect and nominal base parameters, if it explains as much.
 
     A delay of all commands, say, looks like four longer lags.
     """
@@ -341,7 +346,7 @@ def explain_base_by_effect(
 def _best_instead(
     state: SearchState, model: FittedModel, fields: Sequence[str]
 ) -> tuple[SearchState, FittedModel | None]:
-    """Return the best model with at most one effect more while base parameters are held, if it is better."""
+    """Return the best model with base parameters held and at most one more effect, if better."""
     problem, held = state.problem, state.held
     state = replace(state, held=(*held, *(Held(field, "") for field in fields)))
     less = state.fitted(model.candidates, problem.at_start(model.vector, fields))
@@ -365,7 +370,7 @@ def _best_instead(
 def is_determined(
     state: SearchState, model: FittedModel, fields: Sequence[str]
 ) -> tuple[SearchState, bool]:
-    """Return whether a log tells one of an effect's parameters, those of a model, from having no effect."""
+    """Return whether the log shows that some parameter of an effect is not neutral."""
     problem = state.problem
     places = problem.index(fields)
     change = np.abs(model.vector[places] - problem.start[places])

@@ -68,9 +68,11 @@ LOOK_ALIKES: tuple[Effect, ...] = tuple(
 
 
 class Moves(NamedTuple):
-    """How a log moves. late_s: its poses against its gyro, 0 if on time; sigma_s: its standard error.
+    """How a log moves, and how late its poses are.
 
-    While one is chosen, it is negative where the gyro and the accelerometer are late.
+    late_s: the poses against the gyro, 0 if on time. sigma_s: the standard error of ``late_s``.
+
+    While a motion is chosen, ``late_s`` is negative where the gyro and the accelerometer are late.
     """
 
     motion: Motion
@@ -102,7 +104,9 @@ def problem_of(
 
 
 class Seen(NamedTuple):
-    """Rows of a log to learn from, (num_rows,) bool, a model to start from, and the part that is looked at.
+    """Rows of a log to learn from, a model to start from, and the part of the lanes that is used.
+
+    judged: (num_rows,) bool.
 
     num_parts: of some lanes each.
     """
@@ -204,7 +208,7 @@ def _costs(trials: Sequence[Trial], misfits: Sequence[float]) -> list[float]:
 
 
 def _apparent_lateness(log: FlightLog) -> tuple[float, float] | None:
-    """Return how late poses are by correlation, s, and its standard error; None where it cannot tell."""
+    """Return the lateness of poses by correlation, s, and its standard error; None if unknown."""
     for _, _, needed, sums, rates in PAIRS[:2]:
         if all(name in log for name in needed):
             offset_s, sigma_s, _, reason = offset_between(log, sums(log), rates(log))
@@ -245,7 +249,7 @@ def how_it_moves(
 
 
 def _known_around(log: FlightLog, moves: Sequence[Moves]) -> np.ndarray:
-    """Return the rows at which poses can be read so much later, or a few steps of a fit more or less."""
+    """Return the rows at which poses are known for each lateness and a few fit steps around it."""
     room = ROUNDS * LONGEST_STEP_S + DIFFERENCE_S
     late_s = [one.late_s for one in moves if one.late_s > 0.0]
     ends = (min(0.0, min(late_s) - room), max(late_s) + room) if late_s else (0.0,)
@@ -288,7 +292,7 @@ def _both(first: Trial, second: Trial) -> Trial:
 
 
 def likelier_motion(problem: Problem, vector: np.ndarray) -> Motion:
-    """Return the motion under which a fitted model leaves the least, if clearly less than under its own.
+    """Return the motion with the least misfit of a fitted model, its own unless clearly beaten.
 
     Before the search, what the model lacks may fit another simulator's step better than the true
     one. Of 18 plants (benchmarks.beyond, seed 43) this was chosen on one, and only there another
@@ -308,7 +312,9 @@ def likelier_motion(problem: Problem, vector: np.ndarray) -> Motion:
 
 
 def motion_of(log: FlightLog, model: ModelParameters) -> Motion:
-    """Return continuous for a measured log, else the likeliest motion. model: where the search starts.
+    """Return continuous for a measured log, else the likeliest motion.
+
+    model: where the search starts.
 
     Without gyro and attitude a log shows no turns, and the model's own motion is returned.
     """

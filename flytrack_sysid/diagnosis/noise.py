@@ -1,11 +1,11 @@
-"""The noise of residuals: white sensor noise and a wandering disturbance; the filter that whitens them.
+"""Noise of residuals: white sensor noise and a wandering disturbance, and a whitening filter.
 
 Each axis (three of rotation, three of force, one of the battery) has two channels: a direct one,
 ``w`` or ``f``, and a level, ``q``, ``v`` or ``v_bat``, whose rate of change the direct one
 measures. The model of their residuals is
 
     d after = exp(-dt / tau) d + white        disturbance: gusts, vibration, what the model lacks
-    e after = e + coupling d dt + white       what the disturbance, and the fed-in attitude, sum up to
+    e after = e + coupling d dt + white       sum of the disturbance, and of the fed-in attitude
     direct  = d + white                       sensor noise
     level   = e + white                       sensor noise; e begins unknown
 
@@ -107,7 +107,7 @@ def make_gains(noise: Noise, step_s: jax.Array, is_known: jax.Array, counts: jax
 
 
 def innovations(gains: Gains, increments: jax.Array, counts: jax.Array) -> jax.Array:
-    """Return residuals (rows, lanes, axes, 2) as innovations of variance 1; 0 where nothing counts."""
+    """Return residuals (rows, lanes, axes, 2) as innovations of variance 1; 0 if not counted."""
 
     def row(carry: tuple[Any, ...], inputs: tuple[Any, ...]) -> tuple[Any, Any]:
         sum_e, wandered, disturbed = carry
@@ -148,7 +148,7 @@ DIFFERENCE = 1e-4  # of logarithms, for slopes
 
 
 class _Misfit(NamedTuple):
-    """Minus twice the log likelihood of each axis, outliers counted by their size, and its parts."""
+    """Minus twice the log likelihood of each axis, with outliers linear in size, and its parts."""
 
     total: jax.Array
     log_sizes: jax.Array
@@ -172,7 +172,9 @@ def _misfit(
 def _misfit_and_slopes(
     log_noise: jax.Array, *given: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return each axis's misfit (NUM_AXES,), slopes (6, NUM_AXES) and expected curvature (NUM_AXES, 6, 6).
+    """Return each axis's misfit, slopes and expected curvature.
+
+    Shapes are (NUM_AXES,), (6, NUM_AXES) and (NUM_AXES, 6, 6).
 
     Axes do not depend on each other, so that one difference serves all.
     """
@@ -212,7 +214,7 @@ def first_guess(lanes: Lanes, left: np.ndarray) -> np.ndarray:
 
 
 def disturbance_gain(lanes: Lanes, left: np.ndarray, log_noise: np.ndarray) -> np.ndarray:
-    """Return by axis by how much the disturbance lowers minus twice the log likelihood of residuals."""
+    """Return how much a disturbance lowers minus twice the log likelihood, by axis."""
     still = log_noise.copy()
     still[3] = np.log(LEAST_SHARE)
     return np.subtract(*(_total(one, *_given(lanes, left)) for one in (still, log_noise)))
@@ -233,7 +235,7 @@ def _total(log_noise: jax.Array, *given: jax.Array) -> jax.Array:
 
 
 def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-    """Return the noise that makes residuals (rows, lanes, NUM_AXES, 2) most likely, as (6, NUM_AXES).
+    """Return the likeliest noise, (6, NUM_AXES), of residuals (rows, lanes, NUM_AXES, 2).
 
     Fisher scoring with Levenberg damping, every axis by itself.
     """

@@ -52,7 +52,9 @@ PROFILES = ((8.0, 0.5), (1.0, 0.05), (0.1, 0.01))
 
 
 def threshold(num_parameters: int, trimmed: float = LEAST_SHARE, chance: float = CHANCE) -> float:
-    """Return the sup-LM gain of chi2 that so many parameters exceed by chance (Andrews 1993, section 5).
+    """Return the sup-LM gain of chi2 that is exceeded with probability ``chance``.
+
+    Source: Andrews 1993, section 5.
 
     trimmed: share of the log on each side within which no change is looked for. The tail is D.
     DeLong's (Communications in Statistics 10, 1981).
@@ -74,7 +76,7 @@ def windowed_gains(
     own: Sequence[int],
     weights: np.ndarray,
 ) -> np.ndarray:
-    """Return what columns gain, to first order, if they act with a weight in each block, (hypotheses,).
+    """Return the first-order gain of columns that act with a weight in each block, (hypotheses,).
 
     score, information: (blocks, columns) and (blocks, columns, columns); weights: (hypotheses,
     blocks). given: the columns that are free throughout.
@@ -119,7 +121,7 @@ class Hypothesis(NamedTuple):
 
 
 def seconds_of(lanes: Lanes) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first row of each second of a log, and the rows at which something may begin or end.
+    """Return the first row of each second, and the rows at which an effect may begin or end.
 
     Seconds are in the order of ``problem.blocks_of``.
     """
@@ -158,7 +160,10 @@ def _change_of(
     candidate: Candidate,
     seconds: tuple[np.ndarray, ...],
 ) -> Hypothesis | None:
-    """Return the likeliest change of an effect; None where nothing depends on it. seconds: ``seconds_of``."""
+    """Return the likeliest change of an effect; None where nothing depends on it.
+
+    seconds: as of ``seconds_of``.
+    """
     is_named = candidate.effect in model.effects
     columns = [linearization.column(field) for field in candidate.fields]
     own = linearization.acting(columns if is_named else linearization.columns_of(candidate))
@@ -210,7 +215,7 @@ def is_one_flight(log: FlightLog) -> bool:
 
 
 class Profile(NamedTuple):
-    """Rows of the record at which a change was tried, and minus twice the log likelihood; sorted by row."""
+    """Minus twice the log likelihood by row of the record at which a change was tried, sorted."""
 
     rows: np.ndarray
     costs: np.ndarray
@@ -221,7 +226,10 @@ class Profile(NamedTuple):
         return int(self.rows[np.argmin(self.costs)])
 
     def ends95(self, inflation: float) -> tuple[int, int]:
-        """Return the 95 % interval: from the last row tried before those that are as likely, to the next."""
+        """Return the 95 % interval of the row.
+
+        It reaches from the last row tried before the likely ones to the first one after them.
+        """
         likely = np.flatnonzero(self.costs < self.costs.min() + DROP_95 * inflation)
         low, high = max(likely[0] - 1, 0), min(likely[-1] + 1, len(self.rows) - 1)
         return int(self.rows[low]), int(self.rows[high])
@@ -268,7 +276,7 @@ def log_rows(problem: Problem, test: Problem, rows: Sequence[int]) -> np.ndarray
 
 
 def spans_of(selection: Selection, test: Problem, log: FlightLog) -> dict[str, dict[str, Any]]:
-    """Return when effects act that do so for a part of a log only, by name and as fields of a cause.
+    """Return, by effect, when those act that do so in a part of a log only, as fields of a cause.
 
     Onset and end, s of the log's clock, with their 95 % intervals; None without.
     """
@@ -346,7 +354,7 @@ def moved(problem: Problem, row: int, to: int) -> Problem:
 
 
 def with_changes(selection: Selection, test: Problem, log: FlightLog) -> Selection:
-    """Return the selection with effects that begin or end within the log, where that is clearly better.
+    """Return the selection with effects that begin or end within the log, if clearly better.
 
     test: rows held out. A selection whose effects are constant is returned as it is.
     """
@@ -389,7 +397,7 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
 
 
 def misfit(selection: Selection, problem: Problem) -> float:
-    """Return minus twice the log likelihood of the rows of a problem, under a selection and its noise."""
+    """Return minus twice the log likelihood of a problem under a selection and its noise."""
     state, lanes = selection.state, problem.lanes
     assert state.problem.noise is not None
     left = replace(problem, windows=state.problem.windows).residuals(selection.model.vector[None])[
@@ -407,7 +415,7 @@ def windowed(state: SearchState, windows: Sequence[Window]) -> SearchState:
 def _likeliest_side(
     selection: Selection, first: Hypothesis, near: Sequence[str]
 ) -> tuple[SearchState, FittedModel]:
-    """Return the state in which some effects begin, or end, at the row of a change, and a model of it.
+    """Return a state in which effects begin, or end, at the row of a change, and a model of it.
 
     The model has the change's effect and those that have changed before. Where both sides are as
     likely, as of a scale of what is fitted besides, the effect begins.

@@ -1,4 +1,4 @@
-"""Outliers of each channel: rows far beyond the noise, by themselves, and more than chance brings about.
+"""Outliers by channel: isolated rows far beyond the noise, and more than chance brings about.
 
 They count by their size instead of its square (``problem.robust_weight``), so that a few do no
 harm; a reader has to know of them all the same. Errors of a model last, so only runs of a few rows

@@ -1,4 +1,4 @@
-"""A log and all that its model may be: residuals, slopes and whitening for a vector of all parameters.
+"""A log and all that its model may be: residuals, slopes and whitening for parameter vectors.
 
 One program evaluates 20 models at once, another four, each with every effect of the list; a model
 without an effect has it at its neutral value. So no set of effects needs a compilation of its own.
@@ -102,7 +102,10 @@ _gains = jax.jit(noises.make_gains)
 
 
 class Window(NamedTuple):
-    """When an effect acts: in the steps to a row of the record and on, up to another; else it is as given."""
+    """When an effect acts: in the steps to the rows of the record from ``start`` up to ``end``.
+
+    Outside, the effect is as in the given model.
+    """
 
     effect: str
     start: int = -1
@@ -110,7 +113,9 @@ class Window(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """A model's residuals, (rows, lanes, NUM_AXES, 2), and how they change, (num_columns, ...), not whitened.
+    """A model's residuals, and how they change along columns, not whitened.
+
+    residuals: (rows, lanes, NUM_AXES, 2). columns: (num_columns, rows, lanes, NUM_AXES, 2).
 
     places: the parameters of the first columns; ways to other vectors follow.
     """
@@ -153,7 +158,10 @@ class Problem:
         effects: Sequence[Effect] = SEARCHED,
         late: Late | None = None,
     ) -> Self:
-        """Return the problem of lanes and a nominal model that may have some effects, without a noise."""
+        """Return the problem of lanes and a nominal model, without a noise.
+
+        effects: those that the model may have.
+        """
         model = as_replayed(model)
         every = model.with_effects(*(model.effect(effect.name) for effect in effects))
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), every)
@@ -172,14 +180,17 @@ class Problem:
         )
 
     def with_noise(self, noise: np.ndarray | None) -> "Problem":
-        """Return the same problem, weighted by this noise, (6, NUM_AXES), of a problem that has one."""
+        """Return the same problem, weighted by a noise, (6, NUM_AXES), which must not be None."""
         assert noise is not None, "with_noise comes first"
         lanes = self.lanes
         gains = _gains(noises.noise_of(noise), noises.step_to(lanes), lanes.is_known, lanes.counts)
         return replace(self, noise=noise, gains=gains)
 
     def with_law(self, law: LearnedLaw) -> "Problem":
-        """Return the problem of vectors that end with the numbers of a law; at the start its scale is 0."""
+        """Return the problem whose vectors end with the numbers of a law.
+
+        At the start, the scale of the law is 0.
+        """
         like = self.like.with_effects(law._replace(scale=0.0))
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), like)
         names, start = names_of(like), to_vector(like)
@@ -213,7 +224,9 @@ class Problem:
         return self.lanes.counts
 
     def residuals(self, vectors: np.ndarray) -> np.ndarray:
-        """Return residuals of models (num_models, parameters), (num_models, rows, lanes, NUM_AXES, 2).
+        """Return residuals (num_models, rows, lanes, NUM_AXES, 2) of models.
+
+        vectors: (num_models, parameters).
 
         Where an effect's window ends, rows come from another replay: nothing of the effect is
         remembered.
@@ -227,7 +240,7 @@ class Problem:
         )
 
     def _composed(self, vectors: np.ndarray) -> np.ndarray:
-        """Return residuals of models whose effects act within their windows; each row is of a replay."""
+        """Return residuals of models whose effects act in windows; each row is of one replay."""
         found = self._replayed(vectors)
         row = self.lanes.row
         acts = np.stack([(row >= one.start) & (row < one.end) for one in self.windows])
@@ -255,7 +268,10 @@ class Problem:
         return vectors
 
     def whiten(self, left: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
-        """Return residuals (num_models, rows, lanes, NUM_AXES, 2), or those of some axes, as innovations."""
+        """Return residuals as innovations.
+
+        left: (num_models, rows, lanes, NUM_AXES, 2), or of some axes only.
+        """
         assert self.gains is not None, "with_noise comes first"
         gains = jax.tree.map(lambda leaf: np.asarray(leaf)[..., axes], self.gains)
         counts = self.counts[..., axes, :]
@@ -272,7 +288,7 @@ class Problem:
     def nudged(
         self, vector: np.ndarray, places: Sequence[int], share: float = RELATIVE_STEP
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return copies of a vector with one of some places moved each, and by how much, for slopes.
+        """Return copies of a vector, each with one parameter moved, and the steps, for slopes.
 
         One-sided differences, into the bounds: an effect may be defined on one side of neutral
         only. share: of a parameter's scale.
@@ -318,7 +334,7 @@ def vector_of(model: ModelParameters) -> np.ndarray:
 
 
 def _longest(names: Sequence[str], lanes: Lanes) -> np.ndarray:
-    """Return the longest delays, s, for the steps that effects remember; infinity for other parameters."""
+    """Return the longest delays that effects remember, s; infinity for other parameters."""
     step_s = float(np.median(lanes.record.step_s))
     fields = [name.partition(".") for name in names]
     steps = [
@@ -337,7 +353,7 @@ def _scale(name: str, value: float) -> float:
 
 
 def robust_weight(white: np.ndarray) -> np.ndarray:
-    """Return weights of innovations with which outliers count by their size, not its square (Huber)."""
+    """Return Huber weights of innovations: outliers count by their size, not its square."""
     return noises.OUTLIER / np.maximum(np.abs(white), noises.OUTLIER)
 
 
@@ -347,7 +363,10 @@ def robust_square(white: np.ndarray) -> float:
 
 
 def blocks_of(values: np.ndarray) -> np.ndarray:
-    """Return (..., rows, lanes, axes, 2) as (blocks, ..., numbers), a second each, without the lead-in."""
+    """Reshape (..., rows, lanes, axes, 2) to blocks of a second, (blocks, ..., numbers).
+
+    The lead-in is left out.
+    """
     rows, lanes = values.shape[-4:-2]
     kept = values[..., lead_in_of(rows) :, :, :, :]
     second = kept.shape[-4] // LANE_S

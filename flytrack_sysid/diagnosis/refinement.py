@@ -1,4 +1,4 @@
-"""Refinement: effects and their values are judged by how far ahead a model predicts, on rows held out.
+"""Refinement: judge effects and their values by how far ahead a model predicts held-out rows.
 
 One-step residuals say what a model lacks; where they leave something unexplained, a law that stands
 in for it may fit every step and yet fly off. So free flights of 0.1 to 2 s are started from
@@ -85,24 +85,30 @@ class Tested(NamedTuple):
         return np.square(self.errors).sum(axis=-1)
 
     def rms(self) -> np.ndarray:
-        """Return the rms size of the errors, (models, horizons, quantities); not a number without any."""
+        """Return the rms size of the errors, (models, horizons, quantities); NaN without any."""
         number = self.windows.counts.sum(axis=1)
         mean = self.squares.sum(axis=2) / np.maximum(number, 1)
         return np.where(number > 0, np.sqrt(mean), np.nan)
 
     def by_block(self, scale: np.ndarray) -> np.ndarray:
-        """Return mean squares over those of ``scale``, (horizons, quantities), (models, blocks, ...)."""
+        """Return what each block adds to the relative mean squares, (models, blocks, ...).
+
+        scale: the errors they are relative to, (horizons, quantities).
+        """
         number = np.maximum(self.windows.counts.sum(axis=1), 1)
         relative = self.squares / (np.square(scale) * number)[:, None]
         return self.windows.sums_by_block(np.moveaxis(relative, 2, 0)).swapaxes(0, 1)
 
     @property
     def scale(self) -> np.ndarray:
-        """The rms errors of the first model, to divide by, (horizons, quantities); 1 where there are none."""
+        """The rms errors of the first model to divide by, (horizons, quantities); 1 if none."""
         return np.maximum(np.nan_to_num(self.rms()[0], nan=1.0), 1e-9)
 
     def against(self, base: "Tested") -> tuple[np.ndarray, np.ndarray]:
-        """Return the errors over a base's, (horizons, quantities), and by how many standard errors larger."""
+        """Return the errors over a base's, and by how many standard errors they are larger.
+
+        Both are (horizons, quantities).
+        """
         lost = self.by_block(base.scale)[0] - base.by_block(base.scale)[0]
         return self.rms()[0] / base.scale, sureness(lost)
 
@@ -121,7 +127,10 @@ def _errors(vectors: jax.Array, like: ModelParameters, windows: Windows) -> jax.
 
 
 def errors_at(problem: Problem, vectors: np.ndarray, windows: Windows) -> Tested:
-    """Return the errors of models, (num_vectors, num_parameters), on windows; one program for all."""
+    """Return the errors of models on windows; one compiled program serves all.
+
+    vectors: (num_vectors, num_parameters).
+    """
 
     def of_batch(part: np.ndarray) -> np.ndarray:
         found = [np.asarray(_errors(part, problem.like, chunk)) for chunk in chunks_of(windows)]
@@ -155,7 +164,7 @@ def _changes(windows: Windows) -> np.ndarray:
 
 
 def placebo_errors(learnt: Windows, judged: Windows) -> np.ndarray:
-    """Return the errors of a ridge regression on the state at the start, (1, horizons, windows, ...)."""
+    """Return the errors of ridge regression on the start state, (1, horizons, windows, ...)."""
     known, wanted = _regressors(learnt), _changes(learnt)
     mean, spread = known.mean(axis=0), known.std(axis=0) + 1e-9
     rows, others = (
@@ -193,7 +202,10 @@ class Fit(NamedTuple):
 
 
 class Target(NamedTuple):
-    """What a fit makes small: errors on windows over a scale, (horizons, quantities); 0 is not fitted."""
+    """What a fit minimises: errors on windows, relative to a scale.
+
+    scale: (horizons, quantities). is_fitted: cells that the fit takes into account.
+    """
 
     problem: Problem
     windows: Windows
@@ -212,7 +224,7 @@ class Target(NamedTuple):
         return robust + np.square(vectors - self.problem.start) @ prior_information(self.problem)
 
     def fitted(self, vector: np.ndarray, places: Sequence[int], rounds: int) -> Fit:
-        """Return the model of least cost from a vector on, by damped Gauss-Newton with one-sided slopes."""
+        """Fit a model, starting from a vector, by damped Gauss-Newton with one-sided slopes."""
         problem, at = self.problem, np.array(places, int)
         vector = problem.clipped(vector)
         for number in range(rounds + 1):
@@ -261,7 +273,7 @@ class Target(NamedTuple):
 
 
 class Judge(NamedTuple):
-    """Held-out windows, the refitted base's errors there and the placebo's; what cells are evidence.
+    """Held-out windows, errors of the refitted base and the placebo there, and cells of evidence.
 
     scale: the base's rms errors, (horizons, quantities). matters: (horizons, quantities) bool, a
     model that is given the commands predicts better than the placebo.
@@ -295,7 +307,7 @@ class Judge(NamedTuple):
         return errors_at(self.problem, np.stack(vectors), self.windows)
 
     def seeing(self, vector: np.ndarray) -> "Judge":
-        """Return the judge with those cells as evidence, too, in which a model beats the placebo."""
+        """Return the judge that also counts cells as evidence where a model beats the placebo."""
         lost = self.placebo.by_block(self.scale)[0] - self.tested(vector).by_block(self.scale)[0]
         beats = sureness(lost) > SURE_OF_COMMANDS
         return self._replace(matters=self.matters | (beats & self.is_known))
@@ -306,7 +318,10 @@ class Judge(NamedTuple):
         return bool(np.any(self.is_known & (ratio > LIKELY_WORSE) & (lost > SURELY_WORSE)))
 
     def worst_ratio(self, vector: np.ndarray) -> float:
-        """Return the largest of a model's errors over the base's where it is worse; below 1 where none is."""
+        """Return the largest ratio of a model's errors to the base's where it is worse.
+
+        0 where it is nowhere worse.
+        """
         ratio, lost = self.tested(vector).against(self.base)
         is_worse = (ratio > LIKELY_WORSE) & (lost > np.where(self.matters, LIKELY, WORSE_ANYWHERE))
         return float(np.max(ratio[self.is_known & is_worse], initial=0.0))
@@ -353,7 +368,7 @@ class Refined(NamedTuple):
         return {name: float(cost) for name, cost in zip(self.without, costs, strict=True)}
 
     def vector_without(self, effect: str) -> np.ndarray:
-        """Return the fitted model without an effect, or with base parameters at their nominal values."""
+        """Return the fitted model without an effect, or with nominal base parameters."""
         assert self.fit is not None
         if effect in self.without:
             return self.without[effect]
@@ -400,7 +415,7 @@ def at_bounds(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> li
 
 
 def widened(problem: Problem, fields: Sequence[str]) -> Problem:
-    """Return the problem with twice the range for some parameters, except for how far rows are remembered.
+    """Return the problem with twice the range for some parameters, but not for remembered delays.
 
     What is not negative stays so; what is one-sided stays one-sided.
     """
@@ -550,7 +565,7 @@ def _acting(
 
 
 def _is_neutral(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> bool:
-    """Return whether parameters are as in the nominal model, those apart that only shape what others do."""
+    """Return whether parameters are nominal, apart from those that only shape what others do."""
     own = [
         name
         for name in fields
@@ -561,7 +576,7 @@ def _is_neutral(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> 
 
 
 def _probed(problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate]) -> np.ndarray:
-    """Return the vector with parameters that are looked for at probes, and still neutral, at the probes."""
+    """Return the vector with those probed parameters that are still neutral at their probes."""
     result = vector.copy()
     for probe in (probe for one in candidates for probe in one.probes):
         if _is_neutral(problem, vector, [probe.field]):
@@ -583,7 +598,7 @@ def table_of(tested: np.ndarray) -> dict[str, dict[str, float]]:
 
 
 def reduced(selection: Selection, refined: Refined) -> Selection:
-    """Return the selection with only those effects that a refinement kept; its base alone without any.
+    """Return the selection with only the effects that a refinement kept; the base if it kept none.
 
     Where none was fitted to flights, as sensors that flights do not see, single steps decide; the
     base alone stands where it flies better.
@@ -619,7 +634,10 @@ def _narrowed(selection: Selection, kept: Sequence[Candidate]) -> Selection:
 
 
 def _flies_worse(selection: Selection, judge: Judge | None) -> bool:
-    """Return whether a model predicts held-out flights after its last change worse than its base does."""
+    """Return whether a model predicts held-out flights worse than its base does.
+
+    The model is the one after its last change within the log.
+    """
     if judge is None:
         return False
     vector = selection.state.problem.without(selection.model.vector, ended(selection))

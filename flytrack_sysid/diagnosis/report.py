@@ -1,4 +1,4 @@
-"""Writing a diagnosis: ``report.html``, ``diagnosis.json``, the extended model, and a few lines of text."""
+"""Write a diagnosis: ``report.html``, ``diagnosis.json``, the extended model, and text."""
 
 import json
 from collections import Counter
@@ -47,16 +47,20 @@ WRONG = "has the wrong value of"
 LOG_BARS = 20.0  # times the smallest error: from there on bars would vanish on an even scale
 MOST_LIMITS = 8  # rows of the text's table of what a log could not show
 CHANNEL_WORDS = {"rates": "body rates", "force": "specific force"}
-DIFFERENCES = "The log lacks a gyro or an accelerometer; attitude or velocity replace them, by their change per row."
+DIFFERENCES = (
+    "The log lacks a gyro or an accelerometer; attitude or velocity replace them, by their change "
+    "per row."
+)
 HOW = (
-    "Every step of the log is predicted from the row before it. The model carries on what follows from the "
-    "commands alone; attitude, velocity, position and voltage are taken from the log.",
-    "A cause is named where it explains more than chance on the fitted part, where the held-out part does "
-    "not contradict it, and where no other cause explains more.",
-    "In the plot of a cause, orange dots are what the extended model leaves without this one cause and with "
-    "nothing else refitted. The line is the difference between both models. Blue rings are what is left.",
-    "Residuals are measured minus modelled. Forces are specific forces along the body's axes, thrust along "
-    "z, except where world axes are given; rates are about the body's axes.",
+    "Every step of the log is predicted from the row before it. The model carries on what follows "
+    "from the commands alone; attitude, velocity, position and voltage are taken from the log.",
+    "A cause is named where it explains more than chance on the fitted part, where the held-out "
+    "part does not contradict it, and where no other cause explains more.",
+    "In the plot of a cause, orange dots are what the extended model leaves without this one cause "
+    "and with nothing else refitted. The line is the difference between both models. Blue rings "
+    "are what is left.",
+    "Residuals are measured minus modelled. Forces are specific forces along the body's axes, "
+    "thrust along z, except where world axes are given; rates are about the body's axes.",
     "Pictures show the whole log, the table of errors the held-out part.",
 )
 
@@ -103,7 +107,7 @@ def _confused(cause: Cause) -> str:
 
 
 def _faults(diagnosis: Diagnosis) -> str:
-    """Return what the model lacks, has too much or too little of, or has a wrong value of, as a sentence."""
+    """Return a sentence on what the model lacks, has too much or too little of, or has wrong."""
     by_fault: dict[str, list[str]] = {}
     for cause in diagnosis.causes:
         alike = () if cause.effect == "thrust_scale" else cause.equivalent[:MOST_LISTED]
@@ -137,7 +141,7 @@ def fault_of(cause: str, diagnosis: Diagnosis) -> str:
 
 
 def _gain(diagnosis: Diagnosis) -> str:
-    """Return how much closer the extended model flies, as a sentence; nothing where that is not known."""
+    """Return a sentence on how much closer the extended model flies; empty where unknown."""
 
     def error(model: str) -> float:
         found = diagnosis.error[model].position_m if model in diagnosis.error else {}
@@ -171,7 +175,7 @@ def _closer(before: float, after: float) -> str:
 
 
 def _beyond(diagnosis: Diagnosis) -> str:
-    """Return what has a value at the end of what is searched, as a sentence; nothing without any."""
+    """Return a sentence on effects with a value at the end of its range; empty without any."""
     listed = "; ".join(f"{words_of(cause.effect)} ({cause.beyond})" for cause in diagnosis.beyond)
     return f"Beyond the list, so that its cause may be another: {listed}." if listed else ""
 
@@ -216,7 +220,10 @@ def _causes_part(diagnosis: Diagnosis) -> Part:
         ]
         for cause in diagnosis.causes
     ]
-    caption = "Values with 95 % intervals. Gain: fall of minus twice the log likelihood on the held-out part."
+    caption = (
+        "Values with 95 % intervals. Gain: fall of minus twice the log likelihood on the held-out "
+        "part."
+    )
     return Table(
         ["cause", "parameters", "gain", "could it be another?"], rows, caption, is_text=True
     )
@@ -248,8 +255,9 @@ def _errors_table(diagnosis: Diagnosis) -> Table:
         for stick in diagnosis.half_response_s.get("extended", {})
     ]
     caption = (
-        "Held-out part. One step: 1 is as bad as predicting the mean; position in free flight, rms. Half "
-        "response: of body rate or thrust to a small step of the stick; in brackets, to full stick."
+        "Held-out part. One step: 1 is as bad as predicting the mean; position in free flight, "
+        "rms. Half response: of body rate or thrust to a small step of the stick; in brackets, to "
+        "full stick."
     )
     return Table(
         ["error", "unit", *(name.replace("_", " ") for name in diagnosis.error)], rows, caption
@@ -308,7 +316,8 @@ def _half_response(found: HalfResponse | None) -> str:
 def _limits_part(diagnosis: Diagnosis) -> Part:
     if not diagnosis.not_identifiable:
         return Text(
-            "This log could have shown every effect that is looked for, and told it from all others."
+            "This log could have shown every effect that is looked for, and told it from all "
+            "others."
         )
     rows = [
         [
@@ -352,13 +361,13 @@ def _learned_parts(diagnosis: Diagnosis, found: Traces) -> list[Part]:
 
 _LESS, LEARNT = "without ", "what was learnt"
 LEARNT_READING = (
-    "Orange: what the extended model leaves without it, nothing else refitted. The line is what was learnt. "
-    "It holds in the ranges that were flown."
+    "Orange: what the extended model leaves without it, nothing else refitted. The line is what "
+    "was learnt. It holds in the ranges that were flown."
 )
 
 
 def traces_of(diagnosis: Diagnosis, log: FlightLog) -> Traces:
-    """Return the residuals of both models, and of the extended one less each cause ("without ...")."""
+    """Return the residuals of both models, and of the extended one "without" each cause."""
     models = {"nominal": diagnosis.nominal, "extended": diagnosis.extended}
     for cause in diagnosis.causes:
         models[_LESS + cause.effect] = without(diagnosis.extended, diagnosis.nominal, cause.effect)
@@ -378,7 +387,10 @@ def while_acting(found: Traces, cause: Cause, start_s: float) -> Traces:
 
 
 def _evidence_parts(diagnosis: Diagnosis, found: Traces, start_s: float) -> list[Part]:
-    """Return the pictures of the causes that gain most; found: of ``traces_of``; start_s: of the log."""
+    """Return the pictures of the causes that gain most.
+
+    found: of ``traces_of``. start_s: the log's first time.
+    """
     parts: list[Part] = []
     for cause in sorted(diagnosis.causes, key=lambda cause: -cause.chi2_gain)[:MOST_PICTURED]:
         evidence = EVIDENCE[cause.effect]
@@ -401,7 +413,8 @@ def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
     introduction: list[Part] = [
         verdict_of(diagnosis),
         Text(
-            f"{diagnosis.source}: {len(log)} rows, {minutes:.1f} min. SHA-256 {diagnosis.sha256[:12]}."
+            f"{diagnosis.source}: {len(log)} rows, {minutes:.1f} min. SHA-256 "
+            f"{diagnosis.sha256[:12]}."
         ),
         _causes_part(diagnosis),
     ]
@@ -461,7 +474,8 @@ def text_of(diagnosis: Diagnosis) -> str:
         names = [words_of(one) if one == DRIFT else one for one in cause.equivalent]
         twins = f"; not told apart from {', '.join(names)}" if names else ""
         lines.append(
-            f"  {cause.effect}{when_of(cause)}: {values}; held-out gain {cause.heldout_gain:.4g}{twins}"
+            f"  {cause.effect}{when_of(cause)}: {values}; held-out gain "
+            f"{cause.heldout_gain:.4g}{twins}"
         )
     for cause in diagnosis.beyond:
         lines.append(f"beyond the list: {cause.effect}: {cause.beyond}")

@@ -42,7 +42,7 @@ class Estimated:
     def around(
         cls, value: float, half: float, unit: str, low: float = -np.inf, high: float = np.inf
     ) -> "Estimated":
-        """Return a value with an interval of so much to both sides, cut at the ends of its range."""
+        """Return a value with a symmetric interval, cut at the ends of the value's range."""
         return cls(value, (max(value - half, low), min(value + half, high)), unit)
 
     @property
@@ -157,7 +157,9 @@ class Prediction:
 
 @dataclass(frozen=True)
 class HalfResponse:
-    """Time from a step of a stick to half of the response, s: of a small step and of one to full stick.
+    """Time from a step of a stick to half of the response, s.
+
+    time: of a small step. full_stick: of a step to full stick.
 
     ci95: 95 % interval of the small step's; None where the model was not fitted. As in
     ``flytrack_sysid.response``; not a number where there is no response.
@@ -214,7 +216,7 @@ class Diagnosis:
     learned: Learned | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """Return the content of diagnosis.json: the fields under the names of its schema, six digits."""
+        """Return the content of diagnosis.json: fields by the names of its schema, six digits."""
         causes, negligible, beyond = _plain((self.causes, self.negligible, self.beyond))
         limits, unexplained = _plain((self.not_identifiable, self.unexplained))
         unexplained["times_sensor_noise"] = unexplained.pop("shares")
@@ -247,7 +249,7 @@ class Diagnosis:
 
 
 def _plain(value: Any) -> Any:
-    """Return dataclasses as JSON values: numbers with six digits, None for those that are not finite."""
+    """Return dataclasses as JSON values: numbers with six digits, None for non-finite ones."""
     if is_dataclass(value):
         value = {one.name: getattr(value, one.name) for one in fields(value)}
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""The score test: what freeing parameters would gain to first order, from one linearization of a log.
+"""The score test: the first-order gain of freeing parameters, from one linearization of a log.
 
 A ``Linearization`` has a model's whitened residuals and their slopes along every parameter, summed
 up over blocks of a second. Gains are divided by how much more the scores of blocks vary than
@@ -75,7 +75,7 @@ class Candidate(NamedTuple):
 
     @property
     def groups(self) -> list[tuple[str, ...]]:
-        """Its fields by what changes together: several groups of an effect whose settings are independent."""
+        """Its fields by what changes together; several groups if its settings are independent."""
         fields = set(self.fields)
         own = [
             one.fields
@@ -86,7 +86,10 @@ class Candidate(NamedTuple):
         return largest if BY_NAME[self.effect].search.is_setting else [self.fields]
 
     def excludes(self, other: "Candidate") -> bool:
-        """Return whether a model has either: ways of one effect, but for settings that no group connects."""
+        """Return whether a model can have only one of two candidates.
+
+        Candidates of one effect exclude each other, except settings that no group connects.
+        """
         if self.effect != other.effect or not BY_NAME[self.effect].search.is_setting:
             return self.effect == other.effect
         own, theirs = {*self.fields}, {*other.fields}
@@ -127,7 +130,7 @@ CANDIDATES = [candidate for effect in SEARCHED for candidate in candidates_of(ef
 
 
 def candidates_for(problem: Problem) -> list[Candidate]:
-    """Return the ways to look for effects: of the list, and what settings of the craft may be changed."""
+    """Return the candidates: effects of the list, and settings of the craft that may be changed."""
     given = [BY_NAME[name] for name in problem.given_effects if BY_NAME[name].search.is_setting]
     return [
         *CANDIDATES,
@@ -265,7 +268,7 @@ class Linearization:
         return solve(self.total[np.ix_(columns, columns)], self.score[columns])
 
     def step_inside(self) -> np.ndarray:
-        """Return the step along all places that explains most within bounds; those stuck there stay."""
+        """Return the best step along all places within bounds; parameters stuck at one stay."""
         return step_inside(
             self.problem,
             self.vector,
@@ -276,13 +279,16 @@ class Linearization:
     def projected(
         self, columns: Sequence[int], given: Sequence[int]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return information about columns with given ones projected out, and the shares of these in them."""
+        """Return information about columns with given ones projected out, and the projection.
+
+        The projection is the shares of the given columns in the others, (given, columns).
+        """
         across = self.total[np.ix_(given, columns)]
         share = solve(self.total[np.ix_(given, given)], across)
         return self.total[np.ix_(columns, columns)] - across.T @ share, share
 
     def gain(self, added: Sequence[int], given: Sequence[int]) -> Gain | None:
-        """Return what freeing ``added`` columns besides ``given`` ones gains; None where those do the same.
+        """Return the gain of freeing ``added`` besides ``given`` columns; None if these suffice.
 
         Columns that those nearly replace are left out, and their step is 0.
         """
@@ -296,7 +302,10 @@ class Linearization:
         return found._replace(step=whole)
 
     def freed(self, added: list[int], given: list[int]) -> Gain:
-        """Return what freeing ``added`` columns besides ``given`` ones gains; none may replace another."""
+        """Return the gain of freeing ``added`` columns besides ``given`` ones.
+
+        None of them may nearly replace another.
+        """
         own, share = self.projected(added, given)
         score = self.score[added] - share.T @ self.score[given]
         step = solve(own, score)
@@ -307,7 +316,7 @@ class Linearization:
         return Gain(float(score @ step), inflation_of(own, blocks), step, both[: len(given)], own)
 
     def gain_of(self, candidate: Candidate, given: Sequence[int]) -> Gain | None:
-        """Return the gain of a candidate; None where others do the same, or no probe lies the right way.
+        """Return the gain of a candidate; None if others do the same or no probe lies ahead.
 
         Parameters that begin at neutral do not move away from their probes; the step of those is 0.
         """
@@ -349,7 +358,7 @@ def step_inside(
     places: Sequence[int] | np.ndarray,
     step_along: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
-    """Return the step from a vector along places that stays within bounds; those stuck there do not move.
+    """Return the step along places that stays within bounds; parameters stuck at one do not move.
 
     step_along: the best step along those that are free, (num_places,) bool.
     """

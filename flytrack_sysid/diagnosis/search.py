@@ -1,4 +1,4 @@
-"""The search: effects are added one after the other, each refitted together with all that came before."""
+"""The search: add effects one by one, and refit each together with all before it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -37,7 +37,7 @@ STEP_SHARES = np.array([1.0, 0.5, 0.2, 0.05])[:SMALL_BATCH]
 
 
 class FittedModel(NamedTuple):
-    """A fitted model: its effects (and in which way each was found), vector, cost, and free places."""
+    """A fitted model: its effects as candidates, its vector, cost, and free places."""
 
     candidates: tuple[Candidate, ...]
     vector: np.ndarray
@@ -59,7 +59,10 @@ class FittedModel(NamedTuple):
         return next(one for one in self.candidates if one.effect == effect)
 
     def lacks(self, candidate: Candidate) -> bool:
-        """Return whether an effect may be added: the model does not have it, or only other settings of it."""
+        """Return whether an effect may be added.
+
+        The model does not have it, or has only other settings of it.
+        """
         return not any(one.excludes(candidate) for one in self.candidates)
 
     def joined_by(self, candidate: Candidate) -> tuple[Candidate, ...]:
@@ -71,7 +74,7 @@ class FittedModel(NamedTuple):
 
 
 class Held(NamedTuple):
-    """A base parameter held at its nominal value, since an effect explains it away ("" if none does)."""
+    """A base parameter held at nominal; effect: what explains its change, "" if none does."""
 
     field: str
     effect: str
@@ -126,7 +129,10 @@ class SearchState:
         return replace(self, problem=self.problem.with_noise(noise))
 
     def linearized(self, vector: np.ndarray) -> tuple["SearchState", Linearization]:
-        """Return the linearization along everything, and the state that has it; slopes nearby serve again."""
+        """Return the state that has a linearization along everything, and the linearization.
+
+        Slopes of a nearby linearization are used again.
+        """
         problem, last = self.problem, self.linearization
         if last is not None and last.places == self.every_place and last.distance(vector) < STALE:
             if last.noise is not problem.noise:
@@ -148,7 +154,10 @@ class SearchState:
         vector: np.ndarray,
         nearby: Linearization | None = None,
     ) -> FittedModel:
-        """Return the model with these effects that fits best, from a vector. nearby: as in ``refine``."""
+        """Return the best fit of the model with these effects, starting from a vector.
+
+        nearby: as in ``refine``.
+        """
         effects = [place for one in candidates for place in self.problem.index(one.fields)]
         places = self.base_places + effects
         vector, cost = refine(self.problem, vector, places, nearby)
@@ -158,7 +167,7 @@ class SearchState:
 def refine(
     problem: Problem, vector: np.ndarray, places: Sequence[int], nearby: Linearization | None = None
 ) -> tuple[np.ndarray, float]:
-    """Return the model of least cost along some places, from a vector, and its cost, by Gauss-Newton.
+    """Minimise the cost along some places by Gauss-Newton; return the vector and its cost.
 
     Slopes are kept while little is gained: residuals cost a tenth of them. nearby: a linearization
     whose slopes serve at first.
@@ -245,7 +254,7 @@ def add_effect(
 
 
 def _on_the_way(problem: Problem, model: FittedModel, scored: Scored) -> np.ndarray:
-    """Return the vector at the shares of the ways to probes that explain most, all else moved along."""
+    """Return the vector at the best shares of the ways to probes, with all else moved along."""
     candidate, gain = scored
     vector = model.vector.copy()
     vector[list(model.places)] += gain.given_step
@@ -260,7 +269,7 @@ def _on_the_way(problem: Problem, model: FittedModel, scored: Scored) -> np.ndar
 def add_best(
     state: SearchState, linearization: Linearization, model: FittedModel
 ) -> FittedModel | None:
-    """Return the model with the effect added that explains most; None where none explains enough."""
+    """Return the model with the best effect added; None where none explains enough."""
     ranked = [
         one
         for one in score_candidates(state, linearization, model)
@@ -284,7 +293,7 @@ def add_best(
 
 
 def add_effects(state: SearchState, model: FittedModel) -> tuple[SearchState, FittedModel]:
-    """Return the model with all effects added that explain enough, the best first; the same if none does."""
+    """Add effects while one explains enough, the best first; return the model, the same if none."""
     while len(model.candidates) < MOST_EFFECTS:
         state, linearization = state.linearized(model.vector)
         more = add_best(state, linearization, model)
@@ -295,7 +304,7 @@ def add_effects(state: SearchState, model: FittedModel) -> tuple[SearchState, Fi
 
 
 def saturated_residuals(linearization: Linearization) -> np.ndarray:
-    """Return what a model leaves with every effect at once, one step away, regularised by the prior.
+    """Return the residuals one step towards every effect at once, regularised by the prior.
 
     Noise is fitted to this, so that a missing effect is not mistaken for noise.
     """
@@ -308,7 +317,7 @@ def saturated_residuals(linearization: Linearization) -> np.ndarray:
 
 
 def search(state: SearchState) -> tuple[SearchState, FittedModel, FittedModel]:
-    """Return the state with its noise, the base refitted without effects, and the model with effects.
+    """Return the state with its noise, the refitted base, and the model with effects.
 
     Noise and effects take turns: a large effect hides small ones as long as its remainder passes
     for noise.

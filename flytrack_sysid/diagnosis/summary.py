@@ -1,4 +1,4 @@
-"""From a selected model to a diagnosis: causes with intervals, limits, errors on held-out rows, warnings."""
+"""Turn a selected model into a diagnosis: causes, limits, errors on held-out rows, warnings."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -63,7 +63,7 @@ STILL = (*MAX_RATES, DRAIN, *THRUST_COEFFS)  # a model where these are 0 does no
 def estimates(
     linearization: Linearization, model: FittedModel, fields: Sequence[str]
 ) -> dict[str, Estimated]:
-    """Return values and 95 % intervals of parameters that the log determines, by name without the effect."""
+    """Return values and 95 % intervals of determined parameters, by name without the effect."""
     problem = linearization.problem
     halves = Marginal(linearization, model, fields).half_widths()
     result, least = {}, halves.min()  # at least one parameter of each effect is listed
@@ -81,7 +81,7 @@ def estimates(
 
 
 def mean_thrust(problem: Problem) -> np.ndarray:
-    """Return the mean thrust of the rows that are judged, N, per unit of each thrust coefficient, (6,)."""
+    """Return the mean thrust of judged rows, N, per unit of each thrust coefficient, (6,)."""
     record, flown = problem.lanes.record, problem.counts.any(axis=(2, 3))
     return np.array(
         [
@@ -96,7 +96,9 @@ def mean_thrust(problem: Problem) -> np.ndarray:
 
 
 def mean_factor(problem: Problem, vector: np.ndarray, half_n: float) -> dict[str, Estimated]:
-    """Return how much more thrust there is in the mean than the nominal model has: coefficients tell nobody.
+    """Return the ratio of the mean thrust to that of the nominal model.
+
+    Individual coefficients are not interpretable.
 
     half_n: half of the 95 % interval of the mean thrust, N. Empty where the nominal one has none.
     """
@@ -196,7 +198,7 @@ def effect_causes(
 
 
 def _is_remainder(cause: Cause, others: Sequence[Cause]) -> bool:
-    """Return whether a cause gains next to nothing beside another that shows in the same channels."""
+    """Return whether a cause gains next to nothing beside another one in the same channels."""
     side = next(names for names in CHANNELS if cause.channel in names)
     most = max((one.chi2_gain for one in others if one.channel in side), default=0.0)
     return cause.chi2_gain < vetoes.BASE_REMAINDER * most
@@ -248,7 +250,7 @@ def vector_without(
 def _refitted_to_first_order(
     linearization: Linearization, model: FittedModel, fields: Sequence[str]
 ) -> np.ndarray:
-    """Return the vector with some parameters at nominal and the rest fitted again, to first order."""
+    """Return the vector with some parameters at nominal, the rest refitted to first order."""
     problem = linearization.problem
     places, less = problem.index(fields), problem.at_start(model.vector, fields)
     others = [place for place in model.places if place not in set(places)]
@@ -262,7 +264,7 @@ def _refitted_to_first_order(
 def _as_thrust_scale(
     cause: Cause, change: BaseChange, problem: Problem, model: FittedModel
 ) -> Cause:
-    """Return the cause as a scale of thrust if it is a curve, and one factor explains all of its change."""
+    """Return a thrust curve as a scale of thrust if one factor explains all of its change."""
     if cause.effect != "thrust_curve":
         return cause
     places, information = problem.index(change.fields), change.marginal.information
@@ -283,7 +285,7 @@ def _as_thrust_scale(
 def not_identifiable(
     state: SearchState, linearization: Linearization, model: FittedModel, causes: Sequence[Cause]
 ) -> tuple[NotIdentifiable, ...]:
-    """Return what the log could not have shown, and causes it cannot tell from others, with what to fly."""
+    """Return effects that the log could not show or tell from others, with what to fly."""
     limits = unseen_effects(state, linearization, model)
     twins: dict[str, tuple[str, ...]] = {}
     for cause in causes:
@@ -316,7 +318,7 @@ def verdict_of(causes: Sequence[Cause], rest: Unexplained) -> str:
 
 
 def model_of(problem: Problem, model: FittedModel) -> ModelParameters:
-    """Return a fitted model in float32, with the effects that it has and those the nominal one had."""
+    """Return a fitted model in float32, with its effects and those of the nominal model."""
     found = as_float32(from_vector(model.vector, problem.like))
     kept = model.effects | set(problem.given_effects)
     return found._replace(
@@ -362,7 +364,7 @@ def _rms(left: np.ndarray, counts: np.ndarray, is_centred: bool = False) -> np.n
 
 
 def _free_flight_floor(problem: Problem) -> dict[str, float]:
-    """Return the position errors of free flight that come from noise in its start alone, m, by horizon."""
+    """Return the free-flight position errors due to noise at the start alone, m, by horizon."""
     level = np.asarray(problem.fitted_noise.level)
     speed, tilt = np.sqrt(np.sum(level[3:6] ** 2)), np.sqrt(np.sum(level[:2] ** 2))
     gravity = float(problem.like.g)
@@ -375,7 +377,7 @@ def _free_flight_floor(problem: Problem) -> dict[str, float]:
 def errors_of(
     test: Problem, vectors: Mapping[str, np.ndarray], prediction: Prediction
 ) -> dict[str, Errors]:
-    """Return errors of models on held-out rows, by name, and what the sensors' noise alone would leave.
+    """Return errors of models on held-out rows, by name, and those of sensor noise alone.
 
     One-step errors are relative to those of a model that does not move, whose residuals are the
     measured changes themselves, less their mean.
@@ -407,7 +409,7 @@ def errors_of(
 
 
 def _is_beyond(problem: Problem, vector: np.ndarray, field: str) -> str:
-    """Return which way a parameter would go if it were searched farther; nothing within its range."""
+    """Return which way a parameter would go beyond its range; empty within the range."""
     if not at_bounds(problem, vector, [field]):
         return ""
     place = problem.names.index(field)
@@ -420,7 +422,7 @@ def _is_beyond(problem: Problem, vector: np.ndarray, field: str) -> str:
 def causes_at_end(
     selection: vetoes.Selection, refined: Refined, test: Problem
 ) -> tuple[Cause, ...]:
-    """Return effects with a value at the end of what is searched, as causes that say which way it would go.
+    """Return effects with a value at the end of its range, as causes that say which end.
 
     Left out are values that the log does not determine, which end anywhere, and delays that end at
     how many rows are remembered: their law holds.
@@ -456,7 +458,7 @@ def causes_at_end(
 def with_refined_values(
     causes: Sequence[Cause], refined: Refined, vector: np.ndarray
 ) -> tuple[Cause, ...]:
-    """Return causes with the values and intervals of a refinement, and which of them are at a bound."""
+    """Return causes with refined values and intervals, and which of the values are at a bound."""
     problem, fit = refined.problem, refined.fit
     half = {} if fit is None else dict(zip(fit.places, fit.half_widths, strict=True))
     result = []
@@ -489,7 +491,7 @@ def with_refined_values(
 
 
 def prediction_of(refined: Refined, vectors: Mapping[str, np.ndarray]) -> Prediction:
-    """Return how far ahead models predict held-out flights; nothing where too few could be judged."""
+    """Return how far ahead models predict held-out flights; empty if too few could be judged."""
     judge = refined.judge
     if judge is None:
         return Prediction()
@@ -563,8 +565,8 @@ def refinement_notes(refined: Refined, model: FittedModel) -> list[str]:
     ]
     if silent and refined.fit is not None:
         notes.append(
-            f"after {', '.join(silent)} a placebo that knows the state at the start and no commands "
-            "predicts these flights as well as the models: nothing is named from there"
+            f"after {', '.join(silent)} a placebo that knows the state at the start and no "
+            "commands predicts these flights as well as the models: nothing is named from there"
         )
     return notes
 
@@ -609,8 +611,8 @@ def given_law_notes(problem: Problem, rest: Unexplained) -> list[str]:
     if not problem.has_given_law or not rest.shares:
         return []
     return [
-        "the model has learned_law from another log: nothing is learnt beside that; diagnose the model "
-        "without it to learn from this log"
+        "the model has learned_law from another log: nothing is learnt beside that; diagnose the "
+        "model without it to learn from this log"
     ]
 
 
@@ -620,8 +622,8 @@ def unseen_at_rest_notes(rejected: Mapping[str, vetoes.Veto]) -> list[str]:
     if not names:
         return []
     return [
-        f"{names}: not named, since dynamics of the rate loop that no list has would look the same while "
-        "sticks move; fly stick_amplitudes, and hold each stick for a second"
+        f"{names}: not named, since dynamics of the rate loop that no list has would look the same "
+        "while sticks move; fly stick_amplitudes, and hold each stick for a second"
     ]
 
 

@@ -1,4 +1,4 @@
-"""Residuals of models, row by row of a log, and regressors to plot them against: speed, sticks, place.
+"""Residuals of models by row of a log, and regressors to plot them against: speed, sticks, place.
 
 ============  =====================================================================  =======
 channel       residual of a row, measured minus modelled                             unit
@@ -61,7 +61,7 @@ class Traces(NamedTuple):
     row: np.ndarray
 
     def used(self, name: str) -> str:
-        """Return the column to use for one: without a sensor, attitude for rates and velocity for force."""
+        """Return the column to use: without a sensor, attitude for rates, velocity for force."""
         channel, _, rest = name.partition("_")
         if not self.counts[channel].any():
             channel = _INSTEAD.get(channel, channel)
@@ -114,7 +114,7 @@ REGRESSORS: dict[str, tuple[str, str]] = {
 
 @jax.jit
 def _lagged(record: Record, tau: np.ndarray) -> Action:
-    """Return the applied action at the rows of lanes: the commands behind the lags, (rows, lanes) each."""
+    """Return the applied action at the rows of lanes: commands after lags, (rows, lanes) each."""
 
     def next_row(applied: Action, row: Record) -> tuple[Action, Action]:
         restarts = row.begins | row.is_applied_known
@@ -157,7 +157,10 @@ def _rows_of(lanes: Lanes) -> _Rows:
 
 
 def _residuals(left: np.ndarray, rows: _Rows) -> dict[str, np.ndarray]:
-    """Return the channels of one model on the log's rows; left: (rows, lanes, NUM_AXES, 2), world."""
+    """Return the channels of one model on the log's rows.
+
+    left: (rows, lanes, NUM_AXES, 2), world frame.
+    """
     along, record = rows.along(left), rows.record
     step_s = np.roll(record.step_s, 1)[:, None]
     found = {}
@@ -219,7 +222,7 @@ def _regressors(
 def _predicted(
     residuals: dict[str, np.ndarray], lanes: Lanes, rows: _Rows, gravity: float
 ) -> dict[str, np.ndarray]:
-    """Return the rates and the true specific force that a model predicts: measured minus its residual."""
+    """Return the rates and specific force that a model predicts: measured minus residual."""
     record, before = rows.record, rows.before
     step_s = np.roll(record.step_s, 1)[rows.kept, None]
     if "w" in lanes.measured:
@@ -240,7 +243,9 @@ def _predicted(
 
 
 def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> Traces:
-    """Return the residuals of models on the rows of a log at which they know the pose, each by its latency.
+    """Return the residuals of models on the rows of a log at which all of them know the pose.
+
+    Each model reads poses with its own latency.
 
     like: name of the model whose lags, rates and wind make the regressors; a delay of commands does
     not enter. Regressors of a row are those of the step to it: what was flown and commanded in the

@@ -42,7 +42,7 @@ BUMP_SIZE = 3  # features of one bump: a force along each world axis
 
 
 class Flown(NamedTuple):
-    """The flight at the step to each row, (rows, lanes, ...): what a force or rate of the step may depend on.
+    """The flight at the step to each row: what a force or rate may depend on, (rows, lanes, ...).
 
     body_to_world: (rows, lanes, 3, 3). applied: action, and change: its derivative, 1/s; (rows,
     lanes, 4). is_counted: bool, rows that are judged.
@@ -85,7 +85,7 @@ def flight_of(problem: Problem, model: FittedModel) -> Flown:
 
 
 def _lagged(command: np.ndarray, step_s: np.ndarray, tau: np.ndarray) -> np.ndarray:
-    """Return commands behind a first-order lag; its start is forgotten within the lanes' lead-in."""
+    """Return commands after a first-order lag, whose start the lead-in of lanes forgets."""
     applied = command.copy()
     for row in range(1, len(command)):
         keep = np.exp(-step_s[row - 1, :, None] / tau)
@@ -94,7 +94,7 @@ def _lagged(command: np.ndarray, step_s: np.ndarray, tau: np.ndarray) -> np.ndar
 
 
 def _rank_waves(values: np.ndarray, is_counted: np.ndarray, number: int) -> np.ndarray:
-    """Return cosines of the share of the flight in which a value was lower, (number, rows, lanes)."""
+    """Return cosines of the rank of a value, as a share of the flight, (number, rows, lanes)."""
     share = np.zeros(values.shape)
     share[is_counted] = (stats.rankdata(values[is_counted]) - 0.5) / max(int(is_counted.sum()), 1)
     return np.stack([np.cos(np.pi * order * share) for order in range(1, number + 1)])
@@ -111,7 +111,7 @@ def _place_waves(flight: Flown) -> np.ndarray:
 
 
 def bumps(flight: Flown) -> np.ndarray:
-    """Return forces along the world's axes that act only about some place on the way, like a thermal.
+    """Return forces that act only near some places of the flight, like a thermal.
 
     (bumps * BUMP_SIZE, rows, lanes, 3), world frame; all axes of a bump in a row.
     """
@@ -126,13 +126,20 @@ def bumps(flight: Flown) -> np.ndarray:
 
 
 def _along(waves: np.ndarray, vectors_w: np.ndarray) -> np.ndarray:
-    """Return features times world vectors (directions, rows, lanes, 3), (features, rows, lanes, 3)."""
+    """Multiply features by world vectors (directions, rows, lanes, 3).
+
+    Returns:
+        (features, rows, lanes, 3), a row for each feature and direction.
+    """
     product = waves[:, None, ..., None] * vectors_w[None]
     return product.reshape(-1, *product.shape[2:])
 
 
 def time_features(flight: Flown) -> np.ndarray:
-    """Return smooth functions of the time along the body's axes, (features, rows, lanes, 3), world frame."""
+    """Return smooth functions of time along the body's axes, (features, rows, lanes, 3).
+
+    They are in the world frame.
+    """
     span = max(float(flight.time_s[flight.is_counted].max(initial=0.0)), 1e-9)
     times = np.stack([np.cos(np.pi * n * flight.time_s / span) for n in range(1, TIME_WAVES + 1)])
     return _along(times, np.moveaxis(flight.body_to_world, -1, 0))
@@ -178,20 +185,29 @@ def dependences(flight: Flown) -> Mapping[str, Mapping[str, np.ndarray]]:
 
 
 def constants(flight: Flown, side: str) -> np.ndarray:
-    """Return unit rates along the body's axes, or unit forces along body, world and direction of flight."""
+    """Return unit rates along the body's axes, or unit forces along fixed directions.
+
+    The forces are along the body's and the world's axes, and the direction of flight.
+    """
     body = np.moveaxis(flight.body_to_world, -1, 0)
     world = np.broadcast_to(np.eye(3)[:, None, None, :], body.shape)
     return body if side == "rate" else np.concatenate([body, world, _direction(flight)[None]])
 
 
 def _direction(flight: Flown) -> np.ndarray:
-    """Return the direction of flight, world, (rows, lanes, 3); shorter than 1 where it is hardly moving."""
+    """Return the direction of flight, world frame, (rows, lanes, 3).
+
+    Its length is below 1 where the drone hardly moves.
+    """
     speed = np.linalg.norm(flight.vel_w, axis=-1)
     return flight.vel_w / np.maximum(speed, TINY_SPEED)[..., None]
 
 
 class Dependence(NamedTuple):
-    """A dependence found on one side: its name, gain over its inflation, and rms over the sensor's noise."""
+    """A dependence found on one side.
+
+    gain: over its inflation. share: rms over the sensor's noise.
+    """
 
     name: str
     side: str
@@ -213,7 +229,9 @@ class Feature(NamedTuple):
 
 
 class SideFit(NamedTuple):
-    """Features fitted on one side: coefficients, standard errors, and the step of what is given beside them.
+    """Features fitted on one side.
+
+    step, errors: coefficients and standard errors. given: the step of what is given beside them.
 
     chi2: gained. inflation: how much more scores vary than information says.
     """
@@ -242,7 +260,10 @@ class SideTest(NamedTuple):
 
     @classmethod
     def of(cls, side: str, white: np.ndarray, slopes: np.ndarray) -> "SideTest":
-        """Return the test of whitened residuals (rows, lanes, NUM_AXES, 2) beside slopes (count, ...)."""
+        """Return the test of whitened residuals beside slopes.
+
+        white: (rows, lanes, NUM_AXES, 2). slopes: (count, rows, lanes, NUM_AXES, 2).
+        """
         axes = SIDES[side]
         own = white[..., axes, :]
         root = np.sqrt(robust_weight(own))
@@ -351,7 +372,7 @@ def _sensor_noise(noise: noises.Noise, axes: slice) -> float:
 
 
 def _wandering(noise: noises.Noise, axes: slice) -> float:
-    """Return the standard deviation of a disturbance that moves the drone, over all axes of a side."""
+    """Return the standard deviation over a side's axes of a disturbance that moves the drone."""
     felt = np.asarray(noise.coupling)[axes] > FELT
     return float(np.sqrt(np.sum((np.asarray(noise.disturbance)[axes] * felt) ** 2)))
 
@@ -391,7 +412,7 @@ def find_dependences(
 
 
 def is_like_drift(problem: Problem, model: FittedModel, fields: Sequence[str]) -> bool:
-    """Return whether a drift of the force would take up 90 % of a base change that no steady force does.
+    """Return whether a force drift takes up 90 % of a base change that no steady force does.
 
     Within one flight the voltage falls with the time, so that a thrust curve takes up motors that
     warm up.
@@ -458,7 +479,10 @@ def _best_bump(test: SideTest, places: Feature) -> Feature:
 
 
 class Line(NamedTuple):
-    """A line in the spectrum of a side's residuals, body frame; share: amplitude over the sensor's noise."""
+    """A line in the spectrum of a side's residuals, body frame.
+
+    share: amplitude over the sensor's noise.
+    """
 
     side: str
     frequency_hz: float
@@ -504,7 +528,7 @@ def waves_of(problem: Problem, model: FittedModel, lines: Sequence[Line]) -> dic
 
 
 def stochastic_shares(problem: Problem, model: FittedModel) -> dict[str, float]:
-    """Return, by side, the size over the sensor's noise of a wandering disturbance that is clearly there."""
+    """Return the size of a clear wandering disturbance over the sensor's noise, by side."""
     assert problem.noise is not None
     left = problem.residuals(model.vector[None])[0]
     noise = problem.fitted_noise

@@ -1,4 +1,4 @@
-"""Vetoes: rules that reject an effect or a base change although it gains enough where it was fitted.
+"""Vetoes: rules that reject an effect or base change despite its gain where it was fitted.
 
 ``VETOES`` is the one list of rules on a selected model; each returns the effects that it rejects. A
 rejected effect is not searched for again, the model is selected again without it, and the rules
@@ -67,7 +67,7 @@ Veto = Callable[[Selection, Problem], list[str]]
 
 
 def select(state: SearchState, base: FittedModel, model: FittedModel) -> Selection:
-    """Return the model with effects swapped, removed, or put in place of base changes where that helps."""
+    """Swap or remove effects, or replace base changes by one, while that helps."""
     state, model, ablations = model_selection.select_effects(state, model)
     while True:
         state, simpler = model_selection.explain_base_by_effect(state, model)
@@ -77,7 +77,7 @@ def select(state: SearchState, base: FittedModel, model: FittedModel) -> Selecti
 
 
 def reject(selection: Selection, effects: Sequence[str]) -> Selection:
-    """Return the selection without some effects, which are refused from now on; their base is free again."""
+    """Return the selection without some effects, which stay refused, and their base free again."""
     state, model = selection.state, selection.model
     freed = {one.field for one in state.held if one.effect in effects}
     held = tuple(one for one in state.held if one.field not in freed)
@@ -107,7 +107,7 @@ def apply_vetoes(selection: Selection, test: Problem) -> tuple[Selection, dict[s
 
 
 def examined(selection: Selection) -> Selection:
-    """Return the selection with what it leaves unexplained, and the names that stand in for that."""
+    """Return the selection with what it leaves unexplained, and the names that stand in for it."""
     problem, model = selection.state.problem, selection.model
     rest, dependences = unknown.find_unexplained(problem, model, selection.base.vector)
     selection = selection._replace(unexplained=rest, stand_ins=())
@@ -127,7 +127,10 @@ def examined(selection: Selection) -> Selection:
 
 
 class Suspect(NamedTuple):
-    """A name, its parameters, gain over its inflation, and how many parameters the log determines."""
+    """A suspected name, its parameters, and its gain over its inflation.
+
+    num_parameters: how many of the parameters the log determines.
+    """
 
     name: str
     fields: tuple[str, ...]
@@ -150,7 +153,7 @@ def find_stand_ins(
     disturbed = {name.split(":")[0] for name in selection.unexplained.shares}
 
     def noncentralities(one: Suspect, side: str) -> tuple[float, float]:
-        """Return a suspect's noncentrality on a side, and what is left beside what the rest depends on."""
+        """Return a suspect's noncentrality on a side, alone and beside the found dependences."""
         axes = unknown.SIDES[side]
         own = [model.places.index(place) for place in problem.index(one.fields)]
         acting = slopes[own][..., axes, :]
@@ -192,7 +195,7 @@ def stands_in_for_unknown(selection: Selection, test: Problem) -> list[str]:
 
 
 def held_out_gain(test: Problem, less: np.ndarray, full: np.ndarray) -> tuple[float, float]:
-    """Return what a model gains over a lesser one on other rows, and what it would if it were right there."""
+    """Return a model's gain over a lesser one on other rows, and that expected if it is right."""
     white = test.whitened_residuals(less, full)
     gain = float(np.sum(white[0] ** 2) - np.sum(white[1] ** 2))
     return gain, float(np.sum((white[0] - white[1]) ** 2))
@@ -213,7 +216,7 @@ def is_contradicted(gain: float, expected: float, inflation: float) -> bool:
 
 
 def contradicted_on_held_out(selection: Selection, test: Problem) -> list[str]:
-    """Reject effects of which held-out rows show too little: they were there for a time only, or never."""
+    """Reject effects of which held-out rows show too little: they acted for a time or never."""
 
     def is_rejected(one: model_selection.Ablation) -> bool:
         gain, expected = held_out_gain(test, one.without.vector, selection.model.vector)
@@ -223,7 +226,10 @@ def contradicted_on_held_out(selection: Selection, test: Problem) -> list[str]:
 
 
 def rests(record: Record) -> np.ndarray:
-    """Return where the rate commands have rested for a while, (rows, lanes) bool; record: in lanes."""
+    """Return where the rate commands have rested for a while, (rows, lanes) bool.
+
+    record: in lanes.
+    """
     sticks = record.command[..., :3]
     rows = max(round(REST_S / float(np.median(record.step_s))), 1)
     before = np.pad(sticks, ((rows, 0), (0, 0), (0, 0)), mode="edge")
@@ -267,7 +273,10 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
 
 
 def is_force_law(effect: str) -> bool:
-    """Return whether an effect is a law of a force, which may be wrong in form; a scale of thrust is not."""
+    """Return whether an effect is a law of a force, which may have the wrong form.
+
+    A scale of thrust is none.
+    """
     acts_on_force = not {"thrust", "air", "force"}.isdisjoint(BY_NAME[effect].hooks)
     return acts_on_force and effect != "thrust_scale"
 
