@@ -67,7 +67,8 @@ def read_bag(path: Path, mapping: Mapping) -> ImportedFlight:
         if not found["is_stamped"]:
             name = quote_name(found["topic"])
             said.append(
-                f"{path}: topic {name}: no stamps in its messages: times are those of their recording"
+                f"{path}: topic {name}: no stamps in its messages: times are those of their "
+                "recording"
             )
     flight = flight_of_topics(str(path), topics, mapping)
     return flight._replace(notes=(*said, *flight.notes))

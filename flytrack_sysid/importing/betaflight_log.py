@@ -57,7 +57,9 @@ THRUST_SETTINGS = (
 
 
 def read_betaflight(path: Path, mapping: Mapping) -> list[ImportedFlight]:
-    """Return the flights in a blackbox file, one per log in it: commands, rates, specific force, voltage.
+    """Return the flights in a blackbox file, one for each log in it.
+
+    Their channels are commands, rates, specific force and voltage.
 
     docs/real_logs.md says what the channels are. A log that cannot be used is left out, and a note
     says why. Raises LogError for what is no blackbox file of Betaflight 4, or has no log that can
@@ -177,7 +179,7 @@ class _Headers:
         return RATES_TYPES[number]
 
     def stick_curve(self) -> list[str]:
-        """Return a note on the curve between a pilot's sticks and the setpoints, which the commands are."""
+        """Return a note on the curve from a pilot's sticks to setpoints, which are the commands."""
         if not {"rc_rates", "rc_expo"} <= self.values.keys():
             return []
         settings = [self.numbers(name, 3) for name in ("rc_rates", "rates", "rc_expo")]
@@ -189,7 +191,8 @@ class _Headers:
         )
         name = effect_of(curve).name
         return [
-            f"commands are setpoints; for a pilot's sticks a model needs the effect {name}: {numbers}"
+            f"commands are setpoints; for a pilot's sticks a model needs the effect {name}: "
+            f"{numbers}"
         ]
 
     def thrust_settings(self) -> list[str]:
@@ -212,7 +215,9 @@ class _Headers:
 
 
 def _commands(table: Table, headers: _Headers, full: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Return commands (num_rows, 4) and a note if some are clipped; full: the setpoints at full stick, (4,).
+    """Return commands (num_rows, 4) and a note if some are clipped.
+
+    full: the setpoints at full stick, (4,).
 
     What is further past full stick than smoothing overshoots is left, for ``log_of_table`` to
     refuse.
@@ -268,7 +273,7 @@ def _motors(table: Table, headers: _Headers) -> list[str]:
 
 
 def _thrust_of_motors(table: Table, headers: _Headers) -> np.ndarray:
-    """Return thrust commands (num_rows,): -1 and 1 are the lower and upper end of the motors' mean."""
+    """Return thrust commands (num_rows,): -1 and 1 are the ends of the motors' mean output."""
     low, high = headers.numbers("motorOutput", 2)
     names = [name for name in table.columns if name.startswith("motor[")]
     if not names or high <= low:

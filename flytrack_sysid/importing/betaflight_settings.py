@@ -1,4 +1,4 @@
-"""Betaflight's settings: the rate at full stick, and the curve of the sticks and the rate loop as effects.
+"""Betaflight's settings: the rate at full stick, and stick curve and rate loop as effects.
 
 Source: ``apply...Rates`` in Betaflight 4.6, src/main/fc/rc.c, and controlrate_profile.h. The loop's
 body is still to be fitted.
@@ -38,7 +38,9 @@ LEAST_SMOOTHING_HZ, SMOOTHING, TENTHS = 15, 1.5, 10.0
 def full_stick_rate(
     rates_type: str, rc_rate: float, super_rate: float, limit_deg_s: float
 ) -> float:
-    """Return the body rate at full stick, deg/s, by Betaflight's rate settings; expo plays no part there.
+    """Return the body rate at full stick, deg/s, by Betaflight's rate settings.
+
+    Expo does not change it.
 
     rc_rate, super_rate, limit_deg_s: as in the log's headers ``rc_rates``, ``rates``,
     ``rate_limits``.
@@ -57,7 +59,9 @@ def full_stick_rate(
 
 
 def stick_curve(rates_type: str, axes: Sequence[Sequence[float]]) -> Any:
-    """Return the effect that bends sticks as the rate settings do; None of types without one, or straight.
+    """Return the effect that bends sticks as the rate settings do.
+
+    None for rate types without such an effect, and for straight settings.
 
     axes: of roll, pitch, yaw, the rates and the expo as in the log's headers ``rc_rates``,
     ``rates``, ``rc_expo``. Assumption: no rate limit is below the rate at full stick, and Quick
@@ -86,7 +90,7 @@ def stick_curve(rates_type: str, axes: Sequence[Sequence[float]]) -> Any:
 
 
 def rate_loop(value: Callable[[str], str], frames_hz: float) -> BetaflightLoop | None:
-    """Return the effect of a craft's settings; None where the firmware flies by a loop that it has not.
+    """Return the effect of a craft's settings; None if its firmware's loop is not that effect's.
 
     value: of a setting, by its name on the command line. frames_hz: how often the receiver's frames
     come, which should be how often a log has commands.
@@ -108,7 +112,7 @@ def rate_loop(value: Callable[[str], str], frames_hz: float) -> BetaflightLoop |
 
 
 def _smoothing(value: Callable[[str], str], channel: str, factor: str, frames_hz: float) -> float:
-    """Return the cutoff of the receiver's smoothing, Hz, whole as the firmware has it; 0 if there is none."""
+    """Return the cutoff of the receiver's smoothing, a whole number of Hz; 0 without smoothing."""
     if value("rc_smoothing") == "OFF":
         return 0.0
     cutoff_hz = float(value(f"rc_smoothing_{channel}_cutoff"))

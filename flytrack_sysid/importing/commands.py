@@ -1,4 +1,4 @@
-"""Commands of logs whose autopilot was not given body rates: attitude or torque setpoints, motor outputs.
+"""Commands from attitude or torque setpoints or motor outputs, where a log has no rate setpoints.
 
 An attitude controller asks for rates in proportion to the error of the attitude, so these are the
 rate commands. A rate controller asks for a torque in proportion to the error of the rates; the
@@ -50,7 +50,7 @@ def commands_of(
     rules: CommandRules,
     max_rate_deg_s: tuple[float, ...] | None,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the commands (num_rows, 4) in [-1, 1] of a flight, and notes on what was assumed and clipped.
+    """Return a flight's commands (num_rows, 4) in [-1, 1], and notes on assumptions and clipping.
 
     channels: of ``CHANNELS``, and ``attitude_command`` (roll, pitch, yaw, rad), ``own_attitude``
     (as the autopilot estimates it), ``torque_command`` (N m), ``reference_rates`` (rad/s),
@@ -67,7 +67,8 @@ def commands_of(
     else:
         if max_rate_deg_s is None:
             raise LogError(
-                f"{source}: craft.max_rate_deg_s: missing in the mapping: which rates are a command of 1?"
+                f"{source}: craft.max_rate_deg_s: missing in the mapping: which rates are a "
+                "command of 1?"
             )
         rates, said = _rates(source, time, {**channels, "thrust_command": thrust[:, None]}, rules)
         commands = np.column_stack([rates / (np.array(max_rate_deg_s) * PER_DEGREE), thrust])
@@ -122,7 +123,10 @@ def _rates(
     gains, how = rules.attitude_gain, "given"
     if min(gains) == 0.0:
         gains, how = _identified_attitude_gain(source, time, channels, errors, gains)
-    note = f"{source}: rate commands: errors of the attitude, times gains of {_listed(gains)} 1/s ({how})"
+    note = (
+        f"{source}: rate commands: errors of the attitude, times gains of {_listed(gains)} 1/s "
+        f"({how})"
+    )
     note += "; what else the attitude controller adds is left out"
     return errors * np.array(gains), (note,)
 
@@ -140,7 +144,10 @@ def _listed(values: tuple[float, ...]) -> str:
 
 
 def _attitude_errors(source: str, channels: Channels[str, np.ndarray]) -> np.ndarray:
-    """Return the setpoints less the attitude, as Euler angles, as common autopilots do, (num_rows, 3) rad."""
+    """Return setpoints less the attitude, as Euler angles, (num_rows, 3) rad.
+
+    Common autopilots do so.
+    """
     own = channels.get("own_attitude")
     if own is None:
         _check_there(source, channels, "q")
@@ -156,7 +163,10 @@ def _identified_attitude_gain(
     errors: np.ndarray,
     given: tuple[float, ...],
 ) -> tuple[tuple[float, ...], str]:
-    """Return the gain of each axis, rad/s per rad, at which lagged and delayed errors show the rates best."""
+    """Return each axis's gain, rad/s per rad, at which lagged, delayed errors fit the rates best.
+
+    A note on the gains comes second.
+    """
     _check_there(source, channels, "w")
     if len(time) < FEWEST_ROWS:
         raise LogError(
@@ -182,9 +192,13 @@ def _identified_attitude_gain(
                 if correlation > best:
                     best, gain = correlation, float(shown @ rates / (shown @ shown))
         if not best >= LEAST_CORRELATION:
-            found = f"rates correlate with the attitude error by {best:.2f}, expected {LEAST_CORRELATION} or more"
+            found = (
+                f"rates correlate with the attitude error by {best:.2f}, expected "
+                f"{LEAST_CORRELATION} or more"
+            )
             raise LogError(
-                f"{source}: attitude_command.gain: cannot be identified for {name}: {found}; state it"
+                f"{source}: attitude_command.gain: cannot be identified for {name}: {found}; state "
+                "it"
             )
         gains.append(gain)
         correlations.append(best)
@@ -195,12 +209,12 @@ def _identified_attitude_gain(
 def _rates_of_the_law(
     source: str, time: np.ndarray, channels: Channels[str, np.ndarray]
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the rates (num_rows, 3) that torque setpoints track by the law behind them, and a note.
+    """Return the rates (num_rows, 3) that torque setpoints track by their law, and a note.
 
-    Source: Lee, Leok, McClamroch, CDC 2010, with an integral as in Crazyflie's firmware: torque = -KR e
-    - Kw (w - w_reference) - KI integral(e) + constant, which is Kw times the error of the rates from
-    w_reference - KR/Kw e. All factors are identified. Assumption: integral and constant hold against a steady
-    torque, such as that of uneven motors.
+    Source: Lee, Leok, McClamroch, CDC 2010, with an integral as in Crazyflie's firmware:
+    torque = -KR e - Kw (w - w_reference) - KI integral(e) + constant, which is Kw times the error
+    of the rates from w_reference - KR/Kw e. All factors are identified. Assumption: integral and
+    constant hold against a steady torque, such as that of uneven motors.
     """
     if "attitude_command" not in channels:
         where = f"{source}: torque_command.rate_gain: missing"
@@ -223,13 +237,19 @@ def _rates_of_the_law(
             else 0.0
         )
         if not share >= LEAST_EXPLAINED or weights[1] >= 0.0:
-            found = f"attitude and rates explain {share:.0%} of the torque, expected {LEAST_EXPLAINED:.0%}"
+            found = (
+                f"attitude and rates explain {share:.0%} of the torque, expected "
+                f"{LEAST_EXPLAINED:.0%}"
+            )
             where = f"{source}: torque_command.rate_gain: cannot be identified for {name}"
             raise LogError(f"{where}: {found}; state it")
         ratios.append(float(weights[0] / weights[1]))
         gains.append(-float(weights[1]))
         explained.append(f"{share:.1%}")
-    how = f"identified with Kw {_listed(tuple(gains))} N m s/rad; the law explains {', '.join(explained)}"
+    how = (
+        f"identified with Kw {_listed(tuple(gains))} N m s/rad; the law explains "
+        f"{', '.join(explained)}"
+    )
     assumed = "reference rates, and attitude errors times KR/Kw of the torque setpoints' law"
     left_out = "its integral, which holds against steady torques, is left out"
     note = f"{source}: rate commands: {assumed}, {_listed(tuple(ratios))} 1/s ({how}); {left_out}"
@@ -237,7 +257,7 @@ def _rates_of_the_law(
 
 
 def _rotation_errors(source: str, channels: Channels[str, np.ndarray]) -> np.ndarray:
-    """Return the attitude less its setpoint as the law has it, about the body's axes, (num_rows, 3)."""
+    """Return the attitude error of the torque setpoints' law, body axes, (num_rows, 3)."""
     own = channels.get("own_attitude")
     if own is None:
         _check_there(source, channels, "q")

@@ -104,7 +104,8 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
                 ", ".join(map(quote_name, sorted(chosen))) or "none of the messages that are read"
             )
             raise LogError(
-                f"{path}: message {name}: missing or without {', '.join(FIELDS[name])}; found {listed}"
+                f"{path}: message {name}: missing or without {', '.join(FIELDS[name])}; found "
+                f"{listed}"
             )
     craft = mapping.craft
     if craft.max_rate_deg_s is None:
@@ -156,7 +157,7 @@ def _function(parameters: dict[str, float], output: int) -> int:
 
 
 def _choose(name: str, instances: list[_Message], said: list[str]) -> dict[str, np.ndarray]:
-    """Return the fields of the first instance of a message that measured something, and note the others."""
+    """Return the fields of the first healthy instance of a message, and note the others."""
     instances = sorted(instances, key=lambda message: message.instance)
     if name == "BAT":
         instances = [_without_zeros(message, said) for message in instances]
@@ -195,7 +196,7 @@ def _is_healthy(name: str, fields: dict[str, np.ndarray]) -> bool:
 def _full_stick_deg_s(
     path: Path, parameters: dict[str, float], rate: dict[str, np.ndarray], said: list[str]
 ) -> tuple[float, float, float]:
-    """Return the rates of roll, pitch and yaw at a command of 1, deg/s, no less than any setpoint."""
+    """Return the roll, pitch and yaw rates at a command of 1, deg/s, no less than any setpoint."""
     full_stick = []
     for (acro, gain), limit, setpoint in zip(ACRO_RATES, RATE_LIMITS, SETPOINTS, strict=True):
         stated = parameters.get(acro, FULL_STICK_DEG * parameters.get(gain, 0.0))

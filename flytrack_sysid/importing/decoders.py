@@ -74,7 +74,7 @@ def decode_ulog(arguments: Any, _: bytes) -> bytes:
 
 
 class _CountedReads:
-    """A binary file that knows whether it ended within something that was read, as pyulog does not tell."""
+    """A binary file that records whether a read met the end of the file; pyulog does not tell."""
 
     def __init__(self, file: Any):
         self.file, self.is_cut_off = file, False
@@ -238,7 +238,7 @@ class UnsupportedError(Exception):
 
 
 def _bag_messages(path: str, wanted: list[str]) -> Iterator[tuple[str, str, int, Any]]:
-    """Yield topic, type, time of recording, ns, and content of messages; None for unwanted topics."""
+    """Yield topic, type, recording time, ns, and content; None as content of unwanted topics."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 

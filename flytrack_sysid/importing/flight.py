@@ -68,7 +68,9 @@ class Craft(NamedTuple):
 
 
 class ImportedFlight(NamedTuple):
-    """A flight as a reader returns it: its log, the craft by file and mapping, and notes for the user.
+    """A flight as a reader returns it: its log, its craft, and notes for the user.
+
+    craft: as the file and the mapping say.
 
     is_landed: rows at which the autopilot itself says that it is on the ground, (num_rows,) bool;
     None if it says nothing.
@@ -107,9 +109,15 @@ def read_log_file(
 
 def not_a_quadcopter(found: str) -> str:
     """Return the note on a craft that is none."""
-    return f"found {found}, not a quadcopter: thrust and rates stand for all rotors together, and for no wings"
+    return (
+        f"found {found}, not a quadcopter: thrust and rates stand for all rotors together, and for "
+        "no wings"
+    )
 
 
 def saturation(is_at_end: np.ndarray) -> str:
-    """Return the note on how often a motor is at its end, (num_rows,) bool: more cannot be commanded."""
+    """Return the note on how often a motor is at its upper end, (num_rows,) bool.
+
+    There, more cannot be commanded.
+    """
     return f"a motor at its upper end in {np.mean(is_at_end):.2%} of the rows"

@@ -47,7 +47,7 @@ MAX_FALL_FORCE = 2.0  # g: a descent builds up smoothly, what hits the ground sh
 
 
 class _Blocks(NamedTuple):
-    """Means over blocks of about ``BLOCK_S``; (num_blocks,) each, but for ``of_row``, (num_rows,) int.
+    """Means over blocks of about ``BLOCK_S``, (num_blocks,); ``of_row`` is (num_rows,) int.
 
     throttle: thrust command as a fraction of its range. is_at_rest: still at 1 g. is_level: moving
     at about 1 g. is_start: the first of a segment.
@@ -181,7 +181,7 @@ def _runs(is_in: np.ndarray, is_start: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _is_descent(log: FlightLog, blocks: _Blocks, is_low: np.ndarray, start: int, end: int) -> bool:
-    """Return whether the craft gained speed downwards, without a hit, before it came to rest at 1 g.
+    """Return whether the craft gained downward speed, without a hit, before its rest at 1 g.
 
     is_low: blocks at low thrust, (num_blocks,) bool; the fall is within the run of them that leads
     to rest. start, end: the blocks at rest.

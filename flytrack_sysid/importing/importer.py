@@ -57,7 +57,11 @@ class Imported(NamedTuple):
     problems: tuple[str, ...]
 
     def nominal_model(self) -> ModelParameters:
-        """Return the generic quadcopter scaled to this craft, where a fit may start, or raise LogError."""
+        """Return the generic quadcopter scaled to this craft, as a start for fits.
+
+        Raises:
+            LogError: the full-stick rates, the mass or the voltage are unknown.
+        """
         return self.craft.nominal_model(self.log.source)
 
     def describe(self) -> str:
@@ -80,7 +84,7 @@ class Imported(NamedTuple):
         return "\n".join(lines)
 
     def save_details(self, path: str | Path) -> None:
-        """Write what the log itself cannot hold as JSON: sources, craft, clocks, notes, problems."""
+        """Write what the log cannot hold as JSON: sources, craft, clocks, notes, problems."""
         document = {
             "sha256": self.log.sha256,
             "sources": self.sources,
@@ -158,7 +162,7 @@ def _parts(flight: ImportedFlight) -> list[ImportedFlight]:
 def _flights_in_the_air(
     read: list[tuple[Path, ImportedFlight]], mapping: Mapping
 ) -> tuple[list[ImportedFlight], tuple[str, ...]]:
-    """Return the flights without what the mapping does not select, and without rows on the ground, and notes.
+    """Return the flights with only the rows that are selected and in the air, and notes.
 
     Raises LogError if nothing flies in any of them.
     """
@@ -230,10 +234,11 @@ def _is_selected(path: Path, log: FlightLog, mapping: Mapping) -> np.ndarray:
 
 
 def _is_airborne(log: FlightLog, above_m: float, source: str) -> np.ndarray:
-    """Return the longest stretch of rows that are so much higher than the first row, (num_rows,) bool."""
+    """Return the longest stretch of rows above the first row by ``above_m``, (num_rows,) bool."""
     if "p" not in log:
         raise LogError(
-            f"{source}: rows.above_m: found no position in {log.source}, expected one to tell heights"
+            f"{source}: rows.above_m: found no position in {log.source}, expected one to tell "
+            "heights"
         )
     is_high = log["p"][:, 2] - log["p"][0, 2] > above_m
     number = np.cumsum(np.diff(is_high, prepend=False))  # of the stretch, odd ones are high

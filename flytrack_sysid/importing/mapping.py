@@ -60,7 +60,10 @@ class Channel(NamedTuple):
 
 
 class Manifest(Fields):
-    """A CSV file beside the logs; key, count: its columns of file names and of how many rows to use."""
+    """A CSV file beside the logs that says how many rows of each to use.
+
+    key, count: its columns of file names and of numbers of rows.
+    """
 
     file: Text
     key: Text
@@ -68,7 +71,9 @@ class Manifest(Fields):
 
 
 class UsedRows(Fields):
-    """Which rows to use: every n-th from ``from_s`` to ``to_s`` after the first; a manifest limits them.
+    """Which rows to use.
+
+    Every n-th from ``from_s`` to ``to_s`` after the first; a manifest limits them.
 
     above_m: only the longest stretch of rows that are that much higher than the first. ranges_s:
     only what is in one of these, s after the first row; all if none. logs: numbers, from 1, of the
@@ -334,7 +339,10 @@ class ThrustCommand(Fields):
 
 
 class AttitudeCommand(SignedFields):
-    """Setpoints of roll, pitch, yaw, the autopilot's estimate of them, and its gains, 0 to identify them."""
+    """Setpoints of roll, pitch and yaw, the autopilot's estimate of them, and its gains.
+
+    gain: 0 to identify it.
+    """
 
     columns: ThreeNames
     own: ThreeNames | None = None

@@ -88,7 +88,7 @@ def read_csv(path: Path, mapping: Mapping) -> ImportedFlight:
 
 
 def _read_files(folder: Path, mapping: Mapping) -> ImportedFlight:
-    """Return the flight in several CSV files of a folder, by a mapping whose columns are ``file:column``."""
+    """Return the flight in a folder of CSV files, by a mapping of columns ``file:column``."""
     if not folder.is_dir():
         raise LogError(
             f"{folder}: found no folder, expected one with the files of {mapping.source}: files"
@@ -117,13 +117,16 @@ def _read_files(folder: Path, mapping: Mapping) -> ImportedFlight:
 
 
 def _read_file(path: Path, name: str, file: CsvFile, fields: list[str], mapping: Mapping) -> Table:
-    """Return the wanted columns of one of several files, named ``file:column``, and its times, s."""
+    """Return the wanted columns of one of several files, ``file:column``, and its times, s."""
     with open_csv(path, mapping.delimiter) as rows:
         header = [column.strip() for column in next(rows, [])]
         for column in (file.time, *fields):
             if header.count(column) != 1:
                 listed = ", ".join(map(quote_name, header))[:LONGEST_LIST]
-                found = f"{path}: column {quote_name(column)}: found {header.count(column)} times among {listed}"
+                found = (
+                    f"{path}: column {quote_name(column)}: found {header.count(column)} times "
+                    f"among {listed}"
+                )
                 raise LogError(f"{found}; expected once by {mapping.source}: files.{name}")
         table = read_columns(path, rows, header, dict.fromkeys((file.time, *fields)))
     columns = {f"{name}:{field}": table.columns[field] for field in fields}
@@ -132,7 +135,7 @@ def _read_file(path: Path, name: str, file: CsvFile, fields: list[str], mapping:
 
 
 def flight_of_topics(source: str, topics: Sequence[Table], mapping: Mapping) -> ImportedFlight:
-    """Return the flight in tables that have clocks and rates of their own, each with a column of times.
+    """Return the flight in tables with clocks and rates of their own, each with a time column.
 
     Rows are the samples of the body rates, else of the attitude or the position: other sensors are
     interpolated, commands held. There are no rows where a channel has a gap of more than three of
@@ -170,7 +173,10 @@ def flight_of_topics(source: str, topics: Sequence[Table], mapping: Mapping) -> 
         early_s = latency_s - latencies_s.get(base_name, latency_s)
         if abs(early_s) > MAX_LATENCY_S:
             clocks[name] = clocks[name]._replace(times=clocks[name].times + early_s)
-            found = f"stamps of {name} are {early_s:+.6g} s before those of {base_name}, by their recording"
+            found = (
+                f"stamps of {name} are {early_s:+.6g} s before those of {base_name}, by their "
+                "recording"
+            )
             said.append(f"{found}: moved by this, so that {name} is as late as recorded")
     times = put_on_one_line(source, clocks, base_name)
     samples = {name: Samples(times[name], values) for name, (_, values) in samples.items()}

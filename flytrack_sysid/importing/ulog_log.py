@@ -1,4 +1,6 @@
-"""PX4 logs (``.ulg``), read by pyulog: NED and FRD converted to our frames, topics put on one time base.
+"""PX4 logs (``.ulg``), read by pyulog, in our frames and on one time base.
+
+NED and FRD are converted.
 
 Rows are the samples of the body rates; other sensors are interpolated between their own samples,
 setpoints are held. There are no rows where a topic has a gap of more than three of its usual steps.
@@ -96,14 +98,15 @@ EVENTS = ("vehicle_land_detected",)  # topics that are published when something 
 
 
 def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
-    """Return the flight in a PX4 log: commands, rates, attitude, and the other channels that it has.
+    """Return the flight in a PX4 log: commands, rates, attitude, and its other channels.
 
     docs/real_logs.md says which topics the channels are of. Raises LogError for what is no ULog, or
     lacks rates, attitude or rate setpoints at any one time.
     """
     if mapping.rules.motors_as_thrust:
         raise LogError(
-            f"{mapping.source}: motors.as_thrust: not read of PX4 logs: actuator outputs are too slow"
+            f"{mapping.source}: motors.as_thrust: not read of PX4 logs: actuator outputs are too "
+            "slow"
         )
     samples, clocks, parameters, said = _decode(path)
     craft = mapping.craft
@@ -195,7 +198,7 @@ def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, Clock], dict[str,
 def _best_instance(
     path: Path, name: str, instances: dict[int, dict[str, np.ndarray]], fields: tuple[str, ...]
 ) -> tuple[Samples, Clock, list[str]] | None:
-    """Return ``_samples_of`` the instance of a topic that has most valid ones; of equal ones the first."""
+    """Return ``_samples_of`` the topic instance with most valid samples; the first of equals."""
     found = [_samples_of(path, name, topic, fields) for topic in instances.values()]
     return max(
         (one for one in found if one is not None), key=lambda one: len(one[0].times), default=None
@@ -205,7 +208,7 @@ def _best_instance(
 def _samples_of(
     path: Path, name: str, topic: dict[str, np.ndarray], fields: tuple[str, ...]
 ) -> tuple[Samples, Clock, list[str]] | None:
-    """Return the samples of some fields of a topic, their clock, and what was found wrong; None without any.
+    """Return the samples of a topic's fields, their clock, and its faults; None without samples.
 
     Times are those at which a sensor was read, if the topic has them, else those of publishing.
     """
@@ -247,7 +250,10 @@ def _attitude(path: Path, samples: Samples) -> Samples:
 
 
 def _commands(setpoints: np.ndarray, full_stick: np.ndarray) -> np.ndarray:
-    """Return commands (num_rows, 4) of setpoints: rates in FRD, rad/s; thrust, 0 to 1, either sign."""
+    """Return commands (num_rows, 4) of setpoints.
+
+    setpoints: rates in FRD, rad/s, and thrust, 0 to 1 with either sign.
+    """
     rates = vector_from(setpoints[:, :3], True) / full_stick
     return np.column_stack([rates, 2.0 * np.abs(setpoints[:, 3]) - 1.0])
 

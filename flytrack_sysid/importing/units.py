@@ -32,7 +32,7 @@ def vector_from(vectors: np.ndarray, is_turned: bool) -> np.ndarray:
 
 
 def quaternion_from(attitude: Rotation, is_body_turned: bool, is_world_turned: bool) -> np.ndarray:
-    """Return our quaternions (num_rows, 4) of attitudes that lead from a body frame to a world frame.
+    """Return our quaternions (num_rows, 4) of attitudes, each from body to world frame.
 
     is_body_turned: that body frame is FRD; is_world_turned: that world frame is NED.
     """

@@ -52,7 +52,10 @@ def read_usd(path: Path, mapping: Mapping) -> ImportedFlight:
     flight = flight_of_topics(str(path), topics, mapping)
     if is_whole:
         return flight
-    note = f"{path}: damaged or cut off: the checksum is wrong; the first {end} of {len(content)} bytes are used"
+    note = (
+        f"{path}: damaged or cut off: the checksum is wrong; the first {end} of {len(content)} "
+        "bytes are used"
+    )
     return flight._replace(notes=(note, *flight.notes))
 
 
