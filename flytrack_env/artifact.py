@@ -31,7 +31,10 @@ TRIAL_LOOPS = 16
 
 
 class ArtifactError(ValueError):
-    """A file that is no plant; the message says what was found and expected, and does not name the file."""
+    """A file that is not a plant.
+
+    The message says what was found and what was expected, and does not name the file.
+    """
 
 
 def _printable(text: str) -> str:
@@ -42,7 +45,8 @@ def _printable(text: str) -> str:
 def _not_readable(content: bytes, error: Exception) -> ArtifactError:
     reason = _printable(f"{type(error).__name__}: {error}")
     return ArtifactError(
-        f"found {len(content)} bytes that cannot be deserialised ({reason}), expected a jax.export artifact"
+        f"found {len(content)} bytes that cannot be deserialised ({reason}), "
+        "expected a jax.export artifact"
     )
 
 
@@ -143,13 +147,14 @@ def check_runs(exported: export.Exported, start: Sequence[float], num_actions: i
     except Exception as error:
         reason = _printable(f"{type(error).__name__}: {error}")
         raise ArtifactError(
-            f"found a body that does not run on the CPU ({reason}), expected one step from the start state"
+            f"found a body that does not run on the CPU ({reason}), "
+            "expected one step from the start state"
         ) from error
     bad = np.flatnonzero(~np.isfinite(after))
     if bad.size:
         raise ArtifactError(
-            f"components {bad.tolist()} after one step from the start state: found {after[bad].tolist()}, "
-            "expected finite numbers"
+            f"components {bad.tolist()} after one step from the start state: "
+            f"found {after[bad].tolist()}, expected finite numbers"
         )
 
 

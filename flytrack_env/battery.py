@@ -1,4 +1,4 @@
-"""The battery of a craft: between which voltages it is flown, and at which its thrust map was fitted."""
+"""The battery of a craft: the voltages it is flown at, and those its thrust map was fitted at."""
 
 import warnings
 from typing import Any, NamedTuple
@@ -48,7 +48,7 @@ class Battery(NamedTuple):
         return f"{_shown(self.fitted_low_v)} to {_shown(self.fitted_high_v)} V"
 
     def check(self) -> None:
-        """Raise ValueError for voltages that no battery has, or a thrust map from another battery's.
+        """Raise ValueError for impossible voltages, or a thrust map of another battery.
 
         Any leaf may be batched.
         """
@@ -60,7 +60,8 @@ class Battery(NamedTuple):
             )
         if not np.all((low > 0.0) & (low <= high) & np.isfinite(high)):
             raise ValueError(
-                f"model.battery: found fitted_low_v {self.fitted_low_v}, fitted_high_v {self.fitted_high_v}, "
+                f"model.battery: found fitted_low_v {self.fitted_low_v}, "
+                f"fitted_high_v {self.fitted_high_v}, "
                 "expected 0 < fitted_low_v <= fitted_high_v"
             )
         margin = MAX_EXTRAPOLATION * full
@@ -76,8 +77,9 @@ class Battery(NamedTuple):
         is_above = float(self.full_v) > float(self.fitted_high_v) + margin
         if is_above or float(self.empty_v) < float(self.fitted_low_v) - margin:
             text = (
-                f"model: the thrust map was fitted at {self.describe_fitted()}, and the battery goes from "
-                f"{self.describe()}: beyond the fit its thrust is extrapolated"
+                f"model: the thrust map was fitted at {self.describe_fitted()}, "
+                f"and the battery goes from {self.describe()}: "
+                "beyond the fit its thrust is extrapolated"
             )
             warnings.warn(BatteryWarning(text), stacklevel=3)
 

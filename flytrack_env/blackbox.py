@@ -148,7 +148,7 @@ class BlackBox(Plant):
         return jnp.concatenate([after[:16], rate_actions, after[16:]])
 
     def reset(self, drone: Drone, model: ModelParameters) -> Drone:
-        """Return the drone with its leaves as float32, as a step returns them; ``model`` is not used."""
+        """Return the drone with float32 leaves, as a step returns them; ``model`` is not used."""
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), drone)
 
     def step(self, state: Drone, command: Action, dt: Scalar, model: ModelParameters) -> Drone:
@@ -186,7 +186,9 @@ def load(
     max_rate: tuple[float, float, float] = MAX_RATE_DEG_S,
     limits: ResourceLimits | None = ResourceLimits(),  # noqa: B008, a tuple of constants
 ) -> BlackBox:
-    """Return the plant in a file; see the module's description for what a file may hold, and the risks.
+    """Return the plant in a file.
+
+    The module's docstring says what a file may hold, and what the risks are.
 
     max_rate: deg/s, body rates at full stick, used with 18-component artifacts only. limits: of the
     trial. None: no trial, and native calls are allowed; only for files from people whose programs

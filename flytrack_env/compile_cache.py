@@ -39,7 +39,10 @@ def keep_compiled_programs() -> None:
 
 
 def _processor() -> str:
-    """Return a name for this kind of processor: a digest of what Linux says of it, else what Python knows."""
+    """Return a name for this kind of processor.
+
+    It is a digest of what Linux reports about it, or else of what Python knows.
+    """
     known = [platform.machine(), platform.processor()]
     about = Path("/proc/cpuinfo")
     if about.exists():

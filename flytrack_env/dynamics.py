@@ -99,16 +99,20 @@ def body_rates(applied: Action, max_rate: jax.Array | np.ndarray) -> Vec3:
 
 
 def integrate_attitude(quat: Quaternion, rates_b: Vec3, dt: Scalar) -> Quaternion:
-    """Return the attitude after ``dt``: normalize(q + dt/2 q (x) [0, rates]); handout, equation 2."""
+    """Return the attitude after ``dt``, by equation 2 of the handout.
+
+    It is normalize(q + dt/2 q (x) [0, rates]).
+    """
     turn = quat.multiply(Quaternion(0.0, *rates_b))
     half_dt = 0.5 * dt
     return Quaternion(*(q + half_dt * dq for q, dq in zip(quat, turn, strict=True))).normalize()
 
 
 def turn_by(quat: Quaternion, angle_b: Vec3) -> Quaternion:
-    """Return the attitude after a rotation vector, rad, body: the exponential map, to its seventh order.
+    """Return the attitude after a rotation vector, rad, body frame.
 
-    For the turn of a step, well below 1 rad; not normalised.
+    The exponential map, to its seventh order, for the turn of a step, well below 1 rad; not
+    normalised.
     """
     square = angle_b.dot(angle_b)
     cosine = 1.0 - square * (1.0 / 8.0 - square * (1.0 / 384.0 - square * (1.0 / 46080.0)))
@@ -149,7 +153,7 @@ def _with_thrust(
 def _forces(
     context: StepContext, params: ModelParameters, memories: tuple[Any, ...]
 ) -> tuple[Vec3, Vec3]:
-    """Return the acceleration, world, and the specific force, body, m/s^2: thrust and what effects add."""
+    """Return acceleration, world, and specific force, body, m/s^2, with what effects add."""
     axes, thrust_acc = context.body_axes_w, context.thrust_acc
     acc_w = axes[2].scale(thrust_acc) - Vec3(0.0, 0.0, params.g)
     if not effects.acts(params.effects, "force"):
@@ -213,7 +217,7 @@ def _applied(
     params: ModelParameters,
     context: StepContext,
 ) -> tuple[Action, tuple[Any, ...]]:
-    """Return the action that is applied after a time, and the memories of what takes the lag's place."""
+    """Return the applied action after ``dt``, and the memories of effects that replace the lag."""
     lagged = lag(drone.applied, context.acting, dt, tau)
     if not effects.acts(params.effects, "respond"):
         return compute_once(lagged), memories
@@ -280,10 +284,11 @@ class _Instant(NamedTuple):
 def _lag_within_step(
     drone: Drone, memories: tuple[Any, ...], command: Action, dt: Scalar, params: ModelParameters
 ) -> tuple[tuple[_Instant, _Instant, _Instant], tuple[Any, ...]]:
-    """Return the beginning, middle and end of a step under a held command: lag, body rates, battery.
+    """Return the beginning, middle and end of a step under a held command.
 
-    The lag is exact for commands held over half a step; of a delayed one, each half has its mean.
-    The memories are those of what takes the lag's place.
+    Each has the applied action, the battery voltage and the inputs of the body rates. The lag is
+    exact for commands held over half a step; of a delayed one, each half has its mean. The memories
+    are those of effects that replace the lag.
     """
     beginning = _beginning(drone, command, dt, params)
 
@@ -406,7 +411,7 @@ def observe_rates(
 
 
 class Reading(NamedTuple):
-    """What the sensors read after a step: body rates, rad/s, and specific force, m/s^2, body frame."""
+    """The sensors' readings after a step, body frame: rates, rad/s, and specific force, m/s^2."""
 
     rates_b: Vec3
     force_b: Vec3

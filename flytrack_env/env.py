@@ -126,7 +126,7 @@ class FlyTrack(EpisodicEnvironment):
     def transition(
         self, state: EnvState, command: Action, params: EnvParams
     ) -> tuple[EnvState, jax.Array, Causes, RaceEvents]:
-        """Return the next state, the reward (a scalar), the causes of termination and the race's events."""
+        """Return the next state, the reward (scalar), the causes of termination, and the events."""
         is_nan = jnp.isnan(sum(command))
         command = without_nan(command)
         before = self.drone(state)
@@ -193,7 +193,7 @@ class FlyTrack(EpisodicEnvironment):
         return EnvState(plant=self.plant.reset(drone, params.model), race=race, time=jnp.int32(0))
 
     def check_params(self, params: EnvParams) -> None:
-        """Raise ValueError for what cannot be flown, or a step of time that the plant does not have."""
+        """Raise ValueError for what cannot be flown, or another time step than the plant's."""
         params.check(self.plant.delay_steps)
         plant_dt = self.plant.dt
         if plant_dt is not None and not np.allclose(params.dt, plant_dt, rtol=1e-5):

@@ -1,4 +1,4 @@
-"""Episodes: how an environment's hooks become gymnax's ``reset`` and ``step``, with auto-reset outermost.
+"""Episodes: gymnax's ``reset`` and ``step`` from an environment's hooks, auto-reset outermost.
 
 An environment, or a wrapper around one, implements the hooks of ``EpisodicEnvironment``: how an
 episode begins, advances and is observed. ``reset``, ``step`` and ``step_batch`` are built from them
@@ -52,7 +52,7 @@ def without_nan(command: Action) -> Action:
 
 
 def _keep_types(changed: Any, state: Any) -> Any:
-    """Return a changed state with the types of the state before, whatever parameters were computed with."""
+    """Return a changed state with the types of the state before, whatever the parameters' types."""
     return jax.tree.map(lambda leaf, old: jnp.asarray(leaf, jnp.result_type(old)), changed, state)
 
 
@@ -95,7 +95,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         raise NotImplementedError
 
     def sample_start(self, seed: jax.Array, params: EnvParams) -> tuple[Drone, jax.Array]:
-        """Return a drone that begins an episode, and the gate to fly first (an index), of a uint32 scalar."""
+        """Return an episode's first drone and first gate (an index), drawn from a uint32 scalar."""
         raise NotImplementedError
 
     def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> Any:
@@ -108,7 +108,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     def advance(
         self, state: Any, command: Action, params: EnvParams
     ) -> tuple[Any, jax.Array, jax.Array, dict[str, Any]]:
-        """Return the next state, the reward, whether the episode terminates, and info; no auto-reset.
+        """Return next state, reward, whether the episode terminates, and info; no auto-reset.
 
         reward, terminated: scalars. command: within [-1, 1]; one that is not a number ends the
         episode and may not get into the state.
@@ -116,7 +116,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         raise NotImplementedError
 
     def observe_drone(self, drone: Drone, state: Any, params: EnvParams) -> list[jax.Array]:
-        """Return the observation of a state whose sensors report ``drone``: a float32 scalar per row."""
+        """Return the observation where sensors report ``drone``: a float32 scalar per row."""
         raise NotImplementedError
 
     def is_truncated(self, state: Any, params: EnvParams) -> jax.Array:
@@ -143,7 +143,10 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
             type(self.plant).__name__,
             self.observation_space().shape[0],
         )
-        return f"<{self.env_id}: track {track}, plant {plant}, effects {effects}, observation size {size}>"
+        return (
+            f"<{self.env_id}: track {track}, plant {plant}, effects {effects}, "
+            f"observation size {size}>"
+        )
 
     @property
     def num_actions(self) -> int:
@@ -203,12 +206,12 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         return super().reset(key, params)
 
     def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, Any]:
-        """Return observation, (size,) float32, and state of an episode that begins; nothing is checked."""
+        """Return observation, (size,) float32, and state of a new episode; nothing is checked."""
         rows, state = vary_like(self._begin_from(seed_of(key), params), (key, params))
         return jnp.stack(rows), state
 
     def _begin_from(self, seed: jax.Array, params: EnvParams) -> tuple[list[jax.Array], Any]:
-        """Return observation, row by row, and state of an episode that begins, from one random word."""
+        """Return observation, row by row, and state of a new episode, from one random word."""
         state = self.begin(*self.sample_start(seed, params), params, seed)
         return self._rows(state, params), state
 
@@ -238,7 +241,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         return self._fly(seed_of(key), state, action, params)
 
     def _transition(self, state: Any, command: Action, params: EnvParams) -> tuple[Any, ...]:
-        """Return observation, row by row, state, reward, flags and info of a step without auto-reset."""
+        """Return observation rows, state, reward, flags and info of a step without auto-reset."""
         next_state, reward, terminated, info = self.advance(state, command, params)
         next_state, reward = _keep_types(next_state, state), jnp.asarray(reward, self._dtype(state))
         rows = self._rows(next_state, params)
@@ -249,7 +252,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     def _transition_or_reset(
         self, seed: jax.Array, state: Any, command: Action, params: EnvParams, has_ended: Any
     ) -> tuple[Any, ...]:
-        """Return observation and that before the reset, row by row, state, reward, flags and info."""
+        """Return observation rows, those before the reset, state, reward, flags and info."""
         final_rows, next_state, reward, flags, info = self._transition(state, command, params)
         if has_ended is None:
             done = flags["terminated"] | flags["truncated"]

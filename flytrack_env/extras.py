@@ -1,4 +1,4 @@
-"""Packages that only an extra of FlyTrack brings: what is missing is told, and how to install it."""
+"""Packages that only an extra of FlyTrack brings: say what is missing and how to install it."""
 
 from importlib.util import find_spec
 
@@ -25,7 +25,7 @@ def check_gymnax(found: str) -> None:
 
 
 def check_installed(extra: str, who: str, *modules: str) -> None:
-    """Raise an error unless every one of these modules is there to be imported; imports none of them.
+    """Raise ImportError unless all these modules are installed; import none of them.
 
     extra: of FlyTrack, which brings them. who: needs them, in the plural, for the message.
 

@@ -1,4 +1,4 @@
-"""Reading files of bounded size, and writing them atomically: a reader sees the old file or the new one."""
+"""Read files of bounded size, and write files atomically: readers see the old or the new one."""
 
 import contextlib
 import itertools
@@ -15,7 +15,11 @@ _held: set[Path] = set()  # lock files of this process
 
 
 def user_cache_folder() -> Path:
-    """Return FlyTrack's folder for what can be made again; RuntimeError where a user has no home."""
+    """Return FlyTrack's folder for what can be made again.
+
+    Raises:
+        RuntimeError: the user has no home.
+    """
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "flytrack"
 
 

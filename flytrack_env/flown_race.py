@@ -1,4 +1,4 @@
-"""The race that a recorded flight flew: gates passed and when, laps, the gate to fly next, why it ended.
+"""The race of a recorded flight: passes, laps, the gate to fly next, and why it ended.
 
 A rollout holds states and actions, not the race; the race follows from the positions by the
 environment's own rules.
@@ -68,7 +68,7 @@ def follow_race(
     first_gate: int | None = None,
     last_vel_w: np.ndarray | None = None,
 ) -> FlownRace:
-    """Return the race of a flight at 100 Hz through these positions, by the rules of ``advance_race``.
+    """Return the race of a 100 Hz flight through these positions, by ``advance_race``'s rules.
 
     positions: (T, 3), world, m, finite. first_gate: index of the gate to fly first; if None, gate 0
     for a flight that begins near the track's start or passes no gate, else the one that it passes
@@ -170,9 +170,10 @@ def _passed(positions: jax.Array, course: Course) -> jax.Array:
 def _follow(
     positions: jax.Array, first_gate: jax.Array, course: Course
 ) -> tuple[Race, RaceEvents, jax.Array]:
-    """Return the race at each state, leaves (T,), and of each step the events and where it crossed gates.
+    """Return the race at each state, and the events and gate crossings of each step.
 
-    The fractions of a step, (T - 1, 2), are those at the gate and at the one behind it.
+    Leaves of the race are (T,). The crossings are fractions of a step, (T - 1, 2), at the gate and
+    at the one behind it.
     """
 
     def one(race: Race, segment: tuple[jax.Array, ...]) -> tuple[Race, Any]:

@@ -54,7 +54,7 @@ def _is_number(leaf: jax.Array) -> bool:
 
 
 def vary_like(tree: Tree, source: Any) -> Tree:
-    """Return a tree whose leaves vary, within ``shard_map``, over all the axes that those of another do.
+    """Return a tree whose leaves vary, within ``shard_map``, over all axes that ``source``'s do.
 
     The same numbers: what begins as a constant and is then carried by a loop needs the type of its
     end.
@@ -88,7 +88,7 @@ def _lower_fence(ctx, *leaves):  # type: ignore[no-untyped-def]
 
 
 def _lower(function: Callable[..., Any], ctx: Any, *values: Any) -> Any:
-    """Lower a function as it is on one device: ``shard_map`` checks types that loops here do not keep."""
+    """Lower a function as on one device: ``shard_map`` checks types that loops here do not keep."""
     plain = [core.ShapedArray(aval.shape, aval.dtype) for aval in ctx.avals_in]
     return mlir.lower_fun(function, multiple_results=True)(ctx.replace(avals_in=plain), *values)
 
@@ -185,7 +185,7 @@ def is_simple(jaxpr: Any) -> bool:
 
 
 def one_kernel(function: Callable[..., Tree]) -> Callable[..., Tree]:
-    """Return the same function of pytrees, on the CPU compiled as one kernel if it is made of ``SIMPLE``.
+    """Return a function of pytrees that the CPU runs as one kernel if it is made of ``SIMPLE``.
 
     Elsewhere, and with 0 in the environment variable of ``SWITCH``, the function itself.
     """
@@ -230,9 +230,10 @@ def _bind(
 
 
 class _Element(NamedTuple):
-    """A function of one element of a batch, and the axis of the batch in each argument, None in those of all.
+    """A function of one element of a batch, and the axis of the batch in each argument.
 
-    In its results the batch is the last axis.
+    The axis is None for an argument that all elements share. In the results the batch is the last
+    axis.
     """
 
     jaxpr: ClosedJaxpr

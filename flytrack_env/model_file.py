@@ -32,7 +32,10 @@ BESIDE = ("effects", "motion", BATTERY)  # parameters, or among them
 
 
 class ModelFileError(ValueError):
-    """A model file that cannot be used; the message names file, field, what was found and expected."""
+    """A model file that cannot be used.
+
+    The message names file and field, what was found and what was expected.
+    """
 
 
 def _object(where: str, value: Any) -> dict[str, Any]:
@@ -79,8 +82,8 @@ def _read_effect(source: str, name: str, values: dict[str, Any]) -> Any:
     field = f"effects.{name}"
     if name == "learned_residual":
         raise ModelFileError(
-            f"{source}: {field}: networks are no longer part of a model, expected other effects only; "
-            "diagnose the log again"
+            f"{source}: {field}: networks are no longer part of a model, "
+            "expected other effects only; diagnose the log again"
         )
     if name not in effects.BY_NAME:
         known = ", ".join(effects.BY_NAME)

@@ -7,7 +7,9 @@ import jax
 
 @jax.tree_util.register_static
 class Motion(Enum):
-    """A static choice of a model: a pytree without leaves, so that each motion compiles its own program.
+    """How a model moves within a step, a static choice.
+
+    A pytree without leaves, so that each motion compiles its own program.
 
     HANDOUT: the exercise's step, the contract of the registered ids: rates after the step turn the
     drone over all of it, and the force has the attitude before it. SEMI_IMPLICIT: the same, but the

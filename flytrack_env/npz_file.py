@@ -1,4 +1,4 @@
-"""Files of arrays, ``.npz``: nothing is unpickled, and declared sizes are checked before anything is read."""
+"""Files of arrays, ``.npz``, read without unpickling and only after their sizes are checked."""
 
 import io
 import zipfile

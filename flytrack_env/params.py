@@ -96,12 +96,13 @@ class EnvParams:
             np.asarray(self.course.gates.half_opening) > np.asarray(self.drone_radius)[..., None]
         ):
             raise ValueError(
-                f"drone_radius: found {self.drone_radius}, expected less than half of every gate's opening"
+                f"drone_radius: found {self.drone_radius}, "
+                "expected less than half of every gate's opening"
             )
 
 
 def _check_course(course: Course) -> None:
-    """Raise ValueError for a course of one gate, whose passes would count twice, or for invalid numbers."""
+    """Raise ValueError for invalid numbers, or one gate alone, whose passes would count twice."""
     num_gates = np.shape(course.gates.half_opening)[-1]
     if num_gates < LEAST_GATES:
         raise ValueError(f"course.gates: found {num_gates}, expected at least {LEAST_GATES}")

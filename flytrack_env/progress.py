@@ -1,4 +1,7 @@
-"""Progress of long work: a bar on a terminal, a line every 30 s elsewhere. tqdm comes with the extras."""
+"""Progress of long work: a bar on a terminal, a line every 30 s elsewhere.
+
+tqdm comes with the extras.
+"""
 
 import sys
 from typing import Any, TextIO
@@ -34,7 +37,7 @@ def progress_bar(unit: str, **options: Any) -> Any:
 
 
 class ProgressBar:
-    """Progress as a callback of ``collect``, ``fit`` and ``diagnose``: called with what is done and all."""
+    """A callback of ``collect``, ``fit`` and ``diagnose`` that shows how much of all is done."""
 
     def __init__(self, unit: str):
         self.bar = progress_bar(unit, leave=False)

@@ -58,7 +58,10 @@ def start_race(gate_index: jax.Array, course: Course) -> Race:
 def _count_pass(
     race: Race, is_pass: jax.Array, time_s: Scalar, course: Course
 ) -> tuple[Race, jax.Array]:
-    """Return the race after a possible pass, its gate frames not yet moved on, and whether a lap ended."""
+    """Return the race after a possible pass, and whether a lap ended.
+
+    The gate frames of the race are not moved on yet.
+    """
     gates_passed = race.gates_passed + is_pass.astype(jnp.int32)
     is_lap = is_pass & (gates_passed == (race.laps + 1) * course.num_gates)
     counted = race._replace(

@@ -35,7 +35,7 @@ def mix(word: jax.Array) -> jax.Array:
 
 
 def check_key(key: Any) -> None:
-    """Raise TypeError unless this is one JAX key (typed, or the legacy array of words), traced or not."""
+    """Raise TypeError unless this is one JAX key, typed or a legacy array, traced or not."""
     dtype = getattr(key, "dtype", None)
     if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
         num_axes = 0
@@ -93,11 +93,11 @@ class Draws:
         return jnp.asarray(low + (high - low) * unit)
 
     def normal(self, name: str) -> jax.Array:
-        """Return a float32, standard normal but for a distribution function off by up to 0.001; within 4.5.
+        """Return an approximately standard normal float32, at most 4.5 from 0.
 
-        The sum of a word's four bytes, stretched by an odd polynomial: noise is drawn in every
-        step, twice, and the inverse distribution function would cost more than the rest of the
-        observation.
+        Its distribution function is off by up to 0.001. It is the sum of a word's four bytes,
+        stretched by an odd polynomial: noise is drawn in every step, twice, and the inverse
+        distribution function would cost more than the rest of the observation.
         """
         word = self.word(name)
         pairs = (word & EVEN_BYTES) + ((word >> 8) & EVEN_BYTES)

@@ -99,7 +99,7 @@ Choose = Callable[[Scalar, Scalar], jax.Array]
 
 
 def _point_on_course(draws: Draws, gate_index: jax.Array, course: Course) -> tuple[Vec3, Vec3]:
-    """Return a point on the way from the gate before to a gate, and the unit direction of flight there.
+    """Return a point on the way to a gate from the one before, and the unit flight direction.
 
     The way is a cubic Hermite curve that leaves and meets the gates along their directions of
     flight, with tangents as long as the gates are apart: about what a racing drone flies.

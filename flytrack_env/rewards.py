@@ -28,7 +28,7 @@ class Transition(NamedTuple):
 
 
 class RewardWeights(NamedTuple):
-    """Weight of each term; the names are those of the functions in ``TERMS``, which say what they measure.
+    """Weight of each term; the function of that name in ``TERMS`` says what it measures.
 
     progress, gate_pass, off_centre, termination, body_rates, action_change.
     """

@@ -86,7 +86,7 @@ def load_rollout(path: str | Path, allow_pickle: bool = False) -> tuple[np.ndarr
 def load_named_rollouts(
     paths: Sequence[str | Path], allow_pickle: bool = False
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return rollouts by file name without suffix; prefixed by the folder's name if file names repeat.
+    """Return rollouts by file name without suffix, after the folder's name if file names repeat.
 
     Each is states (T, 21) and actions (T, 4). allow_pickle: see ``load_rollout``.
 
@@ -105,9 +105,10 @@ def load_named_rollouts(
 
 
 def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
-    """Return whether a file declares pickled objects; raise RolloutError unless those, or a rollout.
+    """Return whether a file declares pickled objects, before any data is read.
 
-    No data has been read yet.
+    Raises:
+        RolloutError: pickled objects that are not allowed, or no rollout.
     """
     if np.lib.format.read_magic(file) != (1, 0):  # as NumPy writes it unless a header is very long
         raise RolloutError(f"{path}: found another version of .npy than 1.0, expected {EXPECTED}")

@@ -35,7 +35,10 @@ class ResourceLimits(NamedTuple):
 
 
 class SandboxError(Exception):
-    """A call that did not return; ``kind`` is the name of the exception if the function raised one."""
+    """A call that did not return.
+
+    kind: name of the exception if the function raised one.
+    """
 
     def __init__(self, text: str, kind: str = ""):
         super().__init__(text)
@@ -50,7 +53,7 @@ def run(
     limits: ResourceLimits = ResourceLimits(),  # noqa: B008, a tuple of constants
     environment: Mapping[str, str] | None = None,
 ) -> bytes:
-    """Return ``function(argument, content)``, a function of a file that does not import this package.
+    """Return ``function(argument, content)`` of a file that does not import this package.
 
     argument: JSON values. environment: added to that of this process. The function can write no
     files; what it prints is discarded.

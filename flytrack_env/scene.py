@@ -1,4 +1,4 @@
-"""What pictures, videos, windows and recordings share: shapes in the world, the drone's body, and colours."""
+"""What pictures, videos, windows and recordings share: shapes, the drone's body, colours."""
 
 from typing import NamedTuple
 
@@ -97,7 +97,7 @@ def squares(
 
 
 def rotations(quaternions: np.ndarray) -> np.ndarray:
-    """Return the rotation matrices (..., 3, 3), body to world, of unit quaternions (..., 4), scalar first."""
+    """Return rotations (..., 3, 3), body to world, of unit quaternions (..., 4), scalar first."""
     return Rotation.from_quat(np.roll(quaternions, -1, axis=-1)).as_matrix()
 
 

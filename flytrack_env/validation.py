@@ -1,4 +1,4 @@
-"""Validating what JSON and TOML files hold by types and limits of ``msgspec``, with one form of message.
+"""Validate JSON and TOML files by types and limits of ``msgspec``, with one form of message.
 
 A message names file, field, what was found and what is expected: ``a.toml: rows.every: found 0,
 expected a whole number from 1``. Checks between fields are in a struct's ``__post_init__``, which
@@ -31,9 +31,9 @@ class Fields(msgspec.Struct, forbid_unknown_fields=True):
 def convert(
     where: str, values: Any, kind: type[T], error: type[Exception] = ValueError, field: str = ""
 ) -> T:
-    """Convert the content of a JSON or TOML file to a type, strictly: 1 is no bool, and "1" is no number.
+    """Convert the content of a JSON or TOML file to a type, strictly.
 
-    Whole floats count as integers, so that 2e7 is one.
+    1 is no bool, and "1" is no number. Whole floats count as integers, so that 2e7 is one.
 
     Args: where: file or object that the values are from, for messages; empty where the caller names
         it. values: dictionaries, lists, text and numbers. kind: struct, dataclass or other type;
@@ -93,14 +93,17 @@ def _describe(problem: str, value: Any, kind: Any, field: str) -> str:
 
 
 def join_text(field: str, text: str) -> str:
-    """Return what is wrong with a table: ``field: found ...`` of one of its fields, or ``expected ...``."""
+    """Put a table's name before a message on it.
+
+    text: ``field: found ...`` of one of its fields, or ``expected ...`` of the table itself.
+    """
     if not field:
         return text
     return f"{field}: {text}" if text.startswith("expected") else f"{field}.{text}"
 
 
 def choose(field: str, value: Any, choices: Iterable[str]) -> str:
-    """Return a word of a field that must be one of some; raises ValueError without it, or for another."""
+    """Return a field's value; raise ValueError if it is missing or not one of the choices."""
     words = tuple(choices)
     if value not in words:
         found = "missing" if value is None else f"found {quote_value(value)}"

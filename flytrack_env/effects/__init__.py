@@ -104,9 +104,10 @@ def effect_of(parameters: Any) -> Effect:
 
 
 def check_parameters(parameters: Any, dt: Any, delay_steps: int = USUAL_STEPS) -> None:
-    """Raise ValueError, naming effect and parameter, for concrete values beyond what the effect can do.
+    """Raise ValueError for concrete values beyond what the effect can do.
 
-    dt: step of time, s. delay_steps: how many steps are remembered, as in ``start_memories``.
+    The message names effect and parameter. dt: step of time, s. delay_steps: how many steps are
+    remembered, as in ``start_memories``.
     """
     effect = effect_of(parameters)
     for name, bounds in effect.ranges.items():
@@ -129,13 +130,16 @@ def merge(present: tuple[Any, ...], *added: Any) -> tuple[Any, ...]:
 
 
 def lasting_s(parameters: Any) -> np.ndarray:
-    """Return the longest that an effect with concrete parameters may delay anything, s: all its delays."""
+    """Return the sum of the delays of an effect with concrete parameters, s."""
     delays = [getattr(parameters, name) for name in effect_of(parameters).max_steps]
     return np.sum([np.maximum(np.asarray(delay, float), 0.0) for delay in delays], axis=0)
 
 
 def delay_steps_of(effects: tuple[Any, ...], dt: float) -> int:
-    """Return how many steps the delays of a model with concrete parameters need, with room to draw others."""
+    """Return how many steps the delays of a model with concrete parameters need.
+
+    The number leaves room to draw longer delays.
+    """
     longest_s = max((float(np.max(lasting_s(parameters))) for parameters in effects), default=0.0)
     needed = np.ceil((DRAWN_LONGER * longest_s + DRAWN_LATER_S) / dt * (1.0 - ROUNDING))
     return int(np.clip(needed, USUAL_STEPS, MOST_STEPS))
@@ -186,7 +190,7 @@ def fold(
 def respond(
     effects: tuple[Any, ...], memories: tuple[Any, ...], lagged: Any, context: StepContext
 ) -> tuple[Any, tuple[Any, ...]]:
-    """Return the applied action at the end of a span of the step, and the memories of what makes it."""
+    """Return the applied action at the end of a span of the step, and the effects' memories."""
     found = list(memories)
     for place, parameters in enumerate(effects):
         hook = effect_of(parameters).hooks.get("respond")
@@ -239,9 +243,9 @@ def remember(
 def observe(
     effects: tuple[Any, ...], memories: tuple[Any, ...], offset_b: Any, dt: Scalar
 ) -> tuple[tuple[Any, ...], Any]:
-    """Return memories that have taken up how far measured body rates are from the model's, and the rest.
+    """Update memories by measured body rates; return them and what they do not explain.
 
-    dt: since the last measurement, s.
+    offset_b: measured rates minus the model's. dt: since the last measurement, s.
     """
     found = []
     for parameters, memory in zip(reversed(effects), reversed(memories), strict=True):

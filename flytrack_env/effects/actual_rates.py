@@ -1,4 +1,4 @@
-"""Betaflight's Actual rates: a slope about the centre of each stick, and the rest of the rate later."""
+"""Betaflight's Actual rates: a slope about each stick's centre, and a faster end."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,10 @@ from flytrack_env.quaternion import Scalar
 
 
 class ActualRates(NamedTuple):
-    """Share of the rate at full stick that the slope about the centre lacks, 1; how late it comes, 1."""
+    """Share of the rate at full stick that the slope about the centre lacks, 1.
+
+    Expo: how late on the stick that share comes, 1.
+    """
 
     roll: Scalar = 0.0
     pitch: Scalar = 0.0
@@ -30,7 +33,8 @@ ACTUAL_RATES = Effect(
     parameters=ActualRates,
     ranges={name: Range(0.0, 1.0, "1") for name in ActualRates._fields},
     notable=dict.fromkeys(ActualRates._fields[:3], 0.05),
-    equation=r"u_i \leftarrow u_i \left( 1 - b_i + b_i |u_i| \left( e_i u_i^4 + 1 - e_i \right) \right)",
+    equation=r"u_i \leftarrow u_i \left( 1 - b_i + b_i |u_i| "
+    r"\left( e_i u_i^4 + 1 - e_i \right) \right)",
     source="applyActualRates in Betaflight 4.6, src/main/fc/rc.c, over the rate at full stick",
     hooks={"command": on_rate_sticks(_curve)},
     search=Search(shapes=ActualRates._fields[3:], follows_sticks=True, is_setting=True),

@@ -127,7 +127,10 @@ Hook = Callable[[Any, Any, Any, StepContext], Any]
 
 
 def on_rate_sticks(curve: Callable[..., Scalar]) -> Hook:
-    """Return the hook of a curve on each rate stick; parameters: its other arguments, of three axes each."""
+    """Return the hook that applies a curve to each rate stick.
+
+    The effect's parameters are the curve's other arguments, three axes of each.
+    """
 
     def command(parameters: Any, memory: None, sticks: Action, context: StepContext) -> Action:
         thirds = (parameters[start : start + 3] for start in range(0, len(parameters), 3))
@@ -138,12 +141,12 @@ def on_rate_sticks(curve: Callable[..., Scalar]) -> Hook:
 
 
 def scaled(factors: Any, memory: None, vector: Vec3, context: StepContext) -> Vec3:
-    """Return a vector with a factor on each axis: the hook of an effect whose parameters these are."""
+    """Return a vector times a factor per axis: the hook of an effect that has these factors."""
     return Vec3(*(factor * part for factor, part in zip(factors, vector, strict=True)))
 
 
 def shifted(offsets: Any, memory: None, vector: Vec3, context: StepContext) -> Vec3:
-    """Return a vector with an offset on each axis: the hook of an effect whose parameters these are."""
+    """Return a vector plus an offset per axis: the hook of an effect that has these offsets."""
     return vector + Vec3(*offsets)
 
 

@@ -1,4 +1,4 @@
-"""Betaflight's rate loop with its mixer and four motors: how sticks become body rates and thrust."""
+"""Betaflight's rate loop with mixer and four motors: how sticks become body rates and thrust."""
 
 from functools import reduce
 from typing import Any, NamedTuple
@@ -40,15 +40,15 @@ NONE_HZ = 1e5  # a filter that does nothing in a millisecond
 
 
 class BetaflightLoop(NamedTuple):
-    """The craft, and its settings as the firmware's command line has them; without arms there is no loop.
+    """The craft, and its settings as the firmware's command line has them.
 
-    roll_arm, pitch_arm, yaw_arm: angular acceleration for a newton of one motor, 1/(kg m).
-    yaw_spin: change of the yaw rate when one motor starts, rad/s. motor_s: lag of the motors.
-    precession: (I_z - I_y) / I_x. rear_right, front_right, rear_left, front_left: thrust of a motor
-    as a share of what it should be. center_x, center_y: where the centre of mass is ahead and left
-    of the motors' middle, as a share of the motors' own distance from it. gyro_late_s: lag of the
-    gyro beyond that of its filters' settings. sticks_hz, throttle_hz: cutoffs of the receiver's
-    smoothing. A cutoff of 0 is no filter.
+    Without arms there is no loop. roll_arm, pitch_arm, yaw_arm: angular acceleration for a newton
+    of one motor, 1/(kg m). yaw_spin: change of the yaw rate when one motor starts, rad/s. motor_s:
+    lag of the motors. precession: (I_z - I_y) / I_x. rear_right, front_right, rear_left,
+    front_left: thrust of a motor as a share of what it should be. center_x, center_y: where the
+    centre of mass is ahead and left of the motors' middle, as a share of the motors' own distance
+    from it. gyro_late_s: lag of the gyro beyond that of its filters' settings. sticks_hz,
+    throttle_hz: cutoffs of the receiver's smoothing. A cutoff of 0 is no filter.
     """
 
     roll_arm: Scalar = 0.0
@@ -119,7 +119,7 @@ class BetaflightLoop(NamedTuple):
 
 
 class Frames(NamedTuple):
-    """The receiver's frames: what the last one said, and what feedforward makes of those before; (3,) each.
+    """The receiver's last frame, and the feedforward's memory of earlier frames; (3,) each.
 
     setpoint, hold: deg/s, the latter follows slowly. speed: smoothed, deg/s^2; speed_change: of it,
     in a frame. moved: by how much the stick did, us. was_still: 1 if it did not.
@@ -136,7 +136,7 @@ class Frames(NamedTuple):
 
 
 class Axes(NamedTuple):
-    """Filters (tuples: of several stages) and integrals, (3,) each; deg/s, and units of the mixer."""
+    """Filters, a tuple where of several stages, and integrals; (3,) each, deg/s or mixer units."""
 
     setpoint: tuple[Array, ...]
     feedforward: tuple[Array, ...]
@@ -150,7 +150,10 @@ class Axes(NamedTuple):
 
 
 class Throttle(NamedTuple):
-    """Filters of the throttle, 0 to 1: its smoothing, last value, its speed (anti-gravity), and slow part."""
+    """Filters of the throttle, 0 to 1.
+
+    They are its smoothing, last value, speed (for anti-gravity) and slow part.
+    """
 
     smooth: tuple[Scalar, ...]
     last: Scalar
@@ -180,9 +183,10 @@ class Turn(NamedTuple):
 
 
 class Given(NamedTuple):
-    """What substeps under one frame share: setpoints and feedforward of it, (3,) each, the throttle, 0 to 1.
+    """What the substeps under one frame share.
 
-    thrust_coeffs, battery_v: of the thrust map. dt: of a substep, s.
+    setpoint, feedforward: of the frame, (3,) each. throttle: 0 to 1. thrust_coeffs, battery_v: of
+    the thrust map. dt: of a substep, s.
     """
 
     loop: BetaflightLoop
@@ -222,14 +226,17 @@ def _action_of(share: Scalar, loop: BetaflightLoop) -> Scalar:
 
 
 def _like(constants: np.ndarray, value: Array) -> Array:
-    """Return constants in the precision of a value: a compiled kernel keeps the one that it was traced in."""
+    """Return constants in a value's precision, since a compiled kernel keeps that of its trace."""
     return jnp.asarray(constants, value.dtype)
 
 
 def _lowpass(
     stages: tuple[Scalar, ...], target: Scalar, cutoff_hz: Scalar, dt: Scalar
 ) -> tuple[Scalar, ...]:
-    """Return the stages of a low pass after a held target: exact; its cutoff is that of all stages."""
+    """Return the stages of a low pass after a held target, exactly.
+
+    cutoff_hz: of all stages together.
+    """
     correction = 1.0 / (2.0 ** (1.0 / len(stages)) - 1.0) ** 0.5
     cutoff_hz = jnp.where(cutoff_hz > 0.0, cutoff_hz * correction, NONE_HZ)
     turns = 2.0 * jnp.pi * cutoff_hz * dt
@@ -248,7 +255,10 @@ def _lowpass(
 def _received(
     loop: BetaflightLoop, frames: Frames, stick: Array, full: Array, dt: Scalar
 ) -> Frames:
-    """Return the frames after another; full: rates at full stick, (3,) deg/s. dt: since the last, s."""
+    """Return the frames after a new one.
+
+    full: rates at full stick, (3,) deg/s. dt: since the last frame, s.
+    """
     setpoint, reach = stick * full, jnp.abs(full)
     change = setpoint - frames.setpoint
     is_still = jnp.abs(stick - frames.stick) < STILL
@@ -277,7 +287,7 @@ def _received(
 def _throttled(
     loop: BetaflightLoop, throttle: Throttle, stick: Scalar, dt: Scalar
 ) -> tuple[Throttle, Scalar, Scalar]:
-    """Return the throttle's filters a substep later, the throttle, and how much it boosts the loop."""
+    """Return the throttle's filters a substep later, the throttle, and its boost of the loop."""
     level = _lowpass(throttle.smooth, stick, loop.throttle_hz, 0.5 * dt)[-1]
     rest = 1.0 - level
     speed = jnp.abs(level - throttle.last) / dt * rest * rest
@@ -300,7 +310,10 @@ def _cutoff(low: Scalar, high: Scalar, level: Scalar) -> Scalar:
 def _filtered_gyro(
     loop: BetaflightLoop, gyro: Array, rates: Array, level: Scalar, dt: Scalar
 ) -> Array:
-    """Return the gyro behind both filters, as one lag; half a substep of delay is in the substep."""
+    """Return the gyro behind both filters, as one lag.
+
+    The lag is shorter by half a substep, the delay that the substep itself has.
+    """
 
     def lag_s(cutoff_hz: Scalar) -> Scalar:
         return 1.0 / (2.0 * jnp.pi * jnp.where(cutoff_hz > 0.0, cutoff_hz, NONE_HZ))
@@ -314,9 +327,9 @@ def _filtered_gyro(
 def _damped(
     loop: BetaflightLoop, axes: Axes, gyro: Array, feedforward: Array, level: Scalar, dt: Scalar
 ) -> tuple[Array, tuple[Any, Any, Any]]:
-    """Return the D term: of the gyro, behind two filters, and more of it where the craft or a stick jerks.
+    """Return the D term, and its filters afterwards: ``dterm``, ``d_range`` and ``d_boost``.
 
-    And its filters afterwards: ``dterm``, ``d_range`` and ``d_boost``.
+    The term is that of the gyro behind two filters, larger where the craft or a stick jerks.
     """
     d, d_max = loop.axes("d"), loop.axes("d_max")
     cutoff_hz = _cutoff(loop.dterm_lpf1_dyn_min_hz, loop.dterm_lpf1_dyn_max_hz, level)
@@ -367,7 +380,7 @@ def _controlled(state: Turn, given: Given, level: Scalar, boost: Scalar) -> tupl
 
 
 def _mixed(loop: BetaflightLoop, asked: Array, throttle: Throttle, level: Scalar) -> Array:
-    """Return the motors' commands, (4,) shares of full: what the axes ask for comes before the throttle."""
+    """Return the motors' commands, (4,) shares of full; the axes come before the throttle."""
     boost = loop.throttle_boost * BOOST_SCALE
     level = jnp.clip(level + boost * (level - throttle.slow), 0.0, 1.0)
     linear = loop.thrust_linear / PERCENT
@@ -418,7 +431,7 @@ def _substep(state: Turn, given: Given) -> Turn:
 def _respond(
     loop: BetaflightLoop, memory: Loop, lagged: Action, context: StepContext
 ) -> tuple[Action, Loop]:
-    """Return the applied action and the memory at the end of a span of the step, in which a command acts."""
+    """Return the applied action and the memory at the end of a span in which a command acts."""
     begin, end = context.span
     num_substeps = round(NUM_SUBSTEPS * (end - begin))
     full, acting, frames = (
@@ -453,7 +466,7 @@ def _respond(
 
 
 def observe(loop: BetaflightLoop, memory: Loop, offset_b: Vec3, dt: Scalar) -> tuple[Loop, Vec3]:
-    """Return the memory with gyro filters that have followed measured rates; the offset is the rates'."""
+    """Return the memory with gyro filters moved to the measured rates, and the rates' offset."""
     step, axes = jnp.stack(offset_b) / PER_DEGREE, memory.axes
     axes = axes._replace(gyro=axes.gyro + step, dterm=tuple(one + step for one in axes.dterm))
     return memory._replace(axes=axes), offset_b
@@ -497,12 +510,13 @@ BETAFLIGHT_LOOP = Effect(
         "motor_idle": Range(0.0, 2000.0, "%/100"),
     },
     notable=NOTABLE,
-    equation=r"c = \text{mix}\left(u_t, P e + I \int e\, dt - D \dot{\omega} + F \dot{u}\right), \quad "
+    equation=r"c = \text{mix}\left(u_t, P e + I \int e\, dt "
+    r"- D \dot{\omega} + F \dot{u}\right), \quad "
     r"\text{motor}\, \dot{s}_k + s_k = c_k, \quad "
     r"\dot{\omega}_i = \text{arm}_i \sum_k \pm \tfrac{1}{4} T(s_k, V)",
-    source="pidController and mixTable of Betaflight 4.6 with legacy mixer, airmode and PT1 filters "
-    "(src/main/flight/pid.c, mixer.c, src/main/fc/rc.c), a frame of the receiver at each step, and motors "
-    "that each give a quarter of the thrust curve",
+    source="pidController and mixTable of Betaflight 4.6 with legacy mixer, airmode and PT1 "
+    "filters (src/main/flight/pid.c, mixer.c, src/main/fc/rc.c), a frame of the receiver at each "
+    "step, and motors that each give a quarter of the thrust curve",
     hooks={"respond": _respond},
     memory=Memory(start=start, observe=observe),
     search=Search(

@@ -1,4 +1,4 @@
-"""Betaflight's own rates: sticks that turn ever faster towards their ends, and an expo about the centre."""
+"""Betaflight's own rates: sticks that turn faster towards their ends, and a centre expo."""
 
 from typing import NamedTuple
 
@@ -30,7 +30,8 @@ BETAFLIGHT_RATES = Effect(
     parameters=BetaflightRates,
     ranges={name: Range(0.0, 0.99, "1") for name in BetaflightRates._fields},
     notable=dict.fromkeys(BetaflightRates._fields, 0.05),
-    equation=r"u_i \leftarrow u_i \left( 1 - e_i + e_i |u_i|^3 \right) \frac{1 - s_i}{1 - s_i |u_i|}",
+    equation=r"u_i \leftarrow u_i \left( 1 - e_i + e_i |u_i|^3 \right) "
+    r"\frac{1 - s_i}{1 - s_i |u_i|}",
     source="applyBetaflightRates in Betaflight 4.6, src/main/fc/rc.c, over the rate at full stick",
     hooks={"command": on_rate_sticks(_curve)},
     search=Search(follows_sticks=True, is_setting=True),

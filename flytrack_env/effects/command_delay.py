@@ -17,9 +17,9 @@ LONGEST_S, LONGEST_STEPS = (
 
 
 class CommandDelay(NamedTuple):
-    """Delay of all commands, s, and how much later yaw and thrust are than that; need not be whole steps.
+    """Delay of all commands, and how much later yaw and thrust are than that, s.
 
-    A channel is never early: below 0 the sum is 0.
+    Delays need not be whole steps. A channel is never early: below 0 the sum is 0.
     """
 
     delay_s: Scalar = 0.0
@@ -31,7 +31,7 @@ PastCommands = tuple[Action, ...]  # those before the present one, the latest fi
 
 
 def start(delay: CommandDelay, drone: Drone, num_steps: int = USUAL_STEPS) -> PastCommands:
-    """Return the memory of an episode that begins: as if the applied action had been commanded all along.
+    """Return the memory of a new episode, as if the applied action had always been commanded.
 
     num_steps: how many commands it holds; longer delays are cut.
     """
@@ -95,10 +95,11 @@ COMMAND_DELAY = Effect(
         "thrust_extra_s": Range(-LONGEST_S, LONGEST_S, "s"),
     },
     notable=dict.fromkeys(CommandDelay._fields, 0.005),
-    equation=r"u_i(t) \leftarrow \frac{1}{\Delta t} \int_t^{t + \Delta t} u_i(s - \text{delay}_i)\, ds, "
+    equation=r"u_i(t) \leftarrow \frac{1}{\Delta t} "
+    r"\int_t^{t + \Delta t} u_i(s - \text{delay}_i)\, ds, "
     r"\quad \text{delay}_i = \max(0, \text{delay} + \text{extra}_i)",
-    source="assumption: constant within a flight; the link comes first, then what the flight controller "
-    "makes of the sticks",
+    source="assumption: constant within a flight; the link comes first, then what the flight "
+    "controller makes of the sticks",
     max_steps=dict.fromkeys(CommandDelay._fields, LONGEST_STEPS),
     hooks={"command": delayed},
     memory=Memory(start=start, remember=remember),

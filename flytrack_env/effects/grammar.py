@@ -29,7 +29,7 @@ XYZ = 3
 
 
 class Moment(NamedTuple):
-    """What a law may look at, scalars or arrays of one shape; units and frames as in ``StepContext``.
+    """The inputs of a law: scalars or arrays of one shape; units, frames as in ``StepContext``.
 
     time_s: since the start of the flight.
     """
@@ -66,7 +66,7 @@ def moment_of(context: StepContext, flight: Flight | None) -> Moment:
 
 
 class Quantity(NamedTuple):
-    """A quantity of a moment: its unit, and the lowest and highest that a drone in flight can have."""
+    """A quantity of a moment: its unit, and the lowest and highest that a drone can have."""
 
     unit: str
     low: float
@@ -147,10 +147,11 @@ def _place(moment: Moment, x: float, y: float, z: float, radius: float) -> Scala
 
 
 class Shape(NamedTuple):
-    """A shape: the names of its numbers, the words of its formula, the quantities that have it, and itself.
+    """A shape of a factor: a function of a quantity.
 
-    positive: numbers that must be above 0. of_moment: it takes the moment in place of the
-    quantity's value, since its quantity is a direction or a place.
+    numbers: names of its numbers. words: of its formula. quantities: that can have the shape. at:
+    the function. positive: numbers that must be above 0. of_moment: it takes the moment in place of
+    the quantity's value, since its quantity is a direction or a place.
     """
 
     numbers: tuple[str, ...]
@@ -267,7 +268,10 @@ class Term:
         )
 
     def at(self, moment: Moment, spread: Scalar) -> Vec3:
-        """Return its vector, body frame; spread: by how many standard errors each coefficient is larger."""
+        """Return its vector, body frame.
+
+        spread: by how many standard errors each coefficient is larger.
+        """
         signal, total = self.signal(moment), Vec3(0.0, 0.0, 0.0)
         for place, one in enumerate(self.basis(moment)):
             if self.coefficients[place] or self.standard_errors[place]:
@@ -278,7 +282,8 @@ class Term:
     def text(self) -> str:
         """Return its formula, with the standard errors of its coefficients."""
         values = ", ".join(f"{value:.3g}" for value in self.coefficients[: self.num_coefficients])
-        return f"{self.acts} ({self.frame}) += ({values}) {' '.join(one.text() for one in self.factors)}"
+        factors = " ".join(factor.text() for factor in self.factors)
+        return f"{self.acts} ({self.frame}) += ({values}) {factors}"
 
 
 @jax.tree_util.register_static
@@ -379,6 +384,7 @@ def _check_power(where: str, quantity: str, exponent: float, offset: float) -> N
     low, high = QUANTITIES[quantity].low + offset, QUANTITIES[quantity].high + offset
     if exponent < 0.0 and low <= 0.0 <= high:
         raise ValueError(
-            f"{where}.offset: found a pole at {quantity} = {0.0 - offset:g} {QUANTITIES[quantity].unit}, "
-            f"expected none between {QUANTITIES[quantity].low:g} and {QUANTITIES[quantity].high:g}"
+            f"{where}.offset: found a pole at {quantity} = {0.0 - offset:g} "
+            f"{QUANTITIES[quantity].unit}, expected none between "
+            f"{QUANTITIES[quantity].low:g} and {QUANTITIES[quantity].high:g}"
         )

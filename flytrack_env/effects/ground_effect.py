@@ -29,8 +29,8 @@ GROUND_EFFECT = Effect(
     ranges={"gain": Range(-0.5, 0.5, "1"), "height_m": Range(0.05, 2.0, "m")},
     notable={"gain": 0.05},
     equation=r"T \leftarrow T \left( 1 + \frac{\text{gain}}{1 + (z / \text{height})^2} \right)",
-    source="I. C. Cheeseman, W. E. Bennett, ARC R&M 3021, 1955, to first order in (radius / 4 z)^2 = "
-    "gain (height_m / z)^2, levelled off",
+    source="I. C. Cheeseman, W. E. Bennett, ARC R&M 3021, 1955, to first order in "
+    "(radius / 4 z)^2 = gain (height_m / z)^2, levelled off",
     hooks={"thrust": _thrust},
     search=Search(needs=("p",), shapes=("height_m",)),
 )

@@ -19,7 +19,8 @@ GYRO_SCALE = Effect(
     parameters=GyroScale,
     ranges={axis: Range(0.8, 1.2, "1") for axis in GyroScale._fields},
     notable={"x": 0.02, "y": 0.02, "z": 0.02},
-    equation=r"\boldsymbol{\omega}_\text{measured} = \operatorname{diag}(x, y, z)\, \boldsymbol{\omega}",
+    equation=r"\boldsymbol{\omega}_\text{measured} = "
+    r"\operatorname{diag}(x, y, z)\, \boldsymbol{\omega}",
     source="assumption: linear up to the fastest turn, no leak between the axes",
     hooks={"gyro": scaled},
     search=Search(follows_sticks=True, needs=("w",)),

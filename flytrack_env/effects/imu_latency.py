@@ -19,7 +19,7 @@ class ImuLatency(NamedTuple):
 
 
 class PastReadings(NamedTuple):
-    """True body rates, rad/s, and specific forces, m/s^2, body; the present ones first, then the past.
+    """True body rates, rad/s, and specific forces, m/s^2, body frame; the present ones first.
 
     rate_bends_b, force_bends_b: how far those in the middle of a continuous step are from the mean
     of its ends, of the same steps; the last one is not used. is_fresh: no step was made yet, and no
@@ -34,7 +34,7 @@ class PastReadings(NamedTuple):
 
 
 def start(latency: ImuLatency, drone: Drone, num_steps: int) -> PastReadings:
-    """Return the memory of an episode that begins: rates that have been held all along, no forces."""
+    """Return the memory of a new episode: rates that have always been held, and no forces."""
     still = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
     size = min(num_steps, USUAL_STEPS) + 1
     none = (still,) * size
@@ -74,7 +74,10 @@ def _accelerometer(
 
 
 def remember(latency: ImuLatency, past: PastReadings, context: StepContext) -> PastReadings:
-    """Return the memory after a step; before the first, the force is taken to have been that of the first."""
+    """Return the memory after a step.
+
+    Before the first step, the force is taken to have been that of the first step.
+    """
 
     def or_first(force_b: Vec3) -> Vec3:
         pairs = zip(context.force_b, force_b, strict=True)
@@ -102,7 +105,8 @@ IMU_LATENCY = Effect(
     parameters=ImuLatency,
     ranges={"latency_s": Range(0.0, 0.04, "s")},
     notable={"latency_s": 0.003},
-    equation=r"\boldsymbol{\omega}_\text{measured}(t) = \boldsymbol{\omega}(t - \text{latency}), \quad "
+    equation=r"\boldsymbol{\omega}_\text{measured}(t) = "
+    r"\boldsymbol{\omega}(t - \text{latency}), \quad "
     r"\mathbf{f}_\text{measured}(t) = \mathbf{f}(t - \text{latency})",
     source="assumption: the same for both sensors; what imu_offset adds is not late",
     max_steps={"latency_s": USUAL_STEPS},

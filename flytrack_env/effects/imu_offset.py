@@ -34,9 +34,10 @@ IMU_OFFSET = Effect(
     parameters=ImuOffset,
     ranges={axis: Range(-0.2, 0.2, "m") for axis in ImuOffset._fields},
     notable={"x": 0.02, "y": 0.02, "z": 0.02},
-    equation=r"\mathbf{f}_\text{measured} = \mathbf{f} + \boldsymbol{\omega} \times (\boldsymbol{\omega} "
-    r"\times \mathbf{r}) + \dot{\boldsymbol{\omega}} \times \mathbf{r}",
-    source="acceleration of a point of a rigid body; assumption: rates change evenly within the step",
+    equation=r"\mathbf{f}_\text{measured} = \mathbf{f} + \boldsymbol{\omega} \times "
+    r"(\boldsymbol{\omega} \times \mathbf{r}) + \dot{\boldsymbol{\omega}} \times \mathbf{r}",
+    source="acceleration of a point of a rigid body; "
+    "assumption: rates change evenly within the step",
     hooks={"accelerometer": _accelerometer},
     search=Search(needs=("f",)),
 )

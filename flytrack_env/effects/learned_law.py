@@ -1,4 +1,4 @@
-"""A law without a name, which a diagnosis has found in a log: see ``flytrack_env.effects.grammar``."""
+"""An unnamed law that a diagnosis found in a log: see ``flytrack_env.effects.grammar``."""
 
 from typing import NamedTuple
 
@@ -11,9 +11,10 @@ from flytrack_env.state import Drone
 
 
 class LearnedLaw(NamedTuple):
-    """A law, its share that acts, 1 as learnt, and by how many standard errors its coefficients are larger.
+    """A law, and how it acts.
 
-    law: static. Draw ``spread`` from -1 to 1, say, to fly what the log cannot tell.
+    scale: share of it that acts, 1 as learnt. spread: by how many standard errors its coefficients
+    are larger. law: static. Draw ``spread`` from -1 to 1, say, to fly what the log cannot tell.
     """
 
     scale: Scalar = 0.0
@@ -49,7 +50,8 @@ LEARNED_LAW = Effect(
     ranges={"scale": Range(-2.0, 2.0, "1"), "spread": Range(-3.0, 3.0, "1")},
     notable={"scale": 0.05},
     equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b + s \sum_k \mathbf{c}_k\, g_k h_k",
-    source="the log that it was learnt from; sums of products of given functions: S. Brunton et al., "
+    source="the log that it was learnt from; sums of products of given functions: "
+    "S. Brunton et al., "
     '"Discovering governing equations from data by sparse identification", 2016',
     hooks={
         "force": lambda parameters, flight, value, context: _add_terms(

@@ -26,7 +26,8 @@ LINEAR_DRAG = Effect(
     notable={"d_x": 0.05, "d_y": 0.05, "d_z": 0.05},
     equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b - \operatorname{diag}(d_x, d_y, d_z)\, R^\top "
     r"(\mathbf{v} - \mathbf{v}_\text{air})",
-    source='M. Faessler et al., "Differential flatness of quadrotor dynamics subject to rotor drag", eq. 2',
+    source='M. Faessler et al., "Differential flatness of quadrotor dynamics subject to rotor '
+    'drag", eq. 2',
     hooks={"force": _force},
     search=Search(needs=("v", "q")),
 )

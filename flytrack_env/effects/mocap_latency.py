@@ -1,4 +1,4 @@
-"""Poses that are late: motion capture, its network, an estimator of position, velocity and attitude."""
+"""Late poses: motion capture, its network, an estimator of position, velocity and attitude."""
 
 from typing import NamedTuple
 

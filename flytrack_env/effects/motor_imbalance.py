@@ -25,8 +25,9 @@ MOTOR_IMBALANCE = Effect(
     parameters=MotorImbalance,
     ranges={axis: Range(-0.05, 0.05, "(rad/s)/(m/s^2)") for axis in MotorImbalance._fields},
     notable={"roll": 0.002, "pitch": 0.002},
-    equation=r"\omega_x \leftarrow \omega_x + \text{roll}\, \frac{T}{m}, \quad \omega_y \leftarrow \omega_y "
-    r"+ \text{pitch}\, \frac{T}{m}",
-    source="assumption: a torque in proportion to thrust, which a rate loop without integral part leaves",
+    equation=r"\omega_x \leftarrow \omega_x + \text{roll}\, \frac{T}{m}, \quad "
+    r"\omega_y \leftarrow \omega_y + \text{pitch}\, \frac{T}{m}",
+    source="assumption: a torque in proportion to thrust, "
+    "which a rate loop without integral part leaves",
     hooks={"rates": _rates},
 )

@@ -9,7 +9,10 @@ from flytrack_env.quaternion import Scalar, Vec3
 
 
 class QuadraticDrag(NamedTuple):
-    """Deceleration per airspeed squared along body x, y, z, 1/m, and how far the axes share the speed, 1."""
+    """Deceleration per airspeed squared along body x, y, z, 1/m.
+
+    shared: how far the axes share the speed, 1.
+    """
 
     k_x: Scalar = 0.0
     k_y: Scalar = 0.0
@@ -35,10 +38,11 @@ QUADRATIC_DRAG = Effect(
         "shared": Range(0.0, 1.0, "1"),
     },
     notable={"k_x": 0.005, "k_y": 0.005, "k_z": 0.005},
-    equation=r"f_i \leftarrow f_i - k_i \left( s \lVert \mathbf{v}_b \rVert + (1 - s) |v_{b,i}| \right) "
-    r"v_{b,i}, \quad \mathbf{v}_b = R^\top (\mathbf{v} - \mathbf{v}_\text{air}), \quad s = "
-    r"\text{shared}",
-    source="the drag equation, f = c_d A rho v^2 / 2m: of one body (shared 1), or of each axis by itself (0)",
+    equation=r"f_i \leftarrow f_i - k_i \left( s \lVert \mathbf{v}_b \rVert "
+    r"+ (1 - s) |v_{b,i}| \right) v_{b,i}, \quad "
+    r"\mathbf{v}_b = R^\top (\mathbf{v} - \mathbf{v}_\text{air}), \quad s = \text{shared}",
+    source="the drag equation, f = c_d A rho v^2 / 2m: of one body (shared 1), "
+    "or of each axis by itself (0)",
     hooks={"force": _force},
     search=Search(needs=("v", "q"), shapes=("shared",)),
 )

@@ -9,7 +9,10 @@ from flytrack_env.quaternion import Scalar
 
 
 class QuickRates(NamedTuple):
-    """Share of the rate at full stick that the slope about the centre lacks, 1; how late it comes, 1."""
+    """Share of the rate at full stick that the slope about the centre lacks, 1.
+
+    Expo: how late on the stick that share comes, 1.
+    """
 
     roll: Scalar = 0.0
     pitch: Scalar = 0.0
@@ -30,7 +33,8 @@ QUICK_RATES = Effect(
     parameters=QuickRates,
     ranges={name: Range(0.0, 0.99, "1") for name in QuickRates._fields},
     notable=dict.fromkeys(QuickRates._fields[:3], 0.05),
-    equation=r"u_i \leftarrow u_i \frac{1 - b_i}{1 - b_i \left( e_i |u_i|^3 + (1 - e_i) |u_i| \right)}",
+    equation=r"u_i \leftarrow u_i \frac{1 - b_i}{1 - b_i "
+    r"\left( e_i |u_i|^3 + (1 - e_i) |u_i| \right)}",
     source="applyQuickRates in Betaflight 4.6, src/main/fc/rc.c, over the rate at full stick",
     hooks={"command": on_rate_sticks(_curve)},
     search=Search(shapes=QuickRates._fields[3:], follows_sticks=True, is_setting=True),

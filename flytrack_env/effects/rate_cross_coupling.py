@@ -1,4 +1,4 @@
-"""Yaw that turns with roll and pitch: a gyro or a frame that is not square, or unequal propellers."""
+"""Roll and pitch that leak into yaw: a gyro or frame that is not square, unequal propellers."""
 
 from typing import NamedTuple
 
@@ -23,8 +23,8 @@ RATE_CROSS_COUPLING = Effect(
     parameters=RateCrossCoupling,
     ranges={axis: Range(-0.3, 0.3, "1") for axis in RateCrossCoupling._fields},
     notable={"from_roll": 0.03, "from_pitch": 0.03},
-    equation=r"\omega_z \leftarrow \omega_z + \text{from roll} \cdot \omega_x + \text{from pitch} \cdot "
-    r"\omega_y",
+    equation=r"\omega_z \leftarrow \omega_z + \text{from roll} \cdot \omega_x "
+    r"+ \text{from pitch} \cdot \omega_y",
     source="assumption: in proportion, and into yaw only, the axis with the least authority",
     hooks={"rates": _rates},
     search=Search(follows_sticks=True),

@@ -1,4 +1,4 @@
-"""A cubic stick curve that the model does not know: gentle about the centre, the same at full stick."""
+"""A cubic stick curve that the model lacks: gentle about the centre, the same at full stick."""
 
 from typing import NamedTuple
 

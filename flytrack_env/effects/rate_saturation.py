@@ -13,7 +13,10 @@ AXES = ("roll", "pitch", "yaw")
 
 
 class RateSaturation(NamedTuple):
-    """Share of each full stick, at its end, that turns no faster, 1; how gradually, 0 (a corner) to 1."""
+    """Share of each full stick, at its end, that turns no faster, 1.
+
+    softness: how gradually, 0 (a corner) to 1.
+    """
 
     roll: Scalar = 0.0
     pitch: Scalar = 0.0
@@ -43,9 +46,11 @@ RATE_SATURATION = Effect(
     ranges={**{axis: Range(0.0, 0.9, "1") for axis in AXES}, "softness": Range(0.0, 1.0, "1")},
     notable={axis: 0.05 for axis in AXES},
     equation=r"u_i \leftarrow (1 - s) \operatorname{clip}(u_i, -L_i, L_i) + \frac{s\, u_i}"
-    r"{\sqrt{1 + (L_i^{-2} - 1)\, u_i^2}}, \quad L_i = 1 - \text{lost}_i, \quad s = \text{softness}",
-    source="a corner: the rate limits of Betaflight (src/main/fc/rc.c), which clip the setpoint that the "
-    "stick's curve makes; assumption: gradual limits give full stick as much as the corner does",
+    r"{\sqrt{1 + (L_i^{-2} - 1)\, u_i^2}}, \quad "
+    r"L_i = 1 - \text{lost}_i, \quad s = \text{softness}",
+    source="a corner: the rate limits of Betaflight (src/main/fc/rc.c), which clip the setpoint "
+    "that the stick's curve makes; "
+    "assumption: gradual limits give full stick as much as the corner does",
     hooks={"command": _command},
     search=Search(
         follows_sticks=True, shapes=("softness",), probes={axis: (0.03, 0.1, 0.3) for axis in AXES}

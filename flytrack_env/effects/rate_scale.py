@@ -19,8 +19,8 @@ RATE_SCALE = Effect(
     parameters=RateScale,
     ranges={axis: Range(0.5, 1.5, "1") for axis in RateScale._fields},
     notable={"roll": 0.03, "pitch": 0.03, "yaw": 0.03},
-    equation=r"\boldsymbol{\omega} \leftarrow \operatorname{diag}(\text{roll}, \text{pitch}, \text{yaw})\, "
-    r"\boldsymbol{\omega}",
+    equation=r"\boldsymbol{\omega} \leftarrow "
+    r"\operatorname{diag}(\text{roll}, \text{pitch}, \text{yaw})\, \boldsymbol{\omega}",
     source="assumption: the stick's curve stays linear",
     hooks={"rates": scaled},
     search=Search(follows_sticks=True),

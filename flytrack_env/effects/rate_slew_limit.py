@@ -36,7 +36,10 @@ def start(limit: RateSlewLimit, drone: Drone) -> Setpoint:
 def _command(
     limit: RateSlewLimit, setpoint: Setpoint, sticks: Action, context: StepContext
 ) -> Action:
-    """Return the sticks that a simulator's step ends with; of continuous motion their mean in the span."""
+    """Return the limited sticks.
+
+    For continuous motion they are the mean in the span, else those at the end of the step.
+    """
 
     def limited(stick: Scalar, before: Scalar, full_s: Scalar) -> Scalar:
         change = stick - before
@@ -86,8 +89,8 @@ RATE_SLEW_LIMIT = Effect(
     ranges={axis: Range(0.0, 1.0, "s") for axis in RateSlewLimit._fields},
     notable={axis: 0.05 for axis in RateSlewLimit._fields},
     equation=r"|u_i(t + \Delta t) - u_i(t)| \le \frac{\Delta t}{T_i}",
-    source="the acceleration limit of Betaflight (src/main/flight/pid.c), which the setpoint passes between "
-    "the stick's curve and the controller",
+    source="the acceleration limit of Betaflight (src/main/flight/pid.c), "
+    "which the setpoint passes between the stick's curve and the controller",
     hooks={"command": _command},
     memory=Memory(start=start, remember=remember),
     search=Search(

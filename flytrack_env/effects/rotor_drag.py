@@ -1,4 +1,4 @@
-"""Drag in the rotors' plane, in proportion to thrust: blades that flap lean the thrust backwards."""
+"""Drag in the rotors' plane, in proportion to thrust: flapping blades tilt the thrust back."""
 
 from typing import NamedTuple
 
@@ -23,9 +23,10 @@ ROTOR_DRAG = Effect(
     parameters=RotorDrag,
     ranges={"h": Range(-0.2, 0.2, "s/m")},
     notable={"h": 0.005},
-    equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b - h\, \frac{T}{m} \operatorname{diag}(1, 1, 0)\, R^\top "
-    r"(\mathbf{v} - \mathbf{v}_\text{air})",
-    source='R. Mahony, V. Kumar, P. Corke, "Multirotor aerial vehicles", 2012, eq. 12: blade flapping',
+    equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b - h\, \frac{T}{m} "
+    r"\operatorname{diag}(1, 1, 0)\, R^\top (\mathbf{v} - \mathbf{v}_\text{air})",
+    source='R. Mahony, V. Kumar, P. Corke, "Multirotor aerial vehicles", 2012, eq. 12: '
+    "blade flapping",
     hooks={"force": _force},
     search=Search(needs=("v", "q")),
 )

@@ -1,4 +1,4 @@
-"""A rate loop with inertia: body rates that follow with a second order, sluggish or overshooting."""
+"""A rate loop with inertia: body rates follow with second order, sluggish or overshooting."""
 
 from typing import NamedTuple
 
@@ -35,7 +35,7 @@ class Turning(NamedTuple):
 
 
 class _Response(NamedTuple):
-    """What remains after a step of an offset from the input and of a slope, in offset and in slope."""
+    """The transition matrix of a step, of a rate's offset from the input and of its slope."""
 
     offset: Scalar
     offset_of_slope: Scalar
@@ -66,7 +66,7 @@ def _response(lag_s: Scalar, damping: Scalar, dt: Scalar) -> _Response:
 
 
 class _Input(NamedTuple):
-    """The input of an axis over a step: where its steady response would be at both ends, and its slope."""
+    """An axis's input over a step: its steady response at both ends, and its slope."""
 
     first: Scalar
     last: Scalar
@@ -116,9 +116,10 @@ def remember(loop: SecondOrderRates, memory: Turning, context: StepContext) -> T
 def observe(
     loop: SecondOrderRates, memory: Turning, offset_b: Vec3, dt: Scalar
 ) -> tuple[Turning, Vec3]:
-    """Return the memory with the measured rates, and slopes nearer to theirs (an alpha-beta filter).
+    """Correct the memory by measured rates (an alpha-beta filter).
 
-    Axes without a lag hold none of the offset.
+    Rates become the measured ones, and slopes come nearer to theirs. Axes without a lag hold none
+    of the offset.
     """
     own = [
         jnp.where(lag_s > SHORTEST_S, offset, 0.0)
@@ -138,9 +139,10 @@ SECOND_ORDER_RATES = Effect(
     },
     notable={f"{axis}_s": 0.005 for axis in AXES},
     equation=r"\frac{\ddot{\omega}_i}{\omega_{n,i}^2} + \text{lag}_i\, \dot{\omega}_i + \omega_i = "
-    r"\omega_{i,\text{lagged stick}}, \quad \omega_{n,i} = \frac{2\, \text{damping}_i}{\text{lag}_i}",
-    source="a second-order servo, as a rate loop with a PID controller is near its bandwidth; exact for an "
-    "input that is held over the step or changes evenly in it",
+    r"\omega_{i,\text{lagged stick}}, \quad "
+    r"\omega_{n,i} = \frac{2\, \text{damping}_i}{\text{lag}_i}",
+    source="a second-order servo, as a rate loop with a PID controller is near its bandwidth; "
+    "exact for an input that is held over the step or changes evenly in it",
     hooks={"rates": _rates},
     memory=Memory(start=start, remember=remember, observe=observe),
     search=Search(

@@ -25,8 +25,8 @@ THRUST_LAG_ASYMMETRY = Effect(
     parameters=ThrustLagAsymmetry,
     ranges={"ratio": Range(0.3, 3.0, "1")},
     notable={"ratio": 0.3},
-    equation=r"\tau_\text{thrust} \leftarrow \text{ratio} \cdot \tau_\text{thrust} \quad \text{where the "
-    r"command is below the applied thrust}",
+    equation=r"\tau_\text{thrust} \leftarrow \text{ratio} \cdot \tau_\text{thrust} \quad "
+    r"\text{where the command is below the applied thrust}",
     source="assumption: one ratio at any thrust; motors are driven up, and coast down",
     hooks={"lag": _lag},
 )

@@ -23,8 +23,8 @@ THRUST_TILT = Effect(
     parameters=ThrustTilt,
     ranges={name: Range(-0.2, 0.2, "rad") for name in ThrustTilt._fields},
     notable={"towards_x": 0.01, "towards_y": 0.01},
-    equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b + \frac{T}{m} (\text{towards}_x, \text{towards}_y, "
-    r"0)^\top",
+    equation=r"\mathbf{f}_b \leftarrow \mathbf{f}_b + \frac{T}{m} "
+    r"(\text{towards}_x, \text{towards}_y, 0)^\top",
     source="assumption: small angles, the same at any thrust",
     hooks={"force": _force},
 )

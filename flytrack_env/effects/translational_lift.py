@@ -29,9 +29,10 @@ TRANSLATIONAL_LIFT = Effect(
     parameters=TranslationalLift,
     ranges={"gain": Range(-0.5, 0.5, "1")},
     notable={"gain": 0.05},
-    equation=r"T \leftarrow T \left( 1 + \text{gain}\, \frac{s^2}{s^2 + (7\,\text{m/s})^2} \right), \quad s "
-    r"= \sqrt{v_{b,x}^2 + v_{b,y}^2}",
-    source="J. G. Leishman, Principles of Helicopter Aerodynamics, section 2.14, as a saturating curve",
+    equation=r"T \leftarrow T \left( 1 + \text{gain}\, "
+    r"\frac{s^2}{s^2 + (7\,\text{m/s})^2} \right), \quad s = \sqrt{v_{b,x}^2 + v_{b,y}^2}",
+    source="J. G. Leishman, Principles of Helicopter Aerodynamics, section 2.14, "
+    "as a saturating curve",
     hooks={"thrust": _thrust},
     search=Search(needs=("v", "q")),
 )

@@ -38,8 +38,8 @@ WIND = Effect(
         **{name: Range(-5.0, 5.0, "m/s^2") for name in ("a_x", "a_y", "a_z")},
     },
     notable={"a_x": 0.2, "a_y": 0.2, "a_z": 0.2, "v_x": 1.0, "v_y": 1.0, "v_z": 1.0},
-    equation=r"\mathbf{v}_\text{air} \leftarrow \mathbf{v}_\text{air} + \mathbf{v}, \quad \mathbf{f}_b "
-    r"\leftarrow \mathbf{f}_b + R^\top \mathbf{a}",
+    equation=r"\mathbf{v}_\text{air} \leftarrow \mathbf{v}_\text{air} + \mathbf{v}, \quad "
+    r"\mathbf{f}_b \leftarrow \mathbf{f}_b + R^\top \mathbf{a}",
     source="assumption: uniform and steady within a flight",
     hooks={"air": _air, "force": _force},
     search=Search(needs=("q",), groups=(("a_x", "a_y", "a_z"), ("v_x", "v_y", "v_z"))),

@@ -1,4 +1,4 @@
-"""A yaw rate that is kicked when the thrust changes: propellers that spin up turn the frame the other way."""
+"""A yaw rate that changes with thrust: propellers that spin up turn the frame the other way."""
 
 from typing import NamedTuple
 
@@ -27,6 +27,7 @@ YAW_REACTION = Effect(
     ranges={"angle": Range(-0.2, 0.2, "rad")},
     notable={"angle": 0.02},
     equation=r"\omega_z \leftarrow \omega_z + \text{angle}\, \frac{du}{dt}",
-    source="assumption: unequal spin-up of the two directions of rotation, in proportion to its speed",
+    source="assumption: unequal spin-up of the two directions of rotation, "
+    "in proportion to its speed",
     hooks={"rates": _rates},
 )

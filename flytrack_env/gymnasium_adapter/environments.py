@@ -26,7 +26,7 @@ MOST_STEPS = 2**32  # that a uint32 can count
 
 
 class _Adapter:
-    """What the single and the vector environment share: a simulation, its spaces and its pictures."""
+    """What the single and the vector environment share: simulation, spaces and pictures."""
 
     metadata: dict[str, Any]
     render_mode: str | None
@@ -43,7 +43,7 @@ class _Adapter:
         params: EnvParams | None,
         overrides: dict[str, Any],
     ) -> tuple[Any, ...]:
-        """Make the simulation and what draws it; return the spaces of an observation and an action."""
+        """Make the simulation and its renderer; return the spaces of observation and action."""
         render_modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in render_modes:
             expected = ", ".join(map(repr, render_modes))
@@ -69,7 +69,7 @@ class _Adapter:
     def _begin(
         self, options: dict[str, Any] | None, draw_words: Callable[[], np.ndarray]
     ) -> np.ndarray:
-        """Begin episodes as the options of a reset say; return their observations, (num_envs, size).
+        """Begin episodes by the options of a reset; return their observations, (num_envs, size).
 
         draw_words: called for the words of their keys once the options are known to be good.
         """

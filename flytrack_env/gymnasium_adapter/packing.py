@@ -44,7 +44,10 @@ def _layout(structure: Any, forms: tuple[tuple[tuple[int, ...], Any], ...]) -> L
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Packed:
-    """A batch of pytrees as matrices (rows, num_envs), so that a number per environment is contiguous."""
+    """A batch of pytrees as matrices (rows, num_envs).
+
+    A number of all environments is contiguous.
+    """
 
     matrices: tuple[jax.Array, ...]
     layout: Layout = field(metadata={"static": True})

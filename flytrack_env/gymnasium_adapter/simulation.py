@@ -1,4 +1,4 @@
-"""An environment with parameters, and its compiled functions: batches go in and out as few arrays."""
+"""An environment with parameters, and its compiled functions: batches move as few arrays."""
 
 from functools import partial
 from pathlib import Path
@@ -71,7 +71,10 @@ def begin(
 def step(
     env: EpisodicEnvironment, states: Packed, actions: jax.Array, params: Packed
 ) -> tuple[Packed, jax.Array, jax.Array, Packed]:
-    """Return states, observations, scenes, and (rewards, terminated, truncated, info) without auto-reset."""
+    """Step a batch without auto-reset.
+
+    Return states, observations, scenes, and (rewards, terminated, truncated, info).
+    """
     own = _params_of(params)
 
     def step_one(state: Any, action: jax.Array) -> tuple[Any, ...]:
@@ -94,11 +97,12 @@ def step_batch(
     has_ended: jax.Array | None,
     has_scenes: bool,
 ) -> tuple[Packed, jax.Array, jax.Array | None, jax.Array | None, Packed]:
-    """Return states, observations, final observations, scenes, and what ``_group`` makes of the rest.
+    """Step a batch with auto-reset.
 
-    The auto-resetting step of a batch. words: of one key for all; count: makes it this step's own.
-    has_ended: None to reset in this step, or (num_envs,) bool for those that ended in the step
-    before. Scenes, after the auto-reset, are None unless they are needed.
+    Return states, observations, final observations, scenes, and what ``_group`` makes of the rest.
+    words: of one key for all; count: makes it this step's own. has_ended: None to reset in this
+    step, or (num_envs,) bool for those that ended in the step before. Scenes, after the auto-reset,
+    are None unless they are needed.
     """
     key = jax.random.fold_in(_make_key(words), count)
     found = env.step_batch(key, states.unpack(), actions, _params_of(params), has_ended)
@@ -117,7 +121,7 @@ def _group(
     info: dict[str, Any],
     has_ended: Any,
 ) -> Any:
-    """Return what a vector environment gives of one environment's step, as ``SyncVectorEnv`` groups it.
+    """Return a vector environment's outputs of one environment, grouped as ``SyncVectorEnv`` does.
 
     Reward, flags, the infos of an episode that goes on, the final infos of one that ended, and the
     masks of the latter. A mask says where the value of its name, less the underscore, is given;
@@ -177,7 +181,7 @@ class Simulation:
         return Simulation(self.env_id, params, {**self.overrides, "track": track})
 
     def make_renderer(self) -> Any:
-        """Return what draws flights, with the ids of the track's gates, or indices on any other course."""
+        """Return a renderer with the ids of the track's gates, or indices on any other course."""
         course, own = self.params.course, self.env.default_params.course
         is_own = jax.tree.all(jax.tree.map(np.array_equal, course, own))
         ids = [gate.id for gate in self.env.track.gates]

@@ -11,7 +11,7 @@ from flytrack_env.quaternion import Vec3
 
 
 class Path(NamedTuple):
-    """A drone's way through one step, straight and at constant speed: where it began and ended, world, m."""
+    """A drone's way through one step, straight and at constant speed; points in m, world."""
 
     start_w: Vec3
     end_w: Vec3

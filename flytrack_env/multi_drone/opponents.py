@@ -41,14 +41,14 @@ class Standing(NamedTuple):
 
 
 def opponent_table(num_drones: int) -> tuple[Entry, ...]:
-    """Return the observation's rows on opponents: of the three nearest, or of all where there are fewer."""
+    """Return the observation's rows on opponents: the three nearest, or all if there are fewer."""
     return OPPONENT * min(num_drones - 1, MOST_SEEN)
 
 
 def observe_opponents(
     own: Standing, others: Sequence[Standing], gate: GateFrame
 ) -> list[jax.Array]:
-    """Return the rows of ``opponent_table``, nearest first, in the flight frame of a drone's own gate.
+    """Return the rows of ``opponent_table``, nearest first, in the frame of a drone's own gate.
 
     An opponent that is out of the race looks like one as far behind as an observation goes.
     """
@@ -99,7 +99,10 @@ def _nearest(own: Standing, others: Sequence[Standing]) -> list[Standing]:
 
 
 def rank_of(own: Standing, others: Sequence[Standing]) -> jax.Array:
-    """Return the place in the race, int32, 1 for the first: by progress, drones that are out come last."""
+    """Return the place in the race, int32, 1 for the first.
+
+    Drones are ranked by progress; those that are out come last.
+    """
     rank = jnp.int32(1)
     for other in others:
         is_ahead = (other.progress > own.progress) & (other.is_out == own.is_out)
@@ -118,9 +121,9 @@ def gap_of(own: Standing, others: Sequence[Standing]) -> jax.Array:
 
 
 def progress_of(gates_passed: Scalar, pos_w: Vec3, centre_w: Vec3, leg_m: Scalar) -> jax.Array:
-    """Return the gates passed and the share of the way to the next gate, whose centre is given, float32.
+    """Return the gates passed plus the share of the way to the next gate, float32.
 
-    leg_m: distance of that gate from the one before.
+    centre_w: of the next gate. leg_m: its distance from the gate before.
     """
     distance_m = jnp.asarray(compute_once((centre_w - pos_w).norm()))
     return jnp.asarray(gates_passed, distance_m.dtype) + 1.0 - distance_m / leg_m

@@ -19,9 +19,10 @@ SEEDS = 2**31
 
 
 class ParallelRace(ParallelEnv[str, np.ndarray, np.ndarray]):
-    """A race as a ``pettingzoo.ParallelEnv``; agents are "drone_0" and so on, and leave once they are out.
+    """A race as a ``pettingzoo.ParallelEnv``.
 
-    params: the race's default ones if None.
+    Agents are "drone_0" and so on, and leave once they are out. params: the race's default ones if
+    None.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "FlyTrackRace-v0", "render_modes": []}
@@ -53,7 +54,10 @@ class ParallelRace(ParallelEnv[str, np.ndarray, np.ndarray]):
         return self._by_agent(np.asarray(observations)), {agent: {} for agent in self.agents}
 
     def step(self, actions: dict[str, np.ndarray]) -> tuple[Any, ...]:
-        """Return observations, rewards, terminations, truncations and infos of the agents that were racing.
+        """Step the race.
+
+        Return observations, rewards, terminations, truncations and infos of the agents that were
+        racing.
 
         Raises: ValueError: actions of other agents than those that race, or of another shape.
                 RuntimeError: no race was begun.

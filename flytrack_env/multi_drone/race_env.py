@@ -1,4 +1,4 @@
-"""Several drones in one race: each flies an environment for one drone, and sees and meets the others.
+"""Several drones in one race: each flies an environment for one, and sees and meets the others.
 
 All drones of all races are stepped side by side in one flat vector, those of a race next to each
 other; what a drone needs of its opponents comes from shifts of the whole vector. Unrolled, the
@@ -61,7 +61,7 @@ class EntrantState(NamedTuple):
 
 
 class Flown(NamedTuple):
-    """What a drone's step alone came to: its state and standing after it, its path, and the outcome."""
+    """The result of a drone's step without the others: state, standing, path, and outcome."""
 
     state: EntrantState
     standing: Standing
@@ -73,7 +73,7 @@ class Flown(NamedTuple):
 
 
 class MultiDroneRace:
-    """A race of 1 to 8 drones, as pure functions; drones of a race are the first axis of everything.
+    """A race of 1 to 8 drones, as pure functions; its drones are the first axis of everything.
 
     Each flies ``env``, with its own draws of whatever that environment draws. A drone that
     terminates or is put out by a collision is out: it stands still, is neither seen nor met any
@@ -113,7 +113,8 @@ class MultiDroneRace:
         )
         if not set(self.ghosts) <= set(range(1, num_drones)):
             raise ValueError(
-                f"ghosts: found places {sorted(self.ghosts)}, expected some of 1 to {num_drones - 1}"
+                f"ghosts: found places {sorted(self.ghosts)}, "
+                f"expected some of 1 to {num_drones - 1}"
             )
 
     def __repr__(self) -> str:
@@ -150,14 +151,14 @@ class MultiDroneRace:
         return self.env.race(state.inner)
 
     def check_params(self, params: RaceParams) -> None:
-        """Raise ValueError, naming the field, for concrete parameters that no race can be flown with."""
+        """Raise ValueError, naming the field, for concrete parameters that allow no race."""
         self.env.check_params(params.flight)
         check_rules(params.rules, self.num_drones)
 
     def reset(
         self, key: jax.Array, params: RaceParams | None = None
     ) -> tuple[jax.Array, EntrantState]:
-        """Return observations, (num_drones, size) float32, and state of a race that begins on the start grid.
+        """Return observations, (num_drones, size) float32, and state of a race on the start grid.
 
         Raises: TypeError: a key that is none. ValueError: parameters that no race can be flown
                 with, where their values are known.
@@ -178,7 +179,7 @@ class MultiDroneRace:
     def begin(
         self, drones: Drone, gate_indices: jax.Array, params: RaceParams, seed: Any = 0
     ) -> tuple[jax.Array, EntrantState]:
-        """Return observations and state of a race that begins with given drones and gates to fly first.
+        """Return observations and state of a race that begins with given drones and gates.
 
         Leaves (num_drones,). seed: uint32 word that decides whatever else the episode draws.
 
@@ -210,7 +211,9 @@ class MultiDroneRace:
         actions: jax.Array,
         params: RaceParams | None = None,
     ) -> Step:
-        """Return observations, states, rewards, terminated, truncated and info, with auto-reset of the race.
+        """Step the race with auto-reset.
+
+        Return observations, states, rewards, terminated, truncated and info.
 
         actions: (num_drones, 4). Everything returned has num_drones in front. terminated: whether a
         drone is out. truncated: whether the race is over for one that is not. info: that of ``env``
@@ -273,7 +276,7 @@ class MultiDroneRace:
         params: RaceParams,
         ghosts: tuple[jax.Array, Path, Standing] | None,
     ) -> tuple[Any, ...]:
-        """Return observations and those before the reset, row by row, states, rewards, flags and info."""
+        """Return observation rows, those before the reset, states, rewards, flags and info."""
         flown = jax.vmap(self._fly, (0, 0, None))(states, commands, params.flight)
         if ghosts is not None:
             flown = jax.vmap(_with_ghost)(flown, *ghosts)
@@ -313,7 +316,7 @@ class MultiDroneRace:
     def _begin_from(
         self, word: jax.Array, params: RaceParams
     ) -> tuple[list[jax.Array], EntrantState]:
-        """Return observation, row by row, and state of a drone on the start grid, from its random word."""
+        """Return observation rows and state of a drone on the start grid, from its random word."""
         if self.num_drones == 1:
             drone, gate_index = self.env.sample_start(word, params.flight)
             state = self._enter(drone, gate_index, params, word)
@@ -373,7 +376,7 @@ class MultiDroneRace:
         return [*rows, *observe_opponents(self._standing(state), others, gate)]
 
     def _fly(self, state: EntrantState, command: Action, flight: Any) -> Flown:
-        """Return what a drone's step comes to without the others; one that is out stays as it is."""
+        """Return the result of a drone's step without the others; one that is out stays put."""
         env, was_out = self.env, state.is_out
         before, old_gate = env.drone(state.inner), env.race(state.inner).gate
         inner, reward, terminated, info = env.advance(state.inner, command, flight)
@@ -423,7 +426,7 @@ class MultiDroneRace:
         reward: jax.Array,
         rules: RaceRules,
     ) -> tuple[EntrantState, jax.Array, dict[str, jax.Array]]:
-        """Return a drone's state with its gap, its reward with what it gained on the others, and info."""
+        """Return a drone's state with its gap, its reward with the gap's gain, and info."""
         gap = compute_once(gap_of(own, others))
         gain = jnp.where(own.is_out, 0.0, gap - state.gap)
         told = {"rank": rank_of(own, others), "gap_gates": gap}
@@ -441,7 +444,7 @@ class MultiDroneRace:
         return standings
 
     def _ghosts_at(self, steps: jax.Array) -> tuple[jax.Array, Path, Standing] | None:
-        """Return which drones are ghosts, their paths in the next step, standings after it; None without."""
+        """Return which drones are ghosts, their next paths and standings; None without ghosts."""
         found: Any = None
         place = jnp.arange(len(steps)) % self.num_drones
         for ghost_place, ghost in self.ghosts.items():
@@ -459,7 +462,7 @@ class MultiDroneRace:
         return ((seeds & ~jnp.uint32(PLACE_BITS))[:, None] | places).reshape(-1)
 
     def _shift(self, tree: Any, distance: int) -> Any:
-        """Return in each drone's place the leaves of the one so many places after it in its race."""
+        """For each drone, take the leaves of the drone ``distance`` places later, cyclically."""
         size = len(jax.tree.leaves(tree)[0])
         place = jnp.arange(size) % self.num_drones
         is_later = compute_once(place + distance < self.num_drones)

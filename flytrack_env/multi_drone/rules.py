@@ -64,11 +64,12 @@ def check_rules(rules: RaceRules, num_drones: int) -> None:
 
 
 def check_apart(positions_w: np.ndarray, rules: RaceRules) -> None:
-    """Raise ValueError for drones, positions (num_drones, 3), that would start inside each other."""
+    """Raise ValueError for drones, positions (num_drones, 3), that would start in a collision."""
     distances = np.linalg.norm(positions_w[:, None] - positions_w[None], axis=-1)
     for first, second in zip(*np.triu_indices(len(positions_w), 1), strict=True):
         if distances[first, second] < 2.0 * float(rules.collision_radius):
             raise ValueError(
-                f"drones {first} and {second}: found starts {distances[first, second]:.3g} m apart, expected "
+                f"drones {first} and {second}: found starts "
+                f"{distances[first, second]:.3g} m apart, expected "
                 f"at least {2.0 * float(rules.collision_radius):.3g} m, twice the collision_radius"
             )

@@ -1,4 +1,4 @@
-"""A race as an environment for one learner, drone 0, against opponents whose policies are frozen."""
+"""A race as an environment for one learner, drone 0, against opponents with frozen policies."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -108,7 +108,7 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
     def reset(  # type: ignore[override]
         self, key: jax.Array, params: VersusParams | None = None
     ) -> tuple[jax.Array, VersusState]:
-        """Return the learner's observation, (size,) float32, and the state of a race that begins."""
+        """Return the learner's observation, (size,) float32, and the state of a new race."""
         params = self.default_params if params is None else params
         observations, entrants = self.race.reset(key, params.race)
         return observations[0], VersusState(entrants, observations[1:])
@@ -121,7 +121,7 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
         action: jax.Array,
         params: VersusParams | None = None,
     ) -> Step:
-        """Return the learner's observation, state, reward, flags and info of a step, with auto-reset."""
+        """Step with auto-reset; return the learner's observation, state, reward, flags and info."""
         params = self.default_params if params is None else params
         actions = self._all_actions(state.observations, action, params)
         return self._of_learner(self.race.step(key, state.entrants, actions, params.race))
@@ -130,7 +130,10 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
     def step_batch(
         self, key: jax.Array, states: VersusState, actions: jax.Array, params: VersusParams
     ) -> Step:
-        """``step`` for a batch of races with one key, faster than ``vmap(step)``; actions: (num_races, 4)."""
+        """Step a batch of races with one key, faster than ``vmap(step)``.
+
+        actions: (num_races, 4).
+        """
         actions = self._all_actions(states.observations, actions, params)
         return self._of_learner(self.race.step_batch(key, states.entrants, actions, params.race))
 

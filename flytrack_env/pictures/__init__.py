@@ -44,9 +44,10 @@ def draw_flight(flight: Flight) -> dict[str, "Figure"]:
 
 
 def write_pictures(flights: Sequence[Flight], folder: str | Path) -> list[Path]:
-    """Write ``NAME_top.png``, ``NAME_side.png``, ``NAME_commands.png`` of each flight; return their paths.
+    """Write ``NAME_top.png``, ``NAME_side.png`` and ``NAME_commands.png`` of each flight.
 
-    Of several flights also ``comparison_top.png``. All are drawn before the first is written.
+    Return their paths. Of several flights also ``comparison_top.png``. All are drawn before the
+    first is written.
 
     Raises:
         ImportError, OSError: matplotlib is not installed, or a file cannot be written.

@@ -1,4 +1,4 @@
-"""What the figures share: figures and PNGs, a course with its gates, a path in colours, labels with room."""
+"""Shared parts of the figures: PNGs, a course with its gates, a coloured path, labels."""
 
 import io
 
@@ -19,7 +19,7 @@ HEADROOM = 1.2  # of a colour scale, whose last colours are too pale for a line
 
 
 def escape(text: str) -> str:
-    """Return a text that matplotlib writes as it is: no mathematics between dollars, no hidden label."""
+    """Escape a text for matplotlib: no mathematics between dollars, no hidden label."""
     text = text.replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text
 
@@ -50,7 +50,7 @@ def extent(track: Track) -> np.ndarray:
 
 
 def draw_gates(axes: Axes, track: Track, view: list[int]) -> None:
-    """Draw every gate's frame, opening and direction of flight, seen along the axis not in ``view``."""
+    """Draw the gates' frames, openings and flight directions along the axis not in ``view``."""
     gates = gates_of(build_course(track))
     arrow = {"arrowstyle": "-|>", "color": PAPER_OPENING, "linewidth": 1.5, "shrinkA": 0}
     for centre, forward, outer, inner in zip(*gates, strict=True):

@@ -1,4 +1,4 @@
-"""The figures of a flight: the course from above, height and gates from the front, commands over time."""
+"""The figures of a flight: the course from above, heights, gates from the front, commands."""
 
 import itertools
 import math
@@ -167,7 +167,10 @@ def _draw_height(figure: SubFigure, flight: Flight, top: float) -> None:
 
 
 def _half_heights_m(track: Track) -> np.ndarray:
-    """Return half the height of each gate's frame and opening, (num_gates, 2), m: less if it leans."""
+    """Return half the height of each gate's frame and opening, (num_gates, 2), m.
+
+    A gate that leans is lower.
+    """
     gates = gates_of(build_course(track))
     return 0.5 * np.stack(
         [np.ptp(corners[..., 2], axis=1) for corners in (gates.outer, gates.inner)], axis=1
@@ -175,7 +178,7 @@ def _half_heights_m(track: Track) -> np.ndarray:
 
 
 def _draw_bar(axes: Axes, gate: Gate, meeting: Meeting, half_heights_m: np.ndarray) -> None:
-    """Draw a gate's frame as a grey bar with its opening in red, and a cross where it was not passed."""
+    """Draw a gate as a grey bar with a red opening, and a cross where it was not passed."""
     x, z = meeting.distance_m, gate.position[2]
     half_frame, half_opening = half_heights_m
     for half, colour, width in (
@@ -207,9 +210,9 @@ def _draw_fronts(figure: SubFigure, flight: Flight, top: float, shape: tuple[int
     for index, (panel, gate) in enumerate(zip(panels, flight.track.gates, strict=False)):
         _draw_front(panel, gate, [one for one in flight.meetings if one.gate == index], top)
     figure.suptitle(
-        "Gates as the drone approaches them, and how often it passed of how often it met them. Dashed: free "
-        f"for a drone of {DRONE_RADIUS_M:g} m radius.\nDots: passed; crosses: frame touched, or missed. "
-        "Colours: speed.",
+        "Gates as the drone approaches them, and how often it passed of how often it met them. "
+        f"Dashed: free for a drone of {DRONE_RADIUS_M:g} m radius.\n"
+        "Dots: passed; crosses: frame touched, or missed. Colours: speed.",
         fontsize="small",
     )
 
@@ -239,7 +242,10 @@ def _draw_front(panel: Axes, gate: Gate, meetings: list[Meeting], top: float) ->
 
 
 def draw_commands(flight: Flight) -> Figure:
-    """Return four sticks, commanded against applied, speed and battery; gates, laps and failures as lines."""
+    """Return a figure of the four sticks, commanded and applied, speed and battery over time.
+
+    Lines mark gates, laps and failures.
+    """
     times_s = STEP_S * np.arange(len(flight.states))
     width = float(np.clip(SECOND_IN * times_s[-1], *WIDTHS_IN))
     figure = drawing.new_figure(width, COMMANDS_IN)

@@ -1,4 +1,4 @@
-"""A recorded flight with what follows from it: the race, every meeting with a gate, why it ended."""
+"""A recorded flight with its race, every meeting with a gate, and why it ended."""
 
 import itertools
 from collections.abc import Sequence
@@ -87,7 +87,7 @@ class Flight(NamedTuple):
 
 
 def make_flight(name: str, states: np.ndarray, commands: np.ndarray, track: Track) -> Flight:
-    """Return the flight of states (T, 21) and commands (T, 4) on a track; positions must be finite."""
+    """Return the flight of states (T, 21) and commands (T, 4); positions must be finite."""
     race = follow_race(states[:, POSITION], track, last_vel_w=states[-1, VELOCITY])
     steps_m = np.linalg.norm(np.diff(states[:, POSITION].astype(float), axis=0), axis=1)
     distances_m = np.concatenate([[0.0], np.cumsum(steps_m)])
@@ -100,7 +100,9 @@ def make_flight(name: str, states: np.ndarray, commands: np.ndarray, track: Trac
 def read_flights(
     paths: Sequence[str | Path], track: Track, allow_pickle: bool = False
 ) -> tuple[Flight, ...]:
-    """Return the flights of rollout files, named after the files, and their folders where files are alike.
+    """Return the flights of rollout files.
+
+    They are named after the files, and their folders too where files have the same name.
 
     Raises:
         RolloutError: a file that is no rollout, or two files of the same name and folder's name.

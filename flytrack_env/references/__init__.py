@@ -1,4 +1,4 @@
-"""Time-optimal flights of a track with a model: their files, and the ghost to fly beside another flight.
+"""Time-optimal flights of a track with a model: their files, and the ghost that flies them.
 
 The folder has those of the shipped tracks; ``benchmarks.time_optimal`` found them. A file is an
 ``.npz`` of numbers and one JSON text: states and commands at 100 Hz, gate times, the model itself,
@@ -50,7 +50,10 @@ BEYOND = 1e-6  # of a command beyond full stick: the solver's tolerance
 
 
 class ReferenceFileError(ValueError):
-    """A reference file that cannot be used; the message names file, field, what was found and expected."""
+    """A reference file that cannot be used.
+
+    The message names file and field, what was found and what was expected.
+    """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -147,7 +150,7 @@ def save_reference(path: str | Path, reference: Reference) -> None:
 
 
 def _check_arrays(data: dict[str, np.ndarray]) -> None:
-    """Raise ValueError for wrong shapes, numbers that are not finite, or commands beyond [-1, 1]."""
+    """Raise ValueError for wrong shapes, infinite numbers or NaN, or commands beyond [-1, 1]."""
     num_steps = data["commands"].shape[:1]
     shapes = {
         "states": (*(size + 1 for size in num_steps), STATE_SIZE),
@@ -170,7 +173,7 @@ def _check_arrays(data: dict[str, np.ndarray]) -> None:
 
 
 def _check_notes(notes: dict[str, Any]) -> None:
-    """Raise ValueError for notes of wrong types, times that are not positive, or an unknown kind."""
+    """Raise ValueError for wrong types, times that are not positive, or an unknown kind."""
     types = {**dict.fromkeys(TEXTS, str), "found": dict, "dt_s": float, "time_s": float}
     for name, expected in types.items():
         if not isinstance(notes[name], expected):
@@ -232,7 +235,8 @@ def shipped_references(track: Track, model_names: tuple[str, ...]) -> References
     references = {kind: shipped_reference(track.name, kind, name) for kind in KINDS}
     if any(reference.track_sha256 != track_digest(track) for reference in references.values()):
         raise ReferenceFileError(
-            f"reference: {track.name}: found one of another track of that name, expected this track's"
+            f"reference: {track.name}: found one of another track of that name, "
+            "expected this track's"
         )
     return references
 
@@ -245,11 +249,11 @@ def is_model_of(track: str, model_name: str, model: ModelParameters) -> bool:
 
 
 def ghost_rollout(references: References, num_steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return states (num_steps, 21) and commands (num_steps, 4) of the optimum: start, then flying laps.
+    """Return the optimum's states (num_steps, 21) and commands (num_steps, 4).
 
-    Row t is the sample that is nearest in time, at most half a step off: laps are no whole number
-    of steps. The ghost jumps where its start ends, because a standing start may pass its last gate
-    anywhere.
+    It is a standing start, then flying laps. Row t is the sample that is nearest in time, at most
+    half a step off: laps are no whole number of steps. The ghost jumps where its start ends,
+    because a standing start may pass its last gate anywhere.
     """
     standing, flying = references["standing"], references["flying"]
     times_s = standing.dt_s * np.arange(num_steps)

@@ -33,7 +33,10 @@ NUM_COLOURS = 128
 
 
 class Lap(NamedTuple):
-    """A lap to show: label and colour, states (T, 21) at 100 Hz from the start of the lap on, lap time, s."""
+    """A lap to show.
+
+    states: (T, 21), at 100 Hz from the start of the lap on. time_s: the lap time, s.
+    """
 
     label: str
     colour: Colour
@@ -64,7 +67,7 @@ def make_gif(course: Course, gate_ids: Sequence[int], laps: Sequence[Lap]) -> by
 
 
 class FixedView:
-    """Draws laps on a course that is seen from a fixed point: the eye is far off, so that all of it fits."""
+    """Draws laps on a course seen from a fixed point, so far off that all of it fits."""
 
     def __init__(self, course: Course, gate_ids: Sequence[int], laps: Sequence[Lap]):
         self.gates, self.gate_ids = gates_of(course), gate_ids

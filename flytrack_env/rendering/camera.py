@@ -33,7 +33,7 @@ class Camera:
         return (points_w - self.eye_w) @ self.axes.T
 
     def pixels(self, points_c: np.ndarray) -> np.ndarray:
-        """Return the pixels (..., 2) of points (..., 3) in the camera's frame, all in front of it."""
+        """Return the pixels (..., 2) of points (..., 3) in its frame, all in front of it."""
         return self.centre_px + self.focal_px * points_c[..., :2] / points_c[..., 2:]
 
     def horizon_px(self) -> float:
@@ -42,9 +42,9 @@ class Camera:
         return float(self.centre_px[1] + self.focal_px * self.forward_w[2] / level)
 
     def polygon(self, points_c: np.ndarray) -> list[float]:
-        """Return the visible part of a polygon or line (n, 3), camera's frame, as x, y, x, y, ... in pixels.
+        """Return the visible part of a polygon or line (n, 3), camera's frame.
 
-        Empty if all of it is behind the camera.
+        It is x, y, x, y, ... in pixels; empty if all of it is behind the camera.
         """
         depths = points_c[:, 2].tolist()
         if max(depths) < NEAREST_M:

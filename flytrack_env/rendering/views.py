@@ -1,4 +1,4 @@
-"""One picture of a flight: the course from above, the flight from behind the drone, and a line of text."""
+"""A picture of a flight: the course from above, the flight from behind, and a line of text."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -57,9 +57,9 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 class TopView:
-    """Draws the course from above, the trail and the drone as an arrow; trails are kept between pictures.
+    """Draws the course from above, the trail, and the drone as an arrow.
 
-    width, height: pixels of its part of the canvas.
+    Trails are kept between pictures. width, height: pixels of its part of the canvas.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class TopView:
             draw.text(place, str(gate_ids[index]), scene.TEXT, font(13 * PIXEL), anchor="mm")
 
     def _draw_gate(self, draw: ImageDraw.ImageDraw, index: int, colour: Colour) -> None:
-        """Draw a gate as a bar with a gap where its opening is, and an arrow in its direction of flight."""
+        """Draw a gate as a bar with a gap as its opening, and an arrow in its flight direction."""
         middle = self.gates.centres[index]
         for corners, shade, width in (
             (self.gates.outer[index], colour, 4),
@@ -130,7 +130,7 @@ class TopView:
         draw.polygon(self._pairs(np.array([centre + arrow, base + across, base - across])), colour)
 
     def draw(self, canvas: Image.Image, log: FlightLog, ghost: np.ndarray | None) -> None:
-        """Draw the log's last row, the trail of all of them and a ghost (21,), at the canvas's left."""
+        """Draw the log's last row, the trail of all rows and a ghost (21,), at the left."""
         canvas.paste(self._extend_trail(log), (0, 0))
         draw = ImageDraw.Draw(canvas)
         row = log.rows[-1].astype(float)
@@ -176,7 +176,7 @@ class ChaseView:
         self.grid_w = ground_grid(low, high, CHASE_GRID_M)
 
     def camera(self, rows: np.ndarray, follows_nose: bool = False) -> Camera:
-        """Return the camera behind the drone of the last row, looking towards the next gate, or ahead.
+        """Return the camera behind the drone, looking towards the next gate, or ahead.
 
         It follows slowly: its direction is the mean over the last rows, the latest weighing most.
         """
@@ -212,7 +212,7 @@ class ChaseView:
         ghost: np.ndarray | None = None,
         follows_nose: bool = False,
     ) -> None:
-        """Draw the view of the log's last row, and a ghost (21,) in it; ``camera`` describes the rest."""
+        """Draw the view of the log's last row, and a ghost (21,) in it; see also ``camera``."""
         row = log.rows[-1].astype(float)
         camera = self.camera(log.rows, follows_nose)
         picture = Image.new("RGB", (self.width, self.height), scene.SKY)
@@ -258,7 +258,10 @@ class ChaseView:
 def draw_gate(
     draw: ImageDraw.ImageDraw, camera: Camera, corners_c: np.ndarray, colour: Colour
 ) -> None:
-    """Draw a gate's frame as a solid ring; corners: (8, 3), outer four and inner four, camera's frame."""
+    """Draw a gate's frame as a solid ring.
+
+    corners_c: (8, 3), outer four and inner four, camera's frame.
+    """
     for a in range(4):
         b = (a + 1) % 4
         beam = camera.polygon(corners_c[[a, b, 4 + b, 4 + a]])
@@ -285,7 +288,10 @@ def draw_drone(
     colours: tuple[Colour, Colour, Colour] = DRONE_COLOURS,
     enlargement: float = 1.0,
 ) -> None:
-    """Draw arms, rotors and body of a drone, the far rotors first; colours: body, front, rear rotors."""
+    """Draw arms, rotors and body of a drone, the far rotors first.
+
+    colours: of body, front rotors and rear rotors.
+    """
     axes_w = enlargement * rotations(quaternion).T
     motors_w = pos_w + scene.MOTORS_B @ axes_w
     for line in camera.look(pos_w + scene.ARMS_B @ axes_w):

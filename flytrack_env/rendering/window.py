@@ -68,7 +68,7 @@ class Window:
         self.pygame.event.pump()
 
     def put(self, picture: np.ndarray) -> None:
-        """Show a picture (height, width, 3), uint8, as large as it fits; the first opens the window."""
+        """Show a picture (height, width, 3), uint8, fitted to the window; the first opens it."""
         pygame, size = self.pygame, (picture.shape[1], picture.shape[0])
         surface = pygame.display.get_surface() or pygame.display.set_mode(size, pygame.RESIZABLE)
         image = pygame.image.frombuffer(picture.tobytes(), size, "RGB")

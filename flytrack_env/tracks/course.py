@@ -20,9 +20,10 @@ LENGTH_SAMPLES = 1000
 
 
 class GateFrame(NamedTuple):
-    """Flight frame of one gate: centre, m, and the axes forward (x) and up (z) in the world; half edges, m.
+    """Flight frame of one gate.
 
-    half_opening, half_frame: of the inner and the outer square.
+    centre: m. forward, up: its axes x and z in the world. half_opening, half_frame: half edges of
+    the inner and the outer square, m.
 
     The leaves are scalars, or arrays of shape (num_gates,) for the gates of a course.
     """
@@ -78,7 +79,7 @@ class Course(NamedTuple):
         return compute_once(jax.tree.map(select, self.gates))
 
     def next_index(self, index: jax.Array) -> jax.Array:
-        """Return the index of the gate after this one, laps repeating; a scalar, as the index is."""
+        """Return the index of the gate after this one, cyclically; a scalar, as the index is."""
         return jnp.where(index + 1 >= self.num_gates, 0, index + 1)
 
 
@@ -194,6 +195,6 @@ def sample_way(course: Course, num_samples: int) -> np.ndarray:
 
 
 def way_length(course: Course) -> float:
-    """Return the length of the way of ``sample_way`` round a course, m, within a millimetre per gate."""
+    """Return the length of ``sample_way`` round a course, m, within a millimetre per gate."""
     way = sample_way(course, LENGTH_SAMPLES)
     return float(np.linalg.norm(np.diff(way, axis=1), axis=-1).sum())

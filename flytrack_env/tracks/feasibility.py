@@ -99,10 +99,10 @@ class Geometry(NamedTuple):
         return float(np.linalg.norm(local, axis=-1).min())
 
     def crossings(self, index: int, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return where a path (M, 3) crosses a gate's plane: how far off its centre, m, and if forwards.
+        """Return where a path (M, 3) crosses a gate's plane.
 
-        Both (number of crossings,); the offset is the larger one of the gate's two axes,
-        interpolated.
+        Return the offsets from the gate's centre, m, and whether the path crosses forwards, both
+        (number of crossings,); an offset is the larger one of the gate's two axes, interpolated.
         """
         local = self.in_frame(index, path)
         is_beyond = local[:, 0] >= 0.0
@@ -118,13 +118,13 @@ class Geometry(NamedTuple):
         return 0.0 if is_through.any() else self.distance_to_gate(index, path)
 
     def square(self, index: int) -> np.ndarray:
-        """Return points all over the square within a gate's outer edge, (M, 3), corners included."""
+        """Return points all over a gate's outer square, (M, 3), corners included."""
         edge = np.linspace(-self.half_frames[index], self.half_frames[index], SAMPLES_PER_EDGE)
         across, along = (grid.reshape(-1, 1) for grid in np.meshgrid(edge, edge))
         return self.centres[index] + across * self.axes[index, 1] + along * self.axes[index, 2]
 
     def excesses(self, points: np.ndarray, margin: np.ndarray | float) -> dict[str, float]:
-        """Return by side how far points (M, 3) lie beyond the bounds less a margin, m, where they do.
+        """Return by side how far points (M, 3) lie beyond the bounds less a margin, m, if they do.
 
         margin: one for all axes, or (3,).
         """
@@ -139,7 +139,10 @@ def find_openings(geometry: Geometry, limits: Limits) -> Iterator[str]:
     """Yield gates that are too small."""
     for gate in geometry.track.gates:
         if gate.opening < limits.min_opening:
-            yield f"gate {gate.id}: opening of {gate.opening:g} m, expected at least {limits.min_opening:g} m"
+            yield (
+                f"gate {gate.id}: opening of {gate.opening:g} m, "
+                f"expected at least {limits.min_opening:g} m"
+            )
 
 
 def find_spacings(geometry: Geometry, limits: Limits) -> Iterator[str]:
@@ -154,7 +157,7 @@ def find_spacings(geometry: Geometry, limits: Limits) -> Iterator[str]:
 
 
 def angle_deg(forward: np.ndarray, chord: np.ndarray) -> float:
-    """Return the angle between a unit vector and a chord, both (3,); 0 for a chord without length."""
+    """Return the angle between a unit vector and a chord, both (3,); 0 for a chord of length 0."""
     length = float(np.linalg.norm(chord))
     return math.degrees(math.acos(np.clip(forward @ chord / length, -1.0, 1.0))) if length else 0.0
 
@@ -167,9 +170,9 @@ def find_turns(geometry: Geometry, limits: Limits) -> Iterator[str]:
             angle = angle_deg(geometry.axes[gate, 0], chord)
             if angle > limits.max_turn_deg:
                 yield (
-                    f"gate {geometry.id(gate)}: {angle:.0f} deg between its direction of flight and the "
-                    f"straight way {word} gate {geometry.id(other)}, expected at most "
-                    f"{limits.max_turn_deg:g} deg"
+                    f"gate {geometry.id(gate)}: {angle:.0f} deg between its direction of flight "
+                    f"and the straight way {word} gate {geometry.id(other)}, "
+                    f"expected at most {limits.max_turn_deg:g} deg"
                 )
 
 
@@ -196,8 +199,9 @@ def find_gates_in_path(geometry: Geometry, limits: Limits) -> Iterator[str]:
             distance = geometry.gap(other, geometry.way[i])
             if distance < limits.clearance:
                 yield (
-                    f"gate {geometry.id(other)}: {distance:.2f} m from the way from gate {geometry.id(i)} to "
-                    f"{geometry.id(j)}, expected at least {limits.clearance:g} m"
+                    f"gate {geometry.id(other)}: {distance:.2f} m from the way "
+                    f"from gate {geometry.id(i)} to {geometry.id(j)}, "
+                    f"expected at least {limits.clearance:g} m"
                 )
 
 
@@ -215,8 +219,9 @@ def find_touching_frames(geometry: Geometry, limits: Limits) -> Iterator[str]:
             )
             if min(both) < limits.clearance:
                 yield (
-                    f"gates {geometry.id(i)} and {geometry.id(j)}: frames {min(both):.2f} m apart, expected "
-                    f"at least {limits.clearance:g} m"
+                    f"gates {geometry.id(i)} and {geometry.id(j)}: "
+                    f"frames {min(both):.2f} m apart, "
+                    f"expected at least {limits.clearance:g} m"
                 )
 
 
@@ -225,11 +230,15 @@ def find_out_of_bounds(geometry: Geometry, limits: Limits) -> Iterator[str]:
     for i, j in geometry.pairs():
         for side, excess in geometry.excesses(geometry.way[i], limits.clearance).items():
             yield (
-                f"the way from gate {geometry.id(i)} to {geometry.id(j)}: {limits.clearance - excess:.2f} m "
-                f"inside the bounds ({side}), expected at least {limits.clearance:g} m"
+                f"the way from gate {geometry.id(i)} to {geometry.id(j)}: "
+                f"{limits.clearance - excess:.2f} m inside the bounds ({side}), "
+                f"expected at least {limits.clearance:g} m"
             )
         for side, excess in geometry.excesses(geometry.square(i), 0.0).items():
-            yield f"gate {geometry.id(i)}: frame {excess:.2f} m out of bounds ({side}), expected inside"
+            yield (
+                f"gate {geometry.id(i)}: frame {excess:.2f} m out of bounds ({side}), "
+                "expected inside"
+            )
 
 
 def find_bad_start(geometry: Geometry, limits: Limits) -> Iterator[str]:
@@ -244,16 +253,16 @@ def find_bad_start(geometry: Geometry, limits: Limits) -> Iterator[str]:
         )
     if angle > limits.max_start_turn_deg:
         yield (
-            f"start: {angle:.0f} deg off the direction of flight of gate {first}, expected in front of it, "
-            f"at most {limits.max_start_turn_deg:g} deg"
+            f"start: {angle:.0f} deg off the direction of flight of gate {first}, "
+            f"expected in front of it, at most {limits.max_start_turn_deg:g} deg"
         )
     line = start + np.linspace(0.0, 1.0, SAMPLES_PER_WAY)[:, None] * chord
     for other in range(1, len(geometry.centres)):
         gap = geometry.gap(other, line)
         if gap < limits.clearance:
             yield (
-                f"start: gate {geometry.id(other)} is {gap:.2f} m from the straight way to gate {first}, "
-                f"expected at least {limits.clearance:g} m"
+                f"start: gate {geometry.id(other)} is {gap:.2f} m from the straight way "
+                f"to gate {first}, expected at least {limits.clearance:g} m"
             )
     # No margin to floor and ceiling: the drone stands on the ground.
     margin = np.array([limits.start_clearance, limits.start_clearance, 0.0])

@@ -28,7 +28,7 @@ def random_track(
     heights: tuple[float, float] = (0.5 * FRAME_M, 4.0),
     limits: Limits | None = None,
 ) -> Track:
-    """Return a course that ``find_problems`` has nothing against, a function of the arguments alone.
+    """Return a course without ``find_problems``'s problems, a function of the arguments alone.
 
     The gates stand at random, at least ``limits.min_spacing`` apart as seen from above, are flown
     in the order of a short round trip (half of the drawn ones with a stretch turned round, so that
@@ -65,9 +65,9 @@ def random_track(
         failed.update(dict.fromkeys((problem.demand for problem in problems), 1))
     demand, count = failed.most_common(1)[0]
     raise TrackError(
-        f"random_track: no feasible course of {num_gates} gates in {size[0]:g} m x {size[1]:g} m in "
-        f"{MAX_ATTEMPTS} attempts; the demand that failed most often: {demand} ({count} times); expected "
-        "fewer gates, a larger arena or wider limits"
+        f"random_track: no feasible course of {num_gates} gates in {size[0]:g} m x {size[1]:g} m "
+        f"in {MAX_ATTEMPTS} attempts; the demand that failed most often: {demand} ({count} times); "
+        "expected fewer gates, a larger arena or wider limits"
     )
 
 
@@ -108,7 +108,7 @@ def _draw_centres(
     heights: tuple[float, float],
     spacing: float,
 ) -> np.ndarray | None:
-    """Return centres (num_gates, 3) at least that far apart horizontally, None if they found no room."""
+    """Return centres (num_gates, 3) that far apart horizontally, None if there was no room."""
     low = np.array([WALL_MARGIN_M, WALL_MARGIN_M, heights[0]])
     high = np.array([size[0] - WALL_MARGIN_M, size[1] - WALL_MARGIN_M, heights[1]])
     centres = np.empty((0, 3))
@@ -124,9 +124,9 @@ def _draw_centres(
 
 
 def _order(generator: np.random.Generator, centres: np.ndarray) -> np.ndarray:
-    """Return centres (N, 3) in flying order: a short round trip by 2-opt, or one that crosses itself.
+    """Return centres (N, 3) in flying order: a short round trip, or one that crosses itself.
 
-    2-opt: reverse stretches as long as that shortens the trip (G. A. Croes, 1958).
+    By 2-opt: reverse stretches as long as that shortens the trip (G. A. Croes, 1958).
     """
     trip = centres.copy()
     count = len(trip)
@@ -156,7 +156,7 @@ def _track_through(
     size: tuple[float, float],
     top: float,
 ) -> Track:
-    """Return the course through centres (N, 3) in that order; starts on the ground before the first."""
+    """Return the course through centres (N, 3) in that order, with a start on the ground."""
     chord = np.roll(centres, -1, axis=0)[:, :2] - centres[:, :2]
     ways = chord / np.linalg.norm(chord, axis=1, keepdims=True)
     facing = np.roll(ways, 1, axis=0) + ways

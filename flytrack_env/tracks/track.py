@@ -113,8 +113,8 @@ def save_track(path: str | Path, track: Track) -> None:
     changed = [name for name in names if getattr(read, name) != getattr(track, name)]
     if changed:
         raise TrackError(
-            f"{path}: {', '.join(changed)}: would not be read back as written, expected tuples of floats "
-            "and unit quaternions"
+            f"{path}: {', '.join(changed)}: would not be read back as written, "
+            "expected tuples of floats and unit quaternions"
         )
     write_atomically(path, content)
 

@@ -1,4 +1,4 @@
-"""The entities of a recording: what is logged once, and what changes from step to step as whole columns."""
+"""The entities of a recording: those logged once, and those sent for all steps as columns."""
 
 import math
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ PATH_RADIUS, PASS_RADIUS, LAP_RADIUS, ARROW_RADIUS, DRONE_RADIUS = (
 
 
 class Plot(NamedTuple):
-    """One line of a plot: its path below that of the plots, label, values (T,), the model it is of."""
+    """One line of a plot: its path below that of the plots, label, values (T,), and model."""
 
     path: str
     label: str
@@ -40,7 +40,7 @@ def centres_of(track: Track | None) -> np.ndarray:
 
 
 def log_course(recording: rr.RecordingStream, track: Track | None) -> None:
-    """Log the axes, the gates (centre, frame, opening, direction of flight) and the bounds, once."""
+    """Log axes, gates (centre, frame, opening, direction of flight) and bounds, once."""
 
     def log(entity: str, archetype: rr.AsComponents) -> None:
         recording.log(entity, archetype, static=True, strict=True)
@@ -151,7 +151,7 @@ class Writer:
         self.recording.log(entity, archetype, static=True, strict=True)
 
     def _send(self, entity: str, rows: np.ndarray, columns: rr.ComponentColumnList) -> None:
-        """Send an entity's columns for these rows of the flight; rows after its end count as the last one."""
+        """Send an entity's columns for these rows; rows after the end count as the last one."""
         rows = np.minimum(rows, self.all_rows[-1])
         indexes = [
             rr.TimeColumn("step", sequence=rows),
@@ -162,7 +162,7 @@ class Writer:
         self.recording.send_columns(entity, indexes, columns, strict=True)
 
     def _log_drone(self) -> None:
-        """Log the drone's body in its own frame, and the look of its path and of its passes, once."""
+        """Log the drone's body in its own frame, and the style of its path and passes, once."""
         drone, colour = f"{self.world}/drone", self.colours[self.trajectory.name]
         pitch = math.radians(scene.CAMERA_PITCH_DEG)
         ray_b = CAMERA_RAY_M * np.array([math.cos(pitch), 0.0, math.sin(pitch)])
@@ -181,7 +181,7 @@ class Writer:
         self._log(f"{self.world}/laps", laps)
 
     def _send_poses(self) -> None:
-        """Send the drone's pose, and a level frame that flies along, x ahead, for the view from behind."""
+        """Send the drone's pose, and for the view from behind a level frame, x ahead."""
         states, positions = self.trajectory.states, self.trajectory.positions
         x_first = np.roll(states[:, QUATERNION], -1, axis=1)
         pose = rr.Transform3D.columns(translation=positions, quaternion=x_first)

@@ -72,10 +72,11 @@ def visualize_state_action_sequence(
 def write_recording(
     path: str | Path, flights: Sequence[Trajectory], track: Track | None, app_id: str = APP_ID
 ) -> None:
-    """Write flights on one time line as a Rerun recording, under a temporary name that is then renamed.
+    """Write flights on one time line as a Rerun recording.
 
-    flights: at least one, of different names; the first has the entities of the handout, others
-    their own below ``flights/NAME``. track: None shows no gates.
+    The file has a temporary name until it is complete. flights: at least one, of different names;
+    the first has the entities of the handout, others their own below ``flights/NAME``. track: None
+    shows no gates.
 
     Raises:
         ValueError: no flights, two of one name, a flight that cannot be shown (as for
@@ -160,7 +161,7 @@ def _describe(
 def _view(
     name: str, origin: str, position: Sequence[float], target: Sequence[float]
 ) -> rrb.Spatial3DView:
-    """Return a view of the world in the frame of an entity, from a position and towards a target in it."""
+    """Return a view of the world in an entity's frame, from a position towards a target."""
     eye = rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=position, look_target=target)
     contents = ["+ /world/**", "- /world/bounds"]  # around a course, the bounds are mostly empty
     return rrb.Spatial3DView(origin=origin, contents=contents, name=name, eye_controls=eye)

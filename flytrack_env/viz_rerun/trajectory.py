@@ -1,4 +1,4 @@
-"""What a recording shows: checked trajectories with the race that each flew, and gates as a track."""
+"""What a recording shows: checked trajectories, the race of each, and gates as a track."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -41,13 +41,13 @@ class Trajectory:
 
     @cached_property
     def time_ns(self) -> np.ndarray:
-        """The time of each row in whole nanoseconds, (T,): in s, 0.01 would drift off the grid of steps."""
+        """The time of each row, whole ns, (T,): in s, 0.01 would drift off the grid of steps."""
         if self.time_s is None:
             return np.arange(len(self.states)) * round(STEP_S * 1e9)
         return np.rint((self.time_s - self.time_s[0]) * 1e9).astype(np.int64)
 
     def race(self, track: Track | None) -> FlownRace | None:
-        """Return the race that was flown; None without gates, or where rows are not 0.01 s apart."""
+        """Return the flown race; None without gates, or where rows are not 0.01 s apart."""
         if track is None or not track.gates or self.time_s is not None:
             return None
         return follow_race(self.positions, track, last_vel_w=self.states[-1, VELOCITY])
@@ -99,7 +99,9 @@ def checked(trajectory: Trajectory) -> Trajectory:
 
 
 def track_of_gates(gates: np.ndarray, positions: np.ndarray) -> Track:
-    """Return gates as a track without bounds, of the handout's size, flown as the flight first passes them.
+    """Return gates as a track without bounds.
+
+    Gates have the handout's size, and are flown as the flight first passes them.
 
     gates: (N, >=8) with id, x, y, z, qw, qx, qy, qz (to world). positions: (T, 3), of the flight. A
     gate that it does not pass is flown towards its local +y.

@@ -49,14 +49,14 @@ class ActionDelay(Wrapper):
         return self._default
 
     def check_params(self, params: EnvParams) -> None:
-        """Raise ValueError for a delay outside the effect's range, and what the inner check refuses."""
+        """Raise ValueError for a delay out of the effect's range, and as the inner check does."""
         super().check_params(params)
         check_parameters(self.own_params(params), params.dt)
 
     def begin(
         self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0
     ) -> ActionDelayState:
-        """Return the state of an episode that begins, its applied action taken for all past commands."""
+        """Return the state of a new episode; all past commands are its applied action."""
         inner = self.env.begin(drone, gate_index, params, seed)
         return ActionDelayState(inner, command_delay.start(self.own_params(params), drone))
 

@@ -63,7 +63,7 @@ class ActionHistory(Wrapper):
     def begin(
         self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0
     ) -> ActionHistoryState:
-        """Return the state of an episode that begins, the drone's applied action for all of history."""
+        """Return the state of a new episode, with the applied action for all of history."""
         inner = self.env.begin(drone, gate_index, params, seed)
         return ActionHistoryState(inner, (drone.applied,) * self.length)
 

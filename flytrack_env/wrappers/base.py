@@ -41,8 +41,9 @@ class Wrapper(EpisodicEnvironment):
         name = type(self).__name__
         if not isinstance(env, EpisodicEnvironment):
             raise WrapperError(
-                f"{name}: found {type(env).__name__} inside, expected FlyTrack or a wrapper that acts before "
-                "auto-reset; wrappers of another step (LegacyStep, gymnax's) go outermost"
+                f"{name}: found {type(env).__name__} inside, "
+                "expected FlyTrack or a wrapper that acts before auto-reset; "
+                "wrappers of another step (LegacyStep, gymnax's) go outermost"
             )
         for inside in layers_of(env):
             reason = self.refusal(inside)
@@ -54,7 +55,7 @@ class Wrapper(EpisodicEnvironment):
         self.env_id = f"{name}({env.env_id})"
 
     def refusal(self, inside: EpisodicEnvironment) -> str | None:
-        """Return why this wrapper may not go around what is inside, however deep; None if it may."""
+        """Return why this wrapper may not go around an inner one, however deep; None if it may."""
         if isinstance(inside, Wrapper) and inside.key == self.key:
             return f"both have the name {self.key!r}, which identifies their parameters and draws"
         return None

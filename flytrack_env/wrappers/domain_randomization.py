@@ -125,7 +125,8 @@ class DomainRandomization(Wrapper):
         super().__init__(env)
         if env.plant.dt is not None:
             raise WrapperError(
-                f"DomainRandomization around {env.plant!r}: its parameters are baked in, none can be drawn"
+                f"DomainRandomization around {env.plant!r}: its parameters are baked in, "
+                "none can be drawn"
             )
 
     def own_defaults(self) -> RandomizationParams:
@@ -189,7 +190,7 @@ class DomainRandomization(Wrapper):
 
 
 def _check_ranges(ranges: RandomizationParams, params: EnvParams, delay_steps: int) -> None:
-    """Raise ValueError for an empty range, one beyond what can be flown, or effects that do not match."""
+    """Raise ValueError for ranges that are empty or cannot be flown, or effects that differ."""
     classes = [
         [effect_of(parameters).parameters for parameters in side]
         for side in (ranges.low, ranges.high)
@@ -223,7 +224,7 @@ def _check_ranges(ranges: RandomizationParams, params: EnvParams, delay_steps: i
 
 
 def _factors(bounds: Range, values: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the largest factor that leave all values (..., N) within bounds, (...)."""
+    """Return the least and largest factor, (...), that keep values (..., N) within bounds."""
     values = np.asarray(values, float)
     lowest, highest = bounds.low / values.min(axis=-1), bounds.high / values.max(axis=-1)
     return lowest * (1.0 - ROUNDING), highest * (1.0 + ROUNDING)

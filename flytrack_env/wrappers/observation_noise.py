@@ -60,7 +60,7 @@ class ObservationNoise(Wrapper):
         return NoiseParams()
 
     def check_params(self, params: EnvParams) -> None:
-        """Raise ValueError for a standard deviation beyond ``RANGES``, and what the inner check refuses."""
+        """Raise ValueError for a deviation beyond ``RANGES``, or what the inner check refuses."""
         super().check_params(params)
         for name, value in self.own_params(params)._asdict().items():
             bounds = RANGES[name]
