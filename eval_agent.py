@@ -1,4 +1,7 @@
-"""Fly a checkpoint: ``python eval_agent.py --checkpoint PATH --steps N``; the same as ``flytrack eval``."""
+"""Fly a checkpoint, as ``flytrack eval`` does.
+
+Usage: ``python eval_agent.py --checkpoint PATH --steps N``.
+"""
 
 import sys
 

@@ -103,7 +103,10 @@ COMMANDS = {
 
 
 class NotInstalledError(Exception):
-    """A command that is not here; the message says what is missing and, if it can be, how to install it."""
+    """A command that is not installed.
+
+    The message says what is missing and, if possible, how to install it.
+    """
 
 
 def load(name: str, target: str) -> Any:
@@ -165,7 +168,8 @@ def call(name: str, words: Sequence[str]) -> None:
         if not {"-h", "--help"} & set(words):
             leave(name, REFUSED, f"error: {error}")
         print(
-            f"usage: {PROG} {name} [OPTIONS]\n\n{describe(command)}\n\nIts flags cannot be shown: {error}"
+            f"usage: {PROG} {name} [OPTIONS]\n\n{describe(command)}\n\n"
+            f"Its flags cannot be shown: {error}"
         )
         return
     warnings.showwarning = lambda message, *_, **__: print(
@@ -183,7 +187,7 @@ def call(name: str, words: Sequence[str]) -> None:
 
 
 def held_output(asked: Any) -> contextlib.AbstractContextManager[None]:
-    """Return what holds the output folder of a command's flags; nothing for one that writes files alone."""
+    """Return a lock of the command's output folder; a null context if it writes only files."""
     out = getattr(asked, "out", None)
     if not isinstance(out, Path) or out.suffix:
         return contextlib.nullcontext()
@@ -204,7 +208,10 @@ def read_flags(name: str, words: Sequence[str]) -> Any:
 
 
 def print_completion(shell: str) -> None:
-    """Print a shell's script that completes commands and flags; without its extra, the command alone."""
+    """Print a shell's script that completes commands and flags.
+
+    A command whose extra is not installed is completed without its flags.
+    """
     import tyro
 
     def flags_of(name: str) -> Any:

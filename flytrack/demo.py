@@ -38,7 +38,7 @@ WHOLE, QUICK = Size(2.0, 2500, 256), Size(1.0, 200, 16)
 
 
 def identify(black_box: Path, out: Path, seed: int, minutes: float) -> dict[str, Validation]:
-    """Fly the excitation on the black box, fit, write log and model to train on; return held-out errors.
+    """Identify the black box, write the log and the model to train on; return held-out errors.
 
     The minimal model leaves a force unexplained; linear drag, reported for the original drone, is
     then added.
@@ -82,7 +82,8 @@ def run_demo(flags: Demo) -> None:
     blackbox.load(black_box)  # refuses before anything is written
     if flags.out and checkpoints_in(flags.out):
         raise ValueError(
-            f"--out: {flags.out} holds the run of an earlier demo; remove it, or give another folder"
+            f"--out: {flags.out} holds the run of an earlier demo; remove it, "
+            "or give another folder"
         )
     out = flags.out or fresh_folder(DEFAULT_OUT)
     out.mkdir(parents=True, exist_ok=True)
@@ -132,7 +133,8 @@ def run_demo(flags: Demo) -> None:
     else:
         print(f"no recording: {CANNOT_RECORD}")
     print(
-        f"{result.success:.1%} of {size.num_episodes} noisy starts finish {NUM_LAPS} laps on the black "
-        f"box; first lap {result.first_lap_s:.2f} s, flying lap {result.flying_lap_s:.2f} s"
+        f"{result.success:.1%} of {size.num_episodes} noisy starts finish {NUM_LAPS} laps "
+        f"on the black box; first lap {result.first_lap_s:.2f} s, "
+        f"flying lap {result.flying_lap_s:.2f} s"
     )
     print(f"written: {out}/ in {summary['seconds']} s")

@@ -1,6 +1,7 @@
-"""The flags of ``flytrack``'s commands: dataclasses that need no extra, so that ``--help`` shows them.
+"""The flags of ``flytrack``'s commands.
 
-Those of ``train``, ``eval`` and ``loop`` are where their defaults are, in packages that need one.
+They are dataclasses that need no extra, so that ``--help`` shows them. Those of ``train``, ``eval``
+and ``loop`` are where their defaults are, in packages that need one.
 """
 
 from dataclasses import dataclass
@@ -32,7 +33,8 @@ class Demo:
     )
     """Environment steps of the training; default: those of `flytrack train`."""
     quick: bool = False
-    """Every step once, each as short as it can be, to see that all works: the policy learns nothing."""
+    """Every step once, each as short as it can be, to see that all works: the policy learns
+    nothing."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,8 @@ class Show:
     track: str = "flytrack"
     """Name of a shipped track, or a track file (.toml)."""
     allow_pickle: bool = False
-    """Read pickled rollouts. Unpickling runs whatever code a file holds: allow it for files you trust."""
+    """Read pickled rollouts. Unpickling runs whatever code a file holds: allow it for files you
+    trust."""
     ghost: bool = False
     """Fly the time-optimal flight beside them in the recording."""
     ghost_model: Literal["nominal", "black_box"] = "nominal"
@@ -62,8 +65,8 @@ class Collect:
     out: Path
     """The log, .npz or .csv."""
     black_box: Annotated[str | None, arg(metavar="PLANT", help_behavior_hint=NO_HINT)] = None
-    """The plant: an acro_step.bin, or module:name of a function step(x, u) or of a plant; default: the
-    shipped black box."""
+    """The plant: an acro_step.bin, or module:name of a function step(x, u) or of a plant; default:
+    the shipped black box."""
     minutes: Annotated[float, EXCITATION_OR_SCRIPT] = 2.0
     """Duration of the excitation, at least 1."""
     script: Annotated[OptionalPath, EXCITATION_OR_SCRIPT] = None
@@ -111,8 +114,8 @@ class Fit:
     hold_out_every: int = 4
     """Hold out the last of every so many blocks; 0: none."""
     motion: MotionName = "auto"
-    """How the craft moves within a step: as drones do (continuous), or by a simulator's step; auto: as drones
-    do if the log is measured, else what the log shows."""
+    """How the craft moves within a step: as drones do (continuous), or by a simulator's step; auto:
+    as drones do if the log is measured, else what the log shows."""
 
 
 @dataclass(frozen=True)
@@ -138,12 +141,13 @@ class Diagnose:
     model: OptionalPath = None
     """The model to diagnose, .json; default: the nominal model."""
     hold_out: SomeLogs = ()
-    """Logs to judge by and not to learn from; default: the last of every four blocks of the others."""
+    """Logs to judge by and not to learn from; default: the last of every four blocks of the
+    others."""
     before: SomeLogs = ()
     """Logs of the craft as the model knows it: causes are then only what has changed since."""
     motion: MotionName = "auto"
-    """How the craft moves within a step: as drones do (continuous), or by a simulator's step; auto: as drones
-    do if the logs are measured, else what the logs show."""
+    """How the craft moves within a step: as drones do (continuous), or by a simulator's step; auto:
+    as drones do if the logs are measured, else what the logs show."""
 
 
 @dataclass(frozen=True)

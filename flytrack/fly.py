@@ -28,7 +28,8 @@ class Fly:
     ghost: Kind = "reference"
     """Fly against the time-optimal flight, against the shipped champion (extra train), or alone."""
     race: bool = False
-    """Race it: it starts once, with you half a metre behind, does not wait at laps, and can be hit."""
+    """Race it: it starts once, with you half a metre behind, does not wait at laps, and can be
+    hit."""
     controls: Gamepad = field(default_factory=Gamepad)
     out: Path = Path("runs/flight.npy")
     """Rollout to write; a number is added to the name where the file exists."""

@@ -1,4 +1,4 @@
-"""What ``flytrack``'s commands from ``collect`` to ``plan``, and ``import``, do with their flags."""
+"""The functions that run ``flytrack``'s commands ``collect`` to ``plan``, and ``import``."""
 
 import importlib
 import sys
@@ -183,7 +183,9 @@ def fixed_values(pairs: Sequence[str]) -> dict[str, float]:
 
 
 def judged_rows(model_path: Path, log: FlightLog) -> tuple[np.ndarray | None, str]:
-    """Return the rows of a log that a model was not fitted to, (num_rows,) bool, None for all, and a note.
+    """Return the rows of a log that a model was not fitted to, and a note.
+
+    The rows are (num_rows,) bool, or None for all.
 
     Raises ModelFileError for a split that cannot be read, or a model fitted to the whole log.
     """

@@ -45,7 +45,10 @@ class Loop:
 
 @contextmanager
 def _opened(flags: Loop) -> Iterator[tuple[Plant, ModelParameters | None]]:
-    """Give the plant, and the model to fit from if it has one of its own; nothing is left running."""
+    """Yield the plant and, if it has one of its own, the model to fit from.
+
+    Nothing is left running afterwards.
+    """
     if flags.plant is None:
         if flags.dump or flags.body or flags.skip:
             raise ValueError("--dump, --skip and --body: expected with --plant betaflight only")
@@ -66,7 +69,11 @@ def _opened(flags: Loop) -> Iterator[tuple[Plant, ModelParameters | None]]:
 
 
 def run_loop(flags: Loop) -> None:
-    """Close the loop and print before and after; raises OSError or ValueError for what cannot be used."""
+    """Close the loop and print before and after.
+
+    Raises:
+        OSError, ValueError: what cannot be used.
+    """
     name = flags.plant or (flags.black_box or blackbox.SHIPPED).stem
     config = Config(total_timesteps=int(flags.total_timesteps))
     with _opened(flags) as (plant, start):
@@ -74,6 +81,5 @@ def run_loop(flags: Loop) -> None:
         loop = close_loop(plant, out, config, flags.seed, flags.settings, start=start)
         files = write_flights(out, loop, plant, flags.seed)
     print(describe(loop))
-    print(
-        f"written: {out}/ with loop.json, diagnosis/report.html, {', '.join(one.name for one in files)}"
-    )
+    names = ", ".join(one.name for one in files)
+    print(f"written: {out}/ with loop.json, diagnosis/report.html, {names}")

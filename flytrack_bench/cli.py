@@ -25,8 +25,8 @@ class Flags:
     """What is flown."""
 
     policy: Annotated[tuple[str, ...], arg(metavar="CHECKPOINT|MODULE:NAME [...]")]
-    """The policy, one for each training seed: checkpoints, or functions of the observation that return four
-    sticks."""
+    """The policy, one for each training seed: checkpoints, or functions of the observation that
+    return four sticks."""
     out: OptionalPath = None
     """The result, .json; default: it is printed only."""
     suite: str = "v1"

@@ -1,4 +1,4 @@
-"""Policies of any origin: a checkpoint of the baseline, or a function or an object of one's own module."""
+"""Policies: a checkpoint of the baseline, or a function or object of the user's own module."""
 
 import hashlib
 import importlib
@@ -28,7 +28,7 @@ class PolicyError(ValueError):
 
 @dataclass(frozen=True)
 class Function:
-    """A policy without a memory: a function of the observation, (29,), that returns sticks, (4,)."""
+    """A policy without memory: a function of the observation, (29,), that returns sticks, (4,)."""
 
     function: Any
 

@@ -1,4 +1,4 @@
-"""Running a suite: every task flown, with data to adapt to it if asked, and what a result file says of it."""
+"""Run a suite: fly every task, adapt the policy if asked, and collect the result file."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -66,11 +66,11 @@ Adapt = Callable[[Data, Policy], Policy]
 
 
 def fly_task(task: Task, suite: Suite, policy: Policy) -> dict[str, Any]:
-    """Return how a policy does on a task: success, mean lap times, s, its score, and why flights ended.
+    """Return the results of a policy on a task.
 
-    The score is the share of starts that finish times the time-optimal lap over the mean flying
-    lap. gates: passed, mean. ended: share of all flights by what ended them, but for those that
-    finished.
+    They are success, mean lap times, s, score, and why flights ended. The score is the share of
+    starts that finish times the time-optimal lap over the mean flying lap. gates: passed, mean.
+    ended: share of all flights by what ended them, but for those that finished.
     """
     env = policy.env(task.plant, task.track)
     params = with_model_as_given(env.default_params)

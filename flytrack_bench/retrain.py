@@ -1,4 +1,4 @@
-"""An entry of the benchmark: diagnose the data of a plant, and train again on the model that it extends."""
+"""An entry of the benchmark: diagnose a plant's data, and retrain on the extended model."""
 
 import tempfile
 from pathlib import Path
@@ -11,7 +11,7 @@ from flytrack_sysid import diagnose
 
 
 def diagnose_and_retrain(data: Data, policy: Policy) -> Policy:
-    """Return a policy trained from scratch, by the default recipe, on the extended model of a plant.
+    """Return a policy trained from scratch, by the default recipe, on a plant's extended model.
 
     policy: flies all the data that are left. Flights are of its own seed, that of the training is
     0.

@@ -23,7 +23,10 @@ Count = Annotated[int, Meta(ge=0)]
 
 
 class SuiteError(ValueError):
-    """A suite that cannot be used; the message names file and field, what was found and expected."""
+    """A suite that cannot be used.
+
+    The message names file and field, what was found and what was expected.
+    """
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,10 @@ class Task:
 
 @dataclass(frozen=True)
 class Suite:
-    """Tasks; each is flown from so many perturbed starts, for so many laps and at most so many steps."""
+    """A set of tasks.
+
+    starts: perturbed starts per task. laps: to fly from each. steps: at most, of a flight.
+    """
 
     name: str
     digest: str

@@ -24,7 +24,7 @@ STILL_START = ResetParams(0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # no noise, full, never
 
 
 class GhostLap(NamedTuple):
-    """A lap: its states (21,) at any time, and the times of its gates (num_gates,); s since it began."""
+    """A lap: its states (21,) over time, and its gate times (num_gates,), s since it began."""
 
     state_at: Callable[[float], np.ndarray]
     gate_times_s: np.ndarray
@@ -50,7 +50,10 @@ class Ghost(NamedTuple):
         )
 
     def state_at(self, laps: int, time_s: float) -> np.ndarray:
-        """Return the state (21,) so many s after the pilot's lap began; through with a lap, it flies on."""
+        """Return the state (21,) at ``time_s`` after the pilot's lap began.
+
+        After the end of its lap, the ghost flies on.
+        """
         beyond_s = time_s - self.lap(laps).gate_times_s[-1]
         if beyond_s < 0.0:
             return self.lap(laps).state_at(time_s)
@@ -65,14 +68,16 @@ def _lap(states: np.ndarray, first_s: float, gate_times_s: np.ndarray) -> GhostL
 
 
 def still_start(params: EnvParams, num_steps: int) -> EnvParams:
-    """Return parameters whose episodes begin at rest at the start pose and may last that many steps."""
+    """Return parameters of episodes from rest at the start, of at most ``num_steps`` steps."""
     return params.replace(reset=STILL_START, max_steps_in_episode=num_steps)
 
 
 def make_ghost(
     kind: Kind, track: Track, model: ModelParameters | None
 ) -> tuple[Ghost | None, ModelParameters]:
-    """Return the ghost of a kind, and the pilot's model: if None, the champion's own or the nominal one.
+    """Return the ghost of a kind, and the pilot's model.
+
+    model: if None, the champion's own or the nominal one.
 
     Raises:
         ValueError: no reference of this track, or a champion that flies no two laps here.
@@ -106,7 +111,7 @@ def make_ghost(
 def fly_champion(
     track: Track, model: ModelParameters | None
 ) -> tuple[np.ndarray, np.ndarray, ModelParameters]:
-    """Return states (T, 21) and commands (T, 4) of the shipped champion's flight with a model, and the model.
+    """Return states (T, 21), commands (T, 4) and model of a flight of the shipped champion.
 
     model: the champion's own if None.
 

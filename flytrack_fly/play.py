@@ -69,7 +69,7 @@ class Controls:
             self._values[is_mine & (np.array(self._gamepad.axes) == event.axis)] = event.value
 
     def sticks(self, dt_s: float) -> np.ndarray:
-        """Return the sticks (4,) after ``dt_s`` s more: those of the keys, and the gamepad's added."""
+        """Return the sticks (4,) after ``dt_s`` s more: those of the keys plus the gamepad's."""
         pulls = np.zeros(len(NAMES))
         for stick, pull in (KEYS[key] for key in self.held & KEYS.keys()):
             pulls[stick] += pull

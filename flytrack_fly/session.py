@@ -1,4 +1,4 @@
-"""One sitting of a pilot: flights from the start to a crash, their laps, and the gap to the ghost."""
+"""A pilot's session: flights from the start to a crash, their laps, and the gap to the ghost."""
 
 import math
 from dataclasses import dataclass, field
@@ -27,7 +27,7 @@ GRID = RaceRules()
 
 
 def steps_due(behind_s: float, frame_s: float, step_s: float) -> tuple[int, float]:
-    """Return how many steps are due after a picture that took ``frame_s`` s, and the time left over, s.
+    """Return how many steps are due after a picture that took ``frame_s`` s, and the rest, s.
 
     behind_s: left over before. No more than ``MOST_BEHIND_S`` are caught up on.
     """
@@ -38,7 +38,7 @@ def steps_due(behind_s: float, frame_s: float, step_s: float) -> tuple[int, floa
 
 @dataclass(eq=False)
 class Flight:
-    """A flight from the start: log and commands (4,) of its steps, lap times, gates passed, why it ended.
+    """A flight from the start: log, commands (4,), lap times, gates passed, why it ended.
 
     gap: index of the last gate that was passed, and how much later within the lap than the ghost,
     s.
@@ -92,9 +92,10 @@ class Session:
     def _advance_state(
         self, state: Any, command: jax.Array, opponent_w: jax.Array
     ) -> tuple[Any, ...]:
-        """Return the next state, its row, the time of crossing the next gate's plane, causes of an end.
+        """Return the next state, its row, the crossing time, and the causes of an end.
 
-        opponent_w: where an opponent is before and after the step, (2, 3); NaN: nowhere.
+        The crossing is that of the next gate's plane. opponent_w: where an opponent is before and
+        after the step, (2, 3); NaN: nowhere.
         """
         env, params = self.env, self.params
         _, after, _, _, info = env.step_env(None, state, command, params)
@@ -153,7 +154,10 @@ class Session:
             flight.lap_times_s.append(float(after[LAP_TIME]))
 
     def ghost_state(self) -> np.ndarray | None:
-        """Return the ghost's state (21,) now, if any; it begins every lap with the pilot, but in a race."""
+        """Return the ghost's state (21,) now, if any.
+
+        It begins every lap with the pilot, except in a race.
+        """
         log = self.now.log
         if self.ghost and self.is_race:
             return self.ghost.state_at(0, log.time_s)
@@ -161,7 +165,7 @@ class Session:
         return self.ghost and self.ghost.state_at(laps, log.time_s - lap_start_s)
 
     def _opponent_w(self) -> np.ndarray:
-        """Return where the opponent of a race is before and after the next step, (2, 3); NaN without one."""
+        """Return the opponent's positions before and after the next step, (2, 3); NaN without."""
         if self.ghost is None or not self.is_race:
             return np.full((2, 3), np.nan, np.float32)
         times_s = (self.now.log.time_s, self.now.log.time_s + self.step_s)
@@ -170,7 +174,7 @@ class Session:
         )
 
     def notes(self) -> str:
-        """Return what the picture says besides its bar: best lap, gap to the ghost, how to start."""
+        """Return the picture's text besides its bar: best lap, gap to the ghost, how to start."""
         lap_times_s = [time_s for flight in self.flights for time_s in flight.lap_times_s]
         lines = [f"best {min(lap_times_s):.2f} s"] if lap_times_s else []
         if self.ghost and self.now.gap is not None:

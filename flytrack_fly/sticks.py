@@ -62,6 +62,9 @@ def move_by_keys(sticks: np.ndarray, pulls: np.ndarray, is_full: bool, dt_s: flo
 
 
 def command_of(sticks: np.ndarray, hover: float) -> np.ndarray:
-    """Return the command (4,) of sticks (4,): the throttle's middle is ``hover``, its ends are -1 and 1."""
+    """Return the command (4,) of sticks (4,).
+
+    Throttle: the middle is ``hover``, the ends are -1 and 1.
+    """
     thrust = hover + sticks[3] * (1.0 - hover if sticks[3] > 0.0 else 1.0 + hover)
     return np.array([*sticks[:3], thrust], np.float32)

@@ -1,4 +1,4 @@
-"""From what a simulation gets wrong to a better policy: fly, diagnose it, extend, retrain, fly again."""
+"""From a simulation's errors to a better policy: fly, diagnose, extend, retrain, fly again."""
 
 from flytrack_loop.loop import Loop, Settings, close_loop
 from flytrack_loop.stages import Errors, Gap, Stage, errors_of, fly_log, race, train_stage

@@ -1,4 +1,4 @@
-"""The loop: collect, fit, train, fly, diagnose that flight, extend the model, retrain, fly again."""
+"""The loop: collect, fit, train, fly, diagnose the flight, extend the model, retrain, fly again."""
 
 import json
 from collections.abc import Callable
@@ -25,7 +25,10 @@ STREAMS = ("collect", "train", "race_log", "held_out_log", "evaluation")
 
 @dataclass(frozen=True)
 class Settings:
-    """What the loop flies and how noisy its logs are. The policy itself observes the plant's state."""
+    """What the loop flies, and how noisy its logs are.
+
+    The policy itself observes the plant's state.
+    """
 
     minutes: float = 2.0
     """Minutes of excitation."""
@@ -66,7 +69,9 @@ def close_loop(
     report: Callable[[str], None] = print,
     start: ModelParameters | None = None,
 ) -> Loop:
-    """Close the loop on a plant; write logs, models, diagnosis, trainings and ``loop.json`` into ``out``.
+    """Close the loop on a plant.
+
+    Logs, models, diagnosis, trainings and ``loop.json`` are written into ``out``.
 
     plant: a black box, or any ``flytrack_env.plants.Plant``. config: of both trainings. report:
     called with a line per step. start: the model to fit from, and how it moves; the nominal one,

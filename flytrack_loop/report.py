@@ -1,4 +1,4 @@
-"""The loop's results for people: a table, rollouts, pictures, and a recording of flights before and after."""
+"""The loop's results: a table, rollouts, pictures, and a recording of flights before and after."""
 
 from pathlib import Path
 
@@ -71,9 +71,10 @@ def fly_one(stage: Stage, env: EpisodicEnvironment, seed: int) -> Rollout:
 
 
 def write_flights(out: Path, loop: Loop, plant: Plant, seed: int) -> list[Path]:
-    """Write a flight of each policy on the plant and in its simulator, from the same start; return the files.
+    """Write a flight of each policy on the plant and in its simulator; return the files.
 
-    Rollouts, pictures of them, and where Rerun is installed a recording of all.
+    All flights begin at the same start. The files are rollouts, pictures of them, and where Rerun
+    is installed a recording of all.
     """
     start, track = seeds_of(seed)["evaluation"], load_track(loop.before.checkpoint.track)
     flights = {

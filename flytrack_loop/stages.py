@@ -1,4 +1,4 @@
-"""A stage of the loop: a model, the policy trained on it, how both hold on the plant, logs of its flights."""
+"""A stage of the loop: a model, its policy, their results on the plant, and logs of flights."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,7 +34,7 @@ class Errors(NamedTuple):
 
 
 class Gap(NamedTuple):
-    """The same policy in the simulator that it learnt in and on the plant, from the same noisy starts.
+    """The same policy in its simulator and on the plant, from the same noisy starts.
 
     simulator, plant: the race there.
     """
@@ -44,7 +44,7 @@ class Gap(NamedTuple):
 
     @property
     def lap_percent(self) -> float:
-        """How much longer a flying lap takes on the plant than in the simulator, %; NaN without laps."""
+        """How much longer a flying lap takes on the plant than simulated, %; NaN without laps."""
         return 100.0 * (self.plant.flying_lap_s / self.simulator.flying_lap_s - 1.0)
 
 
@@ -79,7 +79,7 @@ def errors_of(model: ModelParameters, log: FlightLog) -> Errors:
 def race(
     checkpoint: Checkpoint, env: EpisodicEnvironment, seed: int, episodes: int = NUM_EPISODES
 ) -> Score:
-    """Return how a policy races from perturbed starts: share that finishes 3 laps, mean lap times."""
+    """Return a policy's results from perturbed starts: share that finishes 3 laps, lap times."""
     keys, params = start_keys(seed, episodes), with_model_as_given(env.default_params)
     return score(race_many(env, checkpoint.policy, keys, NUM_STEPS, NUM_LAPS, params))
 
@@ -114,7 +114,7 @@ def fly_log(
 def log_of_flights(
     flights: Rollout, dt: float, seed: int, seconds: float, noise: float
 ) -> FlightLog:
-    """Return flights, leaves (num_flights, num_steps, ...), as ``fly_log`` does; seed: of the noise."""
+    """Return flights, leaves (num_flights, num_steps, ...), as a log; seed: of the noise."""
     is_flying = np.asarray(flights.is_flying)
     kept: list[tuple[np.ndarray, np.ndarray]] = []
     for states, actions, flown in zip(flights.states, flights.actions, is_flying, strict=True):
@@ -124,8 +124,8 @@ def log_of_flights(
             kept.append((np.asarray(states)[flown], np.asarray(actions)[flown]))
     if not kept:
         raise ValueError(
-            f"policy: found {len(is_flying)} flights of at most {is_flying.sum(axis=1).max()} steps, "
-            f"expected one of {FEWEST_ROWS} or more"
+            f"policy: found {len(is_flying)} flights of at most "
+            f"{is_flying.sum(axis=1).max()} steps, expected one of {FEWEST_ROWS} or more"
         )
     log = log_of_states(kept, dt, f"{len(kept)} flights of the policy")
     if noise > 0.0:

@@ -1,10 +1,11 @@
 """A hidden drone's equations, and those of its effects; it moves in one of three ways.
 
-- handout: the handout's step. Rates after the step turn the drone, the force acts in the attitude before it.
+- handout: the handout's step. Rates after the step turn the drone, the force acts in the attitude
+  before it.
 - semi_implicit: the same, but the force acts in the attitude after the step.
-- fine: a differential equation. Delays and lags are exact for held commands; attitude, velocity and position
-  follow by the midpoint rule in parts of 1 ms or less, cut where a delayed command or an instant of a late
-  sensor falls. What the sensors say is true at an instant, not of a step.
+- fine: a differential equation. Delays and lags are exact for held commands; attitude, velocity and
+  position follow by the midpoint rule in parts of 1 ms or less, cut where a delayed command or an
+  instant of a late sensor falls. What the sensors say is true at an instant, not of a step.
 
 An effect acts at a stage: commands, body rates, thrust, forces. Its function takes its parameters
 and returns a hook, a function of the drone and the value so far: sticks (roll, pitch, yaw, thrust)
@@ -257,7 +258,10 @@ FORCE_EFFECTS = {
 
 
 class Start(NamedTuple):
-    """The start of a flight, at rest in the air: position, m; heading, rad; voltage without load, V."""
+    """The start of a flight, at rest in the air.
+
+    pos_w: m. heading: rad. open_v: voltage without load, V.
+    """
 
     pos_w: Vector
     heading: float
@@ -266,7 +270,10 @@ class Start(NamedTuple):
 
 
 class Felt(NamedTuple):
-    """What an inertial sensor feels: specific force, m/s^2; body rates, rad/s; their slopes, rad/s^2."""
+    """What an inertial sensor measures.
+
+    force_b: specific force, m/s^2. rates_b: body rates, rad/s. slopes_b: of the rates, rad/s^2.
+    """
 
     force_b: Vector
     rates_b: Vector
@@ -282,7 +289,11 @@ class Tracked(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A part of a step: has the delayed command arrived before it, does a sensor read at its end?"""
+    """A part of a step.
+
+    is_new: whether the delayed command has arrived before it. is_felt, is_tracked: whether the
+    inertial sensor or motion capture reads at its end.
+    """
 
     length_s: float
     is_new: bool
@@ -310,7 +321,10 @@ class HiddenDrone:
         centre_w: Vector = (0.0, 0.0, 0.0),
         settle_s: float = 0.0,
     ):
-        """duration_s, centre_w: of the flight, for effects outside the list. settle_s: before its log."""
+        """Place the drone at a start.
+
+        duration_s, centre_w: of the flight, for effects outside the list. settle_s: before its log.
+        """
         self.truth, self.duration_s, self.centre_w = truth, duration_s, centre_w
         self.pos_w, self.vel_w, self.acc_w = start.pos_w, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         self.quat: Quaternion = (
@@ -462,9 +476,9 @@ class HiddenDrone:
                 self.tracked = Tracked(self.pos_w, self.vel_w, self.quat)
 
     def _arriving(self, sticks: Sticks) -> tuple[Sticks, Sticks]:
-        """Return what acts in the first ``_late_share`` of a step in which sticks are sent, and in the rest.
+        """Return the sticks that act in the first ``_late_share`` of a step, and in its rest.
 
-        Before the first command that one acts.
+        sticks: sent in this step; those of the first step act as if they had been held before.
         """
         self.past = tuple(
             tuple(where(self.has_flown, old, new) for old, new in zip(command, sticks, strict=True))
@@ -483,7 +497,7 @@ class HiddenDrone:
         self.force_b, self.rates_b = self.felt[:2]
 
     def _glide(self, sticks: Sticks, part_s: float) -> Vector:
-        """Move on by a part of a step, by the midpoint rule; return the body rates in its middle."""
+        """Advance by a part of a step with the midpoint rule; return the rates in its middle."""
         half_s, pos_w, vel_w, quat = 0.5 * part_s, self.pos_w, self.vel_w, self.quat
         self.part_s = part_s
         self._pass_noise(part_s)

@@ -85,7 +85,7 @@ def _attitude(shape: Any, drone: Any) -> Number:
 
 
 def _heating(shape: Any, drone: Any) -> float:
-    """Return half of a temperature that follows the square of the thrust; it is kept in the drone."""
+    """Return half of a temperature that follows the squared thrust; the drone stores it."""
     now = drone.time_s
     last, warmth = getattr(drone, "heat", (now, 0.0))
     warmth += -math.expm1(-(now - last) / shape["warming_s"]) * (
@@ -96,7 +96,7 @@ def _heating(shape: Any, drone: Any) -> float:
 
 
 def _payload(shape: Any, drone: Any) -> Vector:
-    """Return how far a pendulum with the drone's acceleration is off, world, over its usual swing."""
+    """Return a hanging payload's horizontal offset, world, over the length of its string."""
     now = drone.time_s
     last, off, speed = getattr(drone, "swing", (now, (0.0,) * 3, (0.0,) * 3))
     step_s, stiffness = now - last, GRAVITY / shape["string_m"]
@@ -138,7 +138,7 @@ def noise_hook(process: FirstOrderNoise, size: float, channel: str) -> Callable[
 
 
 def vector_hook(outside: Outside) -> Callable[[Any], Vector]:
-    """Return a hook that adds a force, body, m/s^2, or body rates, rad/s; not of kind "stochastic"."""
+    """Return a hook that adds force, m/s^2, or rates, rad/s, body; not for "stochastic"."""
     size, shape = outside.amplitude * SCALES[outside.channel], outside.shape
     if outside.kind == "payload":
         return lambda drone: to_body(drone.rows, scale(size, _payload(shape, drone)))

@@ -1,4 +1,4 @@
-"""Hidden drones as plants that an environment can fly: the equations of ``drone``, traced by JAX."""
+"""Hidden drones as plants for an environment: the equations of ``drone``, traced by JAX."""
 
 from typing import Any, NamedTuple
 
@@ -30,7 +30,7 @@ START = Start((0.0, 0.0, 0.0), 0.0, 0.0, 0.0)  # every number of it is replaced
 
 
 class HiddenState(NamedTuple):
-    """A hidden drone in flight: what of a ``HiddenDrone`` its next step depends on, a scalar per leaf."""
+    """A hidden drone in flight: what its next step depends on, a scalar per leaf."""
 
     pos_w: Vector
     vel_w: Vector
@@ -104,7 +104,10 @@ class HiddenPlant(Plant):
     def step(
         self, state: HiddenState, command: Action, dt: Scalar, model: ModelParameters
     ) -> HiddenState:
-        """Return the plant 0.01 s later under a held command in [-1, 1]; ``dt``, ``model`` are not used."""
+        """Return the plant 0.01 s later under a held command in [-1, 1].
+
+        ``dt`` and ``model`` are not used.
+        """
         hidden = self._hidden(state)
         hidden.step(
             tuple(jnp.clip(jnp.asarray(stick, jnp.float32), -1.0, 1.0) for stick in command)

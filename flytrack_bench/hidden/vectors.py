@@ -67,7 +67,7 @@ def to_body(rows: tuple[Vector, ...], vector_w: Vector) -> Vector:
 
 
 def integrate_attitude(quat: Quaternion, rates_b: Vector, step_s: float) -> Quaternion:
-    """Return the attitude after a step at body rates, rad/s: first order as in the handout, normalised."""
+    """Return the attitude after a step at body rates, rad/s, to first order as in the handout."""
     w, x, y, z = quat
     half = 0.5 * step_s
     roll, pitch, yaw = half * rates_b[0], half * rates_b[1], half * rates_b[2]
