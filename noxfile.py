@@ -42,7 +42,9 @@ for env_id in (*ENVIRONMENTS, *RACES):
     key = jax.random.key(0)
     env.step(key, env.reset(key, params)[1], env.action_space(params).sample(key), params)
 for env_id in ENVIRONMENTS:
-    envs = gymnasium.make_vec(f"flytrack_env:{env_id}", num_envs=3, vectorization_mode="vector_entry_point")
+    envs = gymnasium.make_vec(
+        f"flytrack_env:{env_id}", num_envs=3, vectorization_mode="vector_entry_point"
+    )
     assert envs.reset(seed=0)[0].shape == envs.step(envs.action_space.sample())[0].shape
 """
 MISSING_EXTRA_IS_NAMED = """
@@ -68,7 +70,9 @@ save_rollout("flight.npy", *map(np.asarray, ghost_rollout(ghost, 400)))
 RENDER = """
 import gymnasium
 from gymnasium.wrappers import RecordVideo
-film, window = (gymnasium.make("flytrack_env:FlyTrack-v0", render_mode=m) for m in ("rgb_array", "human"))
+film, window = (
+    gymnasium.make("flytrack_env:FlyTrack-v0", render_mode=mode) for mode in ("rgb_array", "human")
+)
 for env in (RecordVideo(film, "videos", lambda number: True, video_length=30), window):
     env.reset(seed=0)
     env.step(env.action_space.sample())
@@ -140,7 +144,10 @@ def built() -> tuple[Path, Path]:
 
 @nox.session(tags=["wheel"])
 def contents(session: nox.Session) -> None:
-    """The wheel has the packages' files; the source distribution has every tracked file but firmware/."""
+    """Check the files of the packages.
+
+    The wheel has the packages' files; the source distribution has every tracked file but firmware/.
+    """
     listed = subprocess.run(
         ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
     )
@@ -179,7 +186,7 @@ def wheel(session: nox.Session, extra: str) -> None:
 @nox.session(tags=["versions"], python=["3.11", "3.12", "3.13"])
 @nox.parametrize("resolution", ["highest", "lowest-direct"])
 def versions(session: nox.Session, resolution: str) -> None:
-    """Run the unit tests with the newest allowed versions, and on the oldest Python with the oldest."""
+    """Run the unit tests with the newest versions, and on the oldest Python with the oldest."""
     if resolution == "lowest-direct" and session.python != "3.11":
         session.skip("the oldest versions are tried on the oldest Python alone")
     session.install(".[train,sysid,viz]", *TEST_TOOLS, "--resolution", resolution)

@@ -14,7 +14,7 @@ RETURN_MARGIN, GATE_MARGIN = 2.5, 1.0
 
 
 def measure(seed: int) -> Outcome:
-    """Train and return the results of the episodes at the beginning and at the end of the training."""
+    """Train and return the results of the first and of the last episodes of the training."""
     envs: Any = RecordEpisodeStatistics(gymnasium.make_vec("flytrack_env:FlyTrack-v0", NUM_ENVS))
     envs = NormalizeReward(NormalizeObservation(envs))
     observations, _ = envs.reset(seed=seed)

@@ -39,7 +39,7 @@ def evaluate(problem: GymnaxProblem, network: Any, problem_state: Any) -> tuple[
 
 
 def evolve(seed: int, num_generations: int = 200) -> tuple[GymnaxProblem, Any, Any]:
-    """Return the problem, the variables of the strategy's mean, and how observations are normalised."""
+    """Return the problem, the strategy's mean and the normalisation of observations."""
     problem = make_problem()
     key, init_key = jax.random.split(jax.random.key(seed))
     solution = problem.sample(init_key)

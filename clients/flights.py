@@ -58,7 +58,7 @@ def mean_gates(
 
 
 def outcome_of(done: Any, returns: Any, gates: Any) -> Outcome:
-    """Return the mean results of the episodes that ended in the first and in the last tenth of a training.
+    """Return mean results of the episodes that ended in the first and last tenth of a training.
 
     Of every step, (num_updates, ...): whether an episode ended, and its return and gates where it
     did.

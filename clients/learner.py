@@ -25,7 +25,7 @@ class Network(nn.Module):
 
 
 def begin(key: jax.Array, observations: Any) -> tuple[Any, Any]:
-    """Return a training: variables of a network for such observations, and the optimiser's memory."""
+    """Return the variables of a network for these observations, and the optimiser's state."""
     variables = Network().init(key, observations)
     return variables, OPTIMIZER.init(variables)
 

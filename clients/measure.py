@@ -29,7 +29,10 @@ HEADER = "client | seed | return before | return after | gates before | gates af
 
 
 def main(seeds: int = 5) -> None:
-    """Measure every client with so many seeds, print and write the table; exit 1 if one misses a margin."""
+    """Measure every client with ``seeds`` seeds; print and write the table.
+
+    Exits with status 1 if a client misses a margin.
+    """
     reached, rows = dict.fromkeys(CLIENTS, 0), []
     for name, client in CLIENTS.items():
         for seed in range(seeds):
@@ -41,7 +44,8 @@ def main(seeds: int = 5) -> None:
             print(*rows[-1], sep=", ", flush=True)
     figures = [
         report.Figure(
-            f"{name}: seeds that gain {client.RETURN_MARGIN:g} in return and {client.GATE_MARGIN:g} in gates",
+            f"{name}: seeds that gain {client.RETURN_MARGIN:g} in return "
+            f"and {client.GATE_MARGIN:g} in gates",
             "100 %",
             f"{reached[name] / seeds:.0%}",
             seeds,

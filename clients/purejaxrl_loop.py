@@ -1,4 +1,4 @@
-"""A loop in the style of PureJaxRL on FlyTrack-v0: one compiled scan, with gymnax's own ``LogWrapper``."""
+"""A PureJaxRL-style loop on FlyTrack-v0: one compiled scan, with gymnax's own ``LogWrapper``."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ RETURN_MARGIN, GATE_MARGIN = 5.0, 2.0
 
 
 def measure(seed: int) -> Outcome:
-    """Train and return the results of the episodes at the beginning and at the end of the training."""
+    """Train and return the results of the first and of the last episodes of the training."""
     env, params = gymnax.make("FlyTrack-v0")
     env = LogWrapper(env)
 

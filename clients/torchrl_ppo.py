@@ -17,7 +17,7 @@ NUM_ENVS, NUM_STEPS, NUM_UPDATES, NUM_EPOCHS, MINIBATCH = 256, 64, 60, 4, 512
 
 
 def measure(seed: int) -> Outcome:
-    """Train and return the results of the episodes at the beginning and at the end of the training."""
+    """Train and return the results of the first and of the last episodes of the training."""
     torch.set_num_threads(1)  # more threads compete with those of JAX
     torch.manual_seed(seed)
     envs = gymnasium.make_vec("flytrack_env:FlyTrack-v0", NUM_ENVS, autoreset_mode="SameStep")

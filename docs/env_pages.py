@@ -17,7 +17,9 @@ INFO = {  # its keys that are not causes of termination
     "gates_passed": "gates passed in this episode",
     "laps": "laps completed; a lap is as many gates as the track has, wherever the episode began",
     "lap_completed": "whether a lap was completed in this step",
-    "lap_time_s": "time of the last complete lap, interpolated at the crossing, s; 0 before the first",
+    "lap_time_s": (
+        "time of the last complete lap, interpolated at the crossing, s; 0 before the first"
+    ),
     "gate_distance_m": "distance to the centre of the next gate, m",
     "terminated": "as returned",
     "truncated": "as returned",

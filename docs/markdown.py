@@ -32,7 +32,10 @@ def sentence(docstring: str | None) -> str:
 
 
 def field_texts(record: Any) -> dict[str, str]:
-    """Return what a class's docstring says of its fields, each "name: text." or "name, name: text."."""
+    """Return what a class's docstring says of its fields.
+
+    Its body describes them as "name: text." or "name, name: text.".
+    """
     body = one_line(record.__doc__.partition("\n\n")[2])
     parts = re.split(r"(?:^|(?<=[.;] ))((?:[a-z_*/]+(?:, )?)+): ", body)
     return {

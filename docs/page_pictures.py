@@ -46,7 +46,7 @@ def strong(effect: Effect) -> dict[str, float]:
 
 
 def measured(model: ModelParameters) -> np.ndarray:
-    """Return what the sensors of a model say on the flight, (NUM_STEPS, 4, 3), in the order of ``PANELS``."""
+    """Return what the model's sensors read on the flight, (NUM_STEPS, 4, 3), as in ``PANELS``."""
 
     def fly(state, command):  # type: ignore[no-untyped-def]
         moved = move(*state, unpack_action(command), STEP_S, model)

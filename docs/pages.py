@@ -53,7 +53,7 @@ def notebook_page(name: str) -> str:
 
 
 def with_links(markdown: str, path: str, page: str) -> str:
-    """Return the Markdown of a file of the repository with its links as ``page`` of the site needs them."""
+    """Rewrite the links in the Markdown of a repository file for its place at ``page``."""
 
     def rewrite(match: re.Match[str]) -> str:
         text, target, anchor = match.group(1), match.group(2), match.group(3) or ""

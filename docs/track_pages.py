@@ -21,7 +21,7 @@ def about(name: str) -> str:
 
 
 def gate_rows(track: Track) -> list[tuple[Gate, float, float, float]]:
-    """Return gates with yaw and heading, degrees in [0, 360), and the distance to the next one, m."""
+    """Return gates with yaw and heading, degrees in [0, 360), and distance to the next gate, m."""
     positions = np.array([gate.position for gate in track.gates])
     distances = np.linalg.norm(np.roll(positions, -1, axis=0) - positions, axis=1)
     rows = []
