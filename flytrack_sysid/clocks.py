@@ -68,7 +68,10 @@ class ClockOffset(NamedTuple):
 
 
 class _Stretch(NamedTuple):
-    """A stretch without gaps: start, end and block of its windows, the change over each, the rate by time."""
+    """A stretch of a log without gaps, and its windows.
+
+    starts, ends, block: of each window. change: over each window. rate, integral: by time.
+    """
 
     starts: np.ndarray
     ends: np.ndarray
@@ -78,7 +81,10 @@ class _Stretch(NamedTuple):
     block: np.ndarray
 
     def differences(self, offset_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the change, the integrated rate at an offset and its slope by the offset, centred."""
+        """Return the change, the integrated rate and its slope, each centred.
+
+        The rate is integrated over windows moved by an offset; the slope is by this offset.
+        """
         starts, ends = self.starts - offset_s, self.ends - offset_s
         integral = self.integral(ends) - self.integral(starts)
         slope = self.rate(starts) - self.rate(ends)
@@ -104,7 +110,7 @@ PAIRS = (
 
 
 def _without_spikes(values: np.ndarray) -> np.ndarray:
-    """Return values (num_rows, n) with lone ones, far from what both neighbours say, put in between these."""
+    """Return values (num_rows, n) with isolated spikes replaced by the mean of their neighbours."""
     between = 0.5 * (values[:-2] + values[2:])
     off = np.pad(np.abs(values[1:-1] - between), ((1, 1), (0, 0)))
     usual = np.median(off[1:-1], axis=0)
@@ -145,7 +151,10 @@ def _cost(stretches: list[_Stretch], offset_s: float) -> float:
 
 
 def _sums(stretches: list[_Stretch], offset_s: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return Gauss-Newton's numerator and denominator of each block, (num_blocks,), and the correlation."""
+    """Return Gauss-Newton's numerator and denominator by block, and the correlation.
+
+    Numerator and denominator are (num_blocks,).
+    """
     numerator, denominator, products = [], [], np.zeros(3)
     for stretch in stretches:
         change, integral, slope = stretch.differences(offset_s)
@@ -234,7 +243,9 @@ def align_clocks(log: FlightLog, correct: bool = True) -> tuple[FlightLog, tuple
 
 
 def on_one_clock(log: FlightLog) -> tuple[FlightLog, np.ndarray, list[str]]:
-    """Return a log, which of its rows it still has, (num_rows,) bool, and a sentence on each clock corrected.
+    """Return a log on one clock, which of its rows are kept, and a note on each corrected clock.
+
+    The rows that are kept are (num_rows,) bool.
 
     Velocity is compared with the accelerometer as attitude is with the gyro: half a step of a
     simulator, and a latency of both inertial sensors, are no clocks apart. Position is compared
@@ -268,7 +279,7 @@ def on_one_clock(log: FlightLog) -> tuple[FlightLog, np.ndarray, list[str]]:
 def with_causal_commands(
     log: FlightLog, model: ModelParameters
 ) -> tuple[FlightLog, np.ndarray, list[str]]:
-    """Return a log whose commands come before the turns they cause, the rows it still has, and a sentence.
+    """Return a log whose commands come before the turns they cause, the rows kept, and notes.
 
     model: its mean lag of roll and pitch is what remains between commands and turns, in whole rows,
     where the commands were late.
@@ -289,7 +300,7 @@ def with_causal_commands(
     log = replace(log, channels={**log.channels, "u": log["u"][source]})
     note = (
         f"the clock of the commands was about {1e3 * late * step_s:.0f} ms late: the drone turned "
-        f"{-1e3 * lag_s:.0f} ms before it was told to; corrected so that the model's lag remains, which this "
-        "log cannot show"
+        f"{-1e3 * lag_s:.0f} ms before it was told to; corrected so that the model's lag remains, "
+        "which this log cannot show"
     )
     return log.select(kept), kept, [note]

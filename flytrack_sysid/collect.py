@@ -40,7 +40,7 @@ class CollectError(ValueError):
 def states_flown(
     plant: Plant, model: ModelParameters, start: jax.Array, command: jax.Array
 ) -> jax.Array:
-    """Return the states (T + 1, 21) that commands (T, 4) lead to, from a start (21,), that one included."""
+    """Return the states (T + 1, 21) that commands (T, 4) lead to from a start (21,), included."""
 
     def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
         return plant.step(state, unpack_action(action), DT_S, model), pack(plant.drone(state))
@@ -98,7 +98,11 @@ def _fly_any(plant: Plant | StepFunction, report: Report) -> Fly:
 
 
 def find_hover(fly: Fly, middle_v: float = MIDDLE_V) -> float:
-    """Return the thrust action that holds the weight, level at rest at a voltage; else raise CollectError."""
+    """Return the thrust action at which a plant, level and at rest, holds its weight.
+
+    Raises:
+        CollectError: the plant does not sink at thrust -1 and climb at 1.
+    """
     actions = np.linspace(-1.0, 1.0, 41)
     rng = np.random.default_rng(0)
     starts = np.stack(
@@ -110,8 +114,8 @@ def find_hover(fly: Fly, middle_v: float = MIDDLE_V) -> float:
     if not (climb[0] < 0.0 < climb[-1]):
         found = f"{climb[0]:.3g} and {climb[-1]:.3g} m/s^2"
         raise CollectError(
-            f"plant: found vertical accelerations of {found} at thrust -1 and 1, level at {middle_v:g} V; "
-            "expected it to sink and to climb"
+            f"plant: found vertical accelerations of {found} at thrust -1 and 1, level at "
+            f"{middle_v:g} V; expected it to sink and to climb"
         )
     above = int(np.argmax(climb > 0.0))
     return float(np.interp(0.0, climb[above - 1 : above + 1], actions[above - 1 : above + 1]))
@@ -182,7 +186,7 @@ def _cut(
     heights: tuple[float, float],
     voltages: tuple[float, float],
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the part of each flight before it leaves the envelope, without those of less than two rows."""
+    """Return each flight up to where it leaves the envelope; leave out those below two rows."""
     inside = excitation.is_inside(states, heights, voltages)
     lengths = np.where(inside.all(axis=1), states.shape[1], np.argmin(inside, axis=1))
     kept = [

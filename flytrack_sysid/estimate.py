@@ -72,7 +72,10 @@ def _in_line(values: np.ndarray) -> np.ndarray:
 
 
 class Windows(NamedTuple):
-    """The windows of a level: the rows in line where they begin, and what counts, (all rows, axes)."""
+    """The windows of a level.
+
+    starts: the rows in line where windows begin. counts: what counts, (all rows, axes).
+    """
 
     starts: np.ndarray
     counts: np.ndarray
@@ -102,7 +105,7 @@ class Windows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Channels(Problem):
-    """A log and the residuals of its channels, in the axes and windows that the table of this module says.
+    """A log and the residuals of its channels, in the axes and windows of this module's table.
 
     noise: (NUM_AXES, 2), a standard deviation each. levels: the windows of turns, forces and
     battery. has_position: of forces, the level is position and not velocity.
@@ -113,7 +116,7 @@ class Channels(Problem):
 
     @classmethod
     def of_log(cls, log: FlightLog, judged: np.ndarray, model: ModelParameters) -> "Channels":
-        """Return the judged rows of a log, (num_rows,) bool, for a model and the effects that it has."""
+        """Return the judged rows of a log, (num_rows,) bool, for a model and its effects."""
         tau, has_position = (
             np.asarray(model.tau, float),
             "p" in log and "q" in log and "v" not in log,
@@ -124,7 +127,7 @@ class Channels(Problem):
         return replace(cls.of(lanes, model, ()), levels=_levels(lanes), has_position=has_position)
 
     def residuals(self, vectors: np.ndarray) -> np.ndarray:
-        """Return residuals of models, (num_models, rows, lanes, NUM_AXES, 2); 0 where nothing counts."""
+        """Return residuals, (num_models, rows, lanes, NUM_AXES, 2); 0 where nothing counts."""
         found = super().residuals(vectors)
         for left in found:
             in_line = self._of_channels(_in_line(left))
@@ -166,7 +169,10 @@ class Channels(Problem):
         return left / self.noise[axes]
 
     def spread(self, vector: np.ndarray) -> np.ndarray:
-        """Return the rms that a model leaves, (NUM_AXES, 2), with what was taken out counted as fitted."""
+        """Return the rms residuals of a model, (NUM_AXES, 2).
+
+        The means and slopes taken out of windows count as fitted.
+        """
         number = self.counts.sum(axis=(0, 1))
         for axes, windows in zip(AXES, self.levels, strict=True):
             number[axes, 1] -= windows.num_used() * (
@@ -193,7 +199,10 @@ class Channels(Problem):
 def _counts(
     lanes: Lanes, judged: np.ndarray, certain: np.ndarray, has_position: bool
 ) -> np.ndarray:
-    """Return what counts of judged rows; certain: where applied actions are known, (rows, lanes, 4)."""
+    """Return what counts of judged rows.
+
+    certain: where applied actions are known, (rows, lanes, 4).
+    """
     source = lanes.record.source_row
     is_judged = judged[source] & (source >= 0) & (lanes.row >= 0)
     is_judged[: lead_in_of(len(is_judged))] = False
@@ -212,7 +221,10 @@ def _counts(
 
 
 def _levels(lanes: Lanes) -> tuple[Windows, ...]:
-    """Return the windows of levels: pieces, cut where doubt of commands ends; flights, of the voltage."""
+    """Return the windows of levels.
+
+    Those of voltage are flights; others are pieces, cut where doubt of commands ends.
+    """
     joined, counts = _in_line(lanes.is_joined), _in_line(lanes.counts[..., 1]).astype(float)
     is_cut = np.diff(_in_line(lanes.record.piece), prepend=-1) != 0
     found = []
@@ -225,7 +237,7 @@ def _levels(lanes: Lanes) -> tuple[Windows, ...]:
 
 
 def _covariance(found: Linearization) -> np.ndarray:
-    """Return the covariance of the parameters, widened where residuals within a flight are correlated.
+    """Return the parameters' covariance, widened where residuals within a flight are correlated.
 
     That of independent residuals of the noise assumed, in which each standard deviation is raised
     to that of the cluster-robust (sandwich) estimate over pieces of a flight, if that is larger:
@@ -244,7 +256,7 @@ def _covariance(found: Linearization) -> np.ndarray:
 
 
 def _acting(found: Linearization, free: tuple[str, ...], may_be_idle: bool) -> list[int]:
-    """Return the places of parameters on which something depends; others would lead a search astray.
+    """Return the indices of parameters that residuals depend on; others mislead a search.
 
     Wind, say, acts only once there is some drag; what is idle after the first round too is refused.
     """
@@ -261,7 +273,7 @@ def _acting(found: Linearization, free: tuple[str, ...], may_be_idle: bool) -> l
 
 
 def _polished(problem: Problem, vector: np.ndarray, places: list[int], steps: int) -> Linearization:
-    """Return where the slope of the cost, and not only its change, is rounding: so many full steps on.
+    """Take up to ``steps`` full steps, so that the cost's slope, not only its change, is rounding.
 
     The cost is flat at its least, so that a search which compares costs ends where the order of
     summation decides: another number of threads, another model.

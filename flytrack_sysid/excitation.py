@@ -1,4 +1,4 @@
-"""Excitation: short flights that excite one axis at a time, from chosen states (docs/identification.md).
+"""Excitation: short flights from chosen states that excite one axis each (docs/identification.md).
 
 Four flights of a kind follow each other, so that the last of every four can be held out
 (``flytrack_sysid.split``) and every kind is in both parts.
@@ -47,7 +47,10 @@ def is_inside(
     heights: tuple[float, float] = HEIGHTS,
     voltages: tuple[float, float] = VOLTAGES,
 ) -> np.ndarray:
-    """Return where states (..., 21) are within the envelope, heights in m, voltages in V; NaN is not."""
+    """Return where states (..., 21) are within the envelope; NaN is outside.
+
+    heights: in m. voltages: in V.
+    """
     height, battery_v = states[..., layout.POSITION][..., 2], states[..., layout.BATTERY]
     is_slow = np.linalg.norm(states[..., layout.VELOCITY], axis=-1) <= LARGEST_SPEED
     is_charged = (battery_v >= voltages[0]) & (battery_v <= voltages[1])
@@ -63,7 +66,10 @@ class ScriptedFlight(NamedTuple):
 
 
 def wave(name: str, rng: np.random.Generator) -> np.ndarray:
-    """Return a sine, step, doublet or chirp of amplitude 1, (SLOT_STEPS,), random in phase or timing."""
+    """Return a sine, step, doublet or chirp of amplitude 1, (SLOT_STEPS,).
+
+    Its sign is random, and so is its frequency (sine) or its timing (step, doublet).
+    """
     time = np.arange(SLOT_STEPS) * DT_S
     duration = SLOT_STEPS * DT_S
     sign = rng.choice([-1.0, 1.0])
@@ -80,7 +86,10 @@ def wave(name: str, rng: np.random.Generator) -> np.ndarray:
 def switching(
     rng: np.random.Generator, smallest: float = 1.0, hold_steps: tuple[int, int] = FAST_STEPS
 ) -> np.ndarray:
-    """Return a command that changes sign every so many steps, (FLIGHT_STEPS,), of sizes ``smallest`` to 1."""
+    """Return a command that changes sign at random intervals, (FLIGHT_STEPS,).
+
+    Its sizes are ``smallest`` to 1. hold_steps: the shortest and the longest interval.
+    """
     holds = rng.integers(*hold_steps, size=FLIGHT_STEPS, endpoint=True)
     signs = rng.choice([-1.0, 1.0]) * (-1.0) ** np.arange(FLIGHT_STEPS)
     return np.repeat(signs * rng.uniform(smallest, 1.0, FLIGHT_STEPS), holds)[:FLIGHT_STEPS]
@@ -101,7 +110,7 @@ def start_at(
 def start_state(
     rng: np.random.Generator, voltage: float, hover: float, tilt_deg: float, speed: float
 ) -> np.ndarray:
-    """Return a start (21,) with the thrust action ``hover``, tilted and moving in random directions."""
+    """Return a start (21,) at thrust action ``hover``, tilted and moving in random directions."""
     side, heading, yaw = rng.uniform(-np.pi, np.pi, 3)
     tilt = Rotation.from_rotvec(np.deg2rad(tilt_deg) * np.array([np.cos(side), np.sin(side), 0.0]))
     climb = rng.uniform(-0.3, 0.3)
@@ -112,7 +121,7 @@ def start_state(
 def _axis_command(
     axis: int, turn: int, number: int, hover: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return two waves on one axis; kinds of waves alternate by turn, amplitudes cycle by number."""
+    """Return two waves on one axis; their kinds alternate by turn, amplitudes cycle by number."""
     names = ("chirp", "step") if turn % 2 == 0 else ("doublet", "sine")
     command = np.tile([0.0, 0.0, 0.0, hover], (FLIGHT_STEPS, 1))
     for slot, name in enumerate(names):

@@ -1,4 +1,4 @@
-"""Identification of a model from a flight log: lags, thrust map, battery drain, and chosen effects."""
+"""Identify a model from a flight log: lags, thrust map, battery drain, and chosen effects."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -60,7 +60,10 @@ class Interval(NamedTuple):
 
 
 class MapUncertainty(NamedTuple):
-    """The largest uncertainty of the thrust map: half the 95 % interval, N, and as a share of full thrust."""
+    """The largest uncertainty of the thrust map.
+
+    half_width_n: half the 95 % interval, N. share: of full thrust.
+    """
 
     half_width_n: float
     share: float
@@ -127,8 +130,8 @@ class Fit:
         if self.map_uncertainty is not None:
             worst = self.map_uncertainty
             lines.append(
-                f"thrust map: known to {worst.half_width_n:.3g} N ({worst.share:.2%} of full thrust) or "
-                f"better; worst at action {worst.action:.2g}, {worst.battery_v:.3g} V"
+                f"thrust map: known to {worst.half_width_n:.3g} N ({worst.share:.2%} of full "
+                f"thrust) or better; worst at action {worst.action:.2g}, {worst.battery_v:.3g} V"
             )
         lines += [f"warning: {warning}" for warning in self.warnings]
         return "\n".join(lines)
@@ -137,7 +140,7 @@ class Fit:
 def _free_names(
     model: ModelParameters, log: FlightLog, fixed: Mapping[str, float]
 ) -> tuple[str, ...]:
-    """Return what is estimated: lags, thrust map, drain and effects, as far as the log has the channels."""
+    """Return what the log's channels can estimate of lags, thrust map, drain and effects."""
     names = names_of(model)
     unknown = [name for name in fixed if name not in names]
     if unknown:
@@ -169,7 +172,10 @@ def _intervals(result: Estimate) -> dict[str, Interval]:
 
 
 def _map_uncertainty(result: Estimate, log: FlightLog) -> MapUncertainty | None:
-    """Return the largest uncertainty over all actions and the battery's voltages, or the log's if others."""
+    """Return the largest uncertainty over all actions and voltages.
+
+    Voltages are the battery's, or the log's where it was flown at others.
+    """
     where = [index for index, name in enumerate(result.free) if name in THRUST_COEFFS]
     if not where:
         return None
@@ -203,7 +209,8 @@ def _warnings(
             found.append(f"{name} is not determined by the data: {low:.3g} to {high:.3g} s")
         elif "." in name and low <= (neutral := neutral_value(name)) <= high:
             found.append(
-                f"{name} cannot be told from {neutral:g}: {low:.3g} to {high:.3g} {range_of(name).unit}"
+                f"{name} cannot be told from {neutral:g}: {low:.3g} to {high:.3g} "
+                f"{range_of(name).unit}"
             )
     if uncertainty is not None and uncertainty.share > UNCERTAIN_THRUST:
         half_width_n, share, action, battery_v = uncertainty
@@ -213,12 +220,13 @@ def _warnings(
         )
         found.append(
             f"the thrust map is not determined by the data everywhere: +-{half_width_n:.3g} N "
-            f"({share:.0%} of full thrust) at action {action:.2g}, {battery_v:.4g} V; the log commands "
-            f"{thrust.min():.2g} to {thrust.max():.2g}{volts}"
+            f"({share:.0%} of full thrust) at action {action:.2g}, {battery_v:.4g} V; the log "
+            f"commands {thrust.min():.2g} to {thrust.max():.2g}{volts}"
         )
     if "v_bat" not in log:
         found.append(
-            "v_bat is absent: how thrust depends on the voltage, and the drain, are taken as they were"
+            "v_bat is absent: how thrust depends on the voltage, and the drain, are taken as they "
+            "were"
         )
     return found
 
@@ -231,7 +239,7 @@ def what_is_fitted(
     every: int = HELD_OUT_EVERY,
     motion: Motion | None = None,
 ) -> tuple[ModelParameters, tuple[str, ...], np.ndarray]:
-    """Return the model that a fit starts from, the names of what it estimates and the rows that it sees.
+    """Return the model a fit starts from, the names that it estimates and the rows that it uses.
 
     Arguments and what is raised are those of ``fit``, which calls this before any work.
     """
@@ -263,7 +271,9 @@ def fit(
     report: Callable[[int, int], None] = lambda done, rounds: None,
     motion: Motion | None = None,
 ) -> Fit:
-    """Identify lags, thrust map and battery drain from a log; mass, gravity and full-stick rates are given.
+    """Identify lags, thrust map and battery drain from a log.
+
+    Mass, gravity and full-stick rates are given.
 
     start: initial values, also of what is not estimated; nominal if None. fixed: values of
     parameters that are not estimated, by name (``tau_yaw``, ``c4``, ``linear_drag.d_x``, ...).
@@ -316,19 +326,23 @@ def _check_data(log: FlightLog, judged: np.ndarray, free: tuple[str, ...]) -> No
     has_forces = "f" in log or ("q" in log and any(name in log for name in ("a", "v", "p")))
     if not has_forces and any(name in free for name in (TAUS[3], *THRUST_COEFFS)):
         raise FitError(
-            f"{log.source}: thrust needs f, or q with one of a, v and p; found {', '.join(log.channels)}"
+            f"{log.source}: thrust needs f, or q with one of a, v and p; found "
+            f"{', '.join(log.channels)}"
         )
     for axis, (column, tau) in enumerate(zip(CHANNELS["u"], TAUS, strict=True)):
         stick = log["u"][judged, axis]
         if tau in free and np.ptp(stick) < NEVER_MOVED:
             raise FitError(
-                f"{log.source}: {column}: stuck at {stick[0]:.4g}; {tau} cannot be identified: move "
-                f"it, or fix {tau} (--fix {tau}=VALUE)"
+                f"{log.source}: {column}: stuck at {stick[0]:.4g}; {tau} cannot be identified: "
+                f"move it, or fix {tau} (--fix {tau}=VALUE)"
             )
 
 
 def _check_response(log: FlightLog, start: ModelParameters) -> None:
-    """Raise FitError where no body rate follows its command: motors off, on the ground, another log."""
+    """Raise FitError where no body rate follows its command.
+
+    Possible reasons: motors that are off, a drone on the ground, rates of another log.
+    """
     if "w" not in log:
         return
     answers = []
@@ -362,8 +376,9 @@ def _check_result(result: Estimate, log: FlightLog, judged: np.ndarray) -> None:
             and not TAU_RANGE.low * AT_BOUND < values[name] < TAU_RANGE.high / AT_BOUND
         ):
             raise FitError(
-                f"{log.source}: {name}: the fit ended at {values[name]:.3g} s, expected {TAU_RANGE.low} to "
-                f"{TAU_RANGE.high} s; {_likely_cause(log, name)}; --fix {name}=VALUE holds it"
+                f"{log.source}: {name}: the fit ended at {values[name]:.3g} s, expected "
+                f"{TAU_RANGE.low} to {TAU_RANGE.high} s; {_likely_cause(log, name)}; --fix "
+                f"{name}=VALUE holds it"
             )
     for name in (name for name in result.free if "." in name):
         low, high, unit = range_of(name)
@@ -381,6 +396,7 @@ def _check_result(result: Estimate, log: FlightLog, judged: np.ndarray) -> None:
             )
             if TAUS[axis] in result.free and left > AT_BOUND * measured:
                 raise FitError(
-                    f"{log.source}: {column}: the model leaves more ({left:.3g} rad/s rms) than was measured "
-                    f"({measured:.3g}); do sign and order of {CHANNELS['u'][axis]} and {column} agree?"
+                    f"{log.source}: {column}: the model leaves more ({left:.3g} rad/s rms) than "
+                    f"was measured ({measured:.3g}); do sign and order of {CHANNELS['u'][axis]} "
+                    f"and {column} agree?"
                 )

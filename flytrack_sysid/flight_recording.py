@@ -14,7 +14,7 @@ def write_flight_recording(
     models: Mapping[str, ModelParameters],
     residuals: Traces | None = None,
 ) -> str:
-    """Write a log and what models make of it as a Rerun recording; return why not, "" if it was written.
+    """Write a log and models' flights as a Rerun recording; return why not, "" if written.
 
     models, residuals: as for ``trajectories.trajectories_of``. Where nothing is written, a file of
     that name is removed: it would pass for this log's.

@@ -69,7 +69,7 @@ IN_STATE = {  # where a channel is in the handout's state
 
 
 class LogError(ValueError):
-    """A flight log that cannot be used; the message names file, row and column, found and expected."""
+    """A flight log that cannot be used; the message says file, row, column, found and expected."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,10 @@ class FlightLog:
 
     @cached_property
     def sha256(self) -> str:
-        """The hash of the rows: the same in memory and in any file, and whatever is stated of them."""
+        """The hash of the rows, the same in memory and in any file.
+
+        What is stated of the rows does not change it.
+        """
         digest = hashlib.sha256()
         segment = np.cumsum(self.is_start())
         for name, values in (

@@ -1,4 +1,6 @@
-"""Files of flight logs: ``.npz`` and ``.csv``, checked when read; the same log gives the same bytes.
+"""Files of flight logs, ``.npz`` and ``.csv``, checked when read.
+
+The same log gives the same bytes.
 
 Columns of numbers are read from CSV files of any source, gzip-compressed ones too; every refusal
 names the place.
@@ -40,7 +42,7 @@ LONGEST_ROW = 2**16  # characters: thousands of columns
 
 
 def load_log(path: str | Path) -> FlightLog:
-    """Return the log in an ``.npz`` or ``.csv`` file; the suffix says which. Nothing is ever unpickled.
+    """Return the log in an ``.npz`` or ``.csv`` file; the suffix says which. Nothing is unpickled.
 
     Without a column ``segment``, all rows are one. Quaternions come back with norm 1. Raises
     LogError, whose message names file, row and column; rows count from 0, lines of a CSV file from
@@ -73,7 +75,7 @@ def save_log(path: str | Path, log: FlightLog) -> None:
 
 
 def check_name(path: str | Path) -> None:
-    """Raise LogError for a file that ``save_log`` would refuse by its name, before there is a log."""
+    """Raise LogError for a file name that ``save_log`` would refuse, before there is a log."""
     if Path(path).suffix.lower() not in SUFFIXES:
         raise LogError(
             f"{path}: found suffix {Path(path).suffix!r}, expected {' or '.join(SUFFIXES)}"
@@ -90,12 +92,13 @@ def gaps_of(log: FlightLog) -> np.ndarray:
 
 
 def describe(log: FlightLog) -> str:
-    """Return a few lines on a log: who flew it, how long, how often, what was measured, what is missing."""
+    """Return a few lines on a log: origin, duration, sample interval, gaps, channels, ranges."""
     inside = ~log.is_start()[1:]
     steps = np.diff(log.time)
     absent = [name for name in CHANNELS if name not in log]
     lines = [
-        f"{log.source}: {len(log)} rows, {log.is_start().sum()} segments, {steps[inside].sum():.2f} s",
+        f"{log.source}: {len(log)} rows, {log.is_start().sum()} segments, "
+        f"{steps[inside].sum():.2f} s",
         f"origin: {log.origin or 'not marked'}",
         f"channels: {', '.join(log.channels)}; absent: {', '.join(absent) or 'none'}",
     ]
@@ -112,7 +115,7 @@ def describe(log: FlightLog) -> str:
 
 
 def _ranges(log: FlightLog) -> list[str]:
-    """Return lines on what was covered: commands, and speeds, heights, tilts, voltages where measured."""
+    """Return lines on ranges: commands, and measured speeds, heights, tilts and voltages."""
     commands = [
         f"{column} {values.min():.3g} to {values.max():.3g}"
         for column, values in zip(CHANNELS["u"], log["u"].T, strict=True)
@@ -163,7 +166,10 @@ def _csv_of(columns: dict[str, np.ndarray]) -> bytes:
 
 @contextlib.contextmanager
 def open_csv(path: Path, delimiter: str = ",") -> Iterator[Any]:
-    """Yield the ``csv.reader`` of a file, unpacked if its name ends in .gz; errors become LogErrors."""
+    """Yield the ``csv.reader`` of a file, unpacked if its name ends in .gz.
+
+    Errors become LogErrors.
+    """
     rows = None
     try:
         with open_file(path, LARGEST_BYTES) as file:
@@ -199,7 +205,9 @@ def _lines(text: io.TextIOWrapper, most_characters: int) -> Iterator[str]:
 
 
 def read_columns(path: Path, rows: Any, header: list[str], wanted: Iterable[str]) -> Table:
-    """Return the wanted columns of the rows after the header, which has each of them, less blank ones.
+    """Return the wanted columns of the rows after the header; blank rows are skipped.
+
+    header: has each of the wanted columns.
 
     Raises: LogError: a row of another length, a cell that is no finite number, more than
         LARGEST_VALUES numbers.

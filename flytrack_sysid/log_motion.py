@@ -14,7 +14,10 @@ HOW_TO_MARK = f"a column {MEASURED!r} says it: 1 for a real drone, 0 for a simul
 
 
 def required_motion(log: FlightLog, requested: Motion | None = None) -> Motion | None:
-    """Return the motion to replay a log with: the requested one, else continuous if measured, else None."""
+    """Return the motion to replay a log with; None if neither requested nor measured.
+
+    The requested one comes first; a measured log is continuous.
+    """
     if requested is not None:
         return requested
     return Motion.CONTINUOUS if log.origin == "measured" else None
@@ -32,7 +35,8 @@ def motion_notes(
     required, notes = required_motion(log, requested), []
     if log.origin == "measured" and required not in (None, Motion.CONTINUOUS):
         notes.append(
-            f"motion: {required.value} was requested, but {log.source} is measured: drones move continuously"
+            f"motion: {required.value} was requested, but {log.source} is measured: drones move "
+            "continuously"
         )
     if model is not None and required is not None and model.motion is not required:
         why = "as requested" if requested is not None else f"since {log.source} is measured"
@@ -41,8 +45,8 @@ def motion_notes(
         )
     if log.origin is None and requested is None:
         notes.append(
-            f"motion: {otherwise}, since {log.source} does not say whether a drone or a simulator flew; "
-            f"{HOW_TO_MARK}; measured logs are replayed as continuous"
+            f"motion: {otherwise}, since {log.source} does not say whether a drone or a simulator "
+            f"flew; {HOW_TO_MARK}; measured logs are replayed as continuous"
         )
     return notes
 

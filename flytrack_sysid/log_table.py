@@ -46,7 +46,10 @@ class Table(NamedTuple):
     def check(
         self, is_good: np.ndarray, column: str, expected: str, values: np.ndarray | None = None
     ) -> None:
-        """Raise LogError about the first row that is not good; values: found there, those of the column."""
+        """Raise LogError about the first row that is not good.
+
+        values: found there; those of the column if None.
+        """
         if not is_good.all():
             row = int(np.argmin(is_good))
             found = self.columns[column] if values is None else values
@@ -65,7 +68,10 @@ class Table(NamedTuple):
 
 
 def check_names(source: str, names: Sequence[str]) -> None:
-    """Raise LogError unless the names make up a flight log: each known, once, none missing of a vector."""
+    """Raise LogError unless the names make up a flight log.
+
+    Each is known and occurs once, and none of a vector is missing.
+    """
     for name in names:
         if name not in COLUMNS:
             near = difflib.get_close_matches(name[:LONGEST_NAME].lower(), COLUMNS, n=1)
@@ -92,7 +98,7 @@ def check_names(source: str, names: Sequence[str]) -> None:
 
 
 def columns_of(time: np.ndarray, channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the columns of time and of channels, (num_rows, n) each, in the order of ``CHANNELS``."""
+    """Return the columns of time and channels (num_rows, n), in the order of ``CHANNELS``."""
     columns = {"t": time}
     for name, names in CHANNELS.items():
         if name in channels:
@@ -177,7 +183,10 @@ def _stated_voltages(table: Table) -> tuple[float, float] | None:
     if low is None or high is None:  # both, by ``check_names``
         return None
     if not 0.0 < low < high:
-        found = f"found {low:g} to {high:g} V, expected a lowest voltage above 0 and a highest above that"
+        found = (
+            f"found {low:g} to {high:g} V, expected a lowest voltage above 0 and a highest above "
+            "that"
+        )
         raise table.error(0, ", ".join(STATED_VOLTAGES), found)
     return low, high
 

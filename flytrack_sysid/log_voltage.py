@@ -20,7 +20,7 @@ DECIMALS = 3  # of a battery's voltages, V: sensors have two
 
 
 def with_voltage(log: FlightLog, model: ModelParameters) -> FlightLog:
-    """Return a log that has a voltage: where neither logged nor stated, that of the model's battery."""
+    """Return a log with a voltage; that of the model's battery if neither logged nor stated."""
     if "v_bat" in log or log.stated_voltage_v is not None:
         return log
     return replace(
@@ -29,7 +29,10 @@ def with_voltage(log: FlightLog, model: ModelParameters) -> FlightLog:
 
 
 def assumed_voltage(log: FlightLog) -> float:
-    """Return the voltage of a log without ``v_bat``, V: the middle of what is stated, or the handout's."""
+    """Return the voltage of a log without ``v_bat``, V.
+
+    It is the middle of what is stated, or else of the handout's battery.
+    """
     low, high = log.stated_voltage_v or (BATTERY_EMPTY_V, BATTERY_FULL_V)
     return 0.5 * (low + high)
 
@@ -52,7 +55,7 @@ def is_within(voltages: tuple[float, float], battery: Battery) -> bool:
 
 
 def battery_of_craft(log: FlightLog, battery: Battery) -> Battery:
-    """Return the battery of the craft that flew a log: the model's, unless the log was flown at others.
+    """Return the battery of a log's craft: the model's, unless the log was flown at others.
 
     Then it goes from the highest voltage of the log down to the lowest, or, of a log that hardly
     drains it, by as large a share as the model's battery does.
@@ -65,13 +68,13 @@ def battery_of_craft(log: FlightLog, battery: Battery) -> Battery:
 
 
 def fitted_battery(log: FlightLog, battery: Battery) -> Battery:
-    """Return the battery of the craft that flew a log, with a thrust map that was fitted to the log."""
+    """Return the battery of a log's craft, with a thrust map that was fitted to the log."""
     low, high = flown_voltages(log) if "v_bat" in log else (assumed_voltage(log),) * 2
     return battery_of_craft(log, battery)._replace(fitted_low_v=low, fitted_high_v=high)
 
 
 def voltage_notes(log: FlightLog, battery: Battery) -> list[str]:
-    """Return which voltage is assumed where none was logged, and where a log is not of a model's battery.
+    """Return notes on an assumed voltage, and on a voltage beyond the model's battery.
 
     Args:
         log: as it was given, without a voltage that the model lent it.
@@ -86,8 +89,8 @@ def voltage_notes(log: FlightLog, battery: Battery) -> list[str]:
         )
         low, high = log.stated_voltage_v or (float(battery.empty_v), float(battery.full_v))
         notes.append(
-            f"v_bat is absent: {log.source} is taken as flown at {0.5 * (low + high):.4g} V, the middle of "
-            f"{lender} ({low:.4g} to {high:.4g} V)"
+            f"v_bat is absent: {log.source} is taken as flown at {0.5 * (low + high):.4g} V, the "
+            f"middle of {lender} ({low:.4g} to {high:.4g} V)"
         )
         if log.stated_voltage_v is None:
             return notes
@@ -99,7 +102,8 @@ def voltage_notes(log: FlightLog, battery: Battery) -> list[str]:
             else "is outside"
         )
         notes.append(
-            f"voltage: {log.source} was flown at {low:.4g} to {high:.4g} V, which {overlap} the model's "
-            f"battery, {battery.describe()} (thrust map of {battery.describe_fitted()}); is it of this craft?"
+            f"voltage: {log.source} was flown at {low:.4g} to {high:.4g} V, which {overlap} the "
+            f"model's battery, {battery.describe()} (thrust map of {battery.describe_fitted()}); "
+            "is it of this craft?"
         )
     return notes

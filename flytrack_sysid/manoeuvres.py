@@ -46,7 +46,7 @@ Flight = Callable[[int, float, np.random.Generator], tuple[np.ndarray, np.ndarra
 
 
 class Manoeuvre(NamedTuple):
-    """A manoeuvre: how to fly it on a real drone, and its flights by number, for a hovering thrust."""
+    """A manoeuvre: how to fly it on a real drone, and its flights by number and hover action."""
 
     how: str
     flight: Flight
@@ -79,7 +79,7 @@ def _start(
 
 
 def _swing(hover: float, size: float, rng: np.random.Generator) -> np.ndarray:
-    """Return centred sticks and a thrust that oscillates slowly about hovering, (FLIGHT_STEPS, 4)."""
+    """Return centred sticks and a thrust that oscillates slowly about hover, (FLIGHT_STEPS, 4)."""
     command = np.zeros((excitation.FLIGHT_STEPS, 4))
     time = np.arange(excitation.FLIGHT_STEPS) * excitation.DT_S
     command[:, 3] = hover + size * np.sin(2 * np.pi * SWING_HZ * time + rng.uniform(0, 2 * np.pi))
@@ -178,7 +178,7 @@ def _voltages(number: int, hover: float, rng: np.random.Generator) -> tuple[np.n
 def hover_action(
     model: ModelParameters, voltages: tuple[float, float] = excitation.VOLTAGES
 ) -> float:
-    """Return the thrust action at which a model's thrust curve holds its weight, half-way between voltages.
+    """Return the thrust action at which a model's thrust holds its weight, at the mean voltage.
 
     The nearest end of the stick if none does. Effects are ignored: they matter little to where a
     flight starts.

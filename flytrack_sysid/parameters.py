@@ -38,7 +38,10 @@ def names_of(model: ModelParameters) -> tuple[str, ...]:
 
 
 def base_of(model: ModelParameters) -> tuple[str, ...]:
-    """Return what every fit frees: lags, unless an effect takes their place, thrust map, drain, the craft."""
+    """Return what every fit frees: lags, thrust map, drain, and parameters of the craft.
+
+    Lags are left out where an effect takes their place.
+    """
     every = [effect_of(parameters) for parameters in model.effects]
     taus = () if any("respond" in effect.hooks for effect in every) else TAUS
     craft = [f"{effect.name}.{field}" for effect in every for field in effect.search.fitted]
@@ -75,7 +78,7 @@ def from_vector(vector: Any, like: ModelParameters) -> ModelParameters:
 
 
 def in_batches(program: Callable[[np.ndarray], Any], values: np.ndarray, size: int) -> np.ndarray:
-    """Return what a program, compiled for so many values at once, makes of all, (num_values, ...)."""
+    """Run a program, compiled for ``size`` values at once, on all of them, (num_values, ...)."""
     parts = []
     for begin in range(0, len(values), size):
         part = values[begin : begin + size]

@@ -59,7 +59,7 @@ class Windows(NamedTuple):
         return values[self.ends] - values[self.starts]
 
     def mean_of(self, log: FlightLog, values: np.ndarray) -> np.ndarray:
-        """Return the mean over each window of values (num_rows, n), which change linearly in between."""
+        """Return the mean over each window of values (num_rows, n), linear between rows."""
         steps = np.diff(log.time)[:, None] * 0.5 * (values[1:] + values[:-1])
         integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
         return self.change_of(integral) / self.durations[:, None]
@@ -109,7 +109,7 @@ def agreement(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> tuple[flo
 
 
 def slope_of(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> float:
-    """Return the factor from the change of one quantity to the integral of its rate, nan if none is clear."""
+    """Return the ratio of the integral of a rate to a change; NaN if none is clear."""
     correlation, slope = agreement(log, change, rate)
     return slope if correlation >= LEAST_CORRELATION else np.nan
 
@@ -139,13 +139,19 @@ def _length(log: FlightLog) -> Iterator[str]:
     duration = np.diff(log.time)[~log.is_start()[1:]].sum()
     if len(log) < FEWEST_ROWS or duration < SHORTEST_S:
         expected = f"expected at least {FEWEST_ROWS} rows and {SHORTEST_S:g} s"
-        yield f"t: found {len(log)} rows and {duration:.3g} s, {expected}: too short to tell anything from"
+        yield (
+            f"t: found {len(log)} rows and {duration:.3g} s, {expected}: too short to tell "
+            "anything from"
+        )
 
 
 def _commands(log: FlightLog) -> Iterator[str]:
     if np.ptp(log["u"], axis=0).max() <= STILL:
         found = ", ".join(f"{value:g}" for value in log["u"][0])
-        yield f"{_columns('u')}: found {found} in every row, expected commands that move: they look stuck"
+        yield (
+            f"{_columns('u')}: found {found} in every row, expected commands that move: they look "
+            "stuck"
+        )
 
 
 def _motion(log: FlightLog) -> Iterator[str]:
@@ -169,12 +175,15 @@ def _attitude(log: FlightLog) -> Iterator[str]:
     windows = windows_of(log, WINDOWS_S[-1])
     turn = np.linalg.norm(windows.mean_of(log, log["w"]), axis=1) * windows.durations
     if np.ptp(log["q"], axis=0).max() <= STILL and len(turn) and turn.max() > LEAST_TURN:
-        found = f"found the same in every row while {_columns('w')} turn by {turn.max():.2g} rad in a second"
+        found = (
+            f"found the same in every row while {_columns('w')} turn by {turn.max():.2g} rad in a "
+            "second"
+        )
         yield f"{_columns('q')}: {found}: the attitude looks stuck"
 
 
 def _pairs(log: FlightLog) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return what measures one motion twice: the channels, and of each pair a change and its rate."""
+    """Return pairs of channels that measure one motion, as a change and its rate."""
     pairs = {}
     if "q" in log:
         attitude = Rotation.from_quat(log["q"], scalar_first=True)
@@ -197,7 +206,10 @@ def _changed(
 
 
 def _rolled(quat: np.ndarray, signs: np.ndarray, step: int) -> np.ndarray:
-    """Return quaternions in another order, (num_rows, 4), with some components negated before and after."""
+    """Return quaternions (num_rows, 4) in another order.
+
+    Some components are negated before and after.
+    """
     return np.roll(quat * signs, step, axis=1) * signs
 
 
@@ -239,7 +251,8 @@ CONVENTIONS: tuple[tuple[str, str, Callable[[FlightLog], FlightLog]], ...] = (
     ),
     (
         "q",
-        "has body axes and world turned: this looks like the other of flu and frd, and of z_up and ned",
+        "has body axes and world turned: this looks like the other of flu and frd, and of z_up and "
+        "ned",
         _changed("q", _as_quaternions(lambda attitude: HALF_TURN * attitude * HALF_TURN)),
     ),
     *(
@@ -291,7 +304,10 @@ def _conventions(log: FlightLog) -> Iterator[str]:
                 f"{name} correlate by {before[name]:.2f}" for name in names.split(", ")
             )
             agree = "; or if ".join(dict.fromkeys(readings))
-            yield f"{_columns(channel)}: found motion that contradicts itself ({shown}); it agrees if {agree}"
+            yield (
+                f"{_columns(channel)}: found motion that contradicts itself ({shown}); it agrees "
+                f"if {agree}"
+            )
             return
 
 
@@ -334,7 +350,7 @@ def _force(log: FlightLog) -> Iterator[str]:
 
 
 def _force_unit(log: FlightLog) -> Iterator[str]:
-    """Compare the size of the specific force with that by the velocity, or with what keeps a drone up."""
+    """Compare the size of specific force with that by velocity, or with what keeps a drone up."""
     windows = windows_of(log, WINDOWS_S[0])
     if len(windows.starts) < FEWEST_WINDOWS:
         return
@@ -372,7 +388,10 @@ def _battery(log: FlightLog) -> Iterator[str]:
         low, high = LIKELY_BATTERY_V
         units = [unit for factor, unit in BATTERY_UNITS.items() if low <= found / factor <= high]
         guess = f"this looks like {' or '.join(units)}" if units else "no battery has that"
-        yield f"v_bat: found a median of {found:.5g}, expected at most {HIGHEST_BATTERY_V:g} V: {guess}"
+        yield (
+            f"v_bat: found a median of {found:.5g}, expected at most {HIGHEST_BATTERY_V:g} V: "
+            f"{guess}"
+        )
 
 
 CHECKS: tuple[Callable[[FlightLog], Iterator[str]], ...]
@@ -401,7 +420,7 @@ def find_problems(log: FlightLog) -> list[str]:
 
 
 def check_plausible(log: FlightLog) -> None:
-    """Raise LogError unless a log may be of a flight; the message lists the problems, a line each."""
+    """Raise LogError unless a log may be of a flight; the message has one line for each problem."""
     problems = find_problems(log)
     if problems:
         raise LogError("\n".join(problems))

@@ -1,4 +1,4 @@
-"""What a model predicts of a flight log, in float64: one step from every row, and free flight from some."""
+"""A model's predictions of a log, in float64: steps from every row, and free flights from some."""
 
 import operator
 from typing import Any, NamedTuple
@@ -55,7 +55,10 @@ class Prediction(NamedTuple):
 
 
 def runs_of(rows: np.ndarray, record: Record) -> list[tuple[int, int]]:
-    """Return the runs of judged rows within a flight, as first row and end; rows: (num_rows,) bool."""
+    """Return the runs of judged rows within a flight, as first row and end.
+
+    rows: (num_rows,) bool, those that are judged.
+    """
     follows = np.append(False, rows[1:] & rows[:-1] & ~record.begins[1:])[: len(rows)]
     starts = np.flatnonzero(rows & ~follows)
     ends = np.flatnonzero(rows & ~np.append(follows[1:], False)[: len(rows)]) + 1
@@ -70,7 +73,7 @@ def judged_steps(rows: np.ndarray, prediction: Prediction) -> np.ndarray:
 
 
 def inputs_that_lack(model: ModelParameters, log: FlightLog) -> dict[str, tuple[str, ...]]:
-    """Return, for every channel that a model predicts, the channels it needs and the log does not have.
+    """Return, for each channel that a model predicts, the channels it needs but the log lacks.
 
     One without forces beside thrust needs no velocity to predict the specific force.
     """
@@ -112,7 +115,7 @@ def _step_from_every_row(
 
 
 def predict(model: ModelParameters, filled: Filled) -> Prediction:
-    """Return the model's step from every row of a log, from the measured state under the logged command.
+    """Return a model's step from every row of a log, from the measured state and logged command.
 
     The applied action is the log's; without it, it follows the commands from the segment's start
     on.
@@ -156,7 +159,7 @@ def _fly(
 def free_flights(
     prediction: Prediction, starts: np.ndarray, seen: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return flights of the model by itself from measured rows under the logged commands: p, v, q, w.
+    """Return free flights from measured rows under the logged commands: p, v, q, w.
 
     starts: (num_starts,) rows. seen: (num_starts, num_seen) later rows, at which it returns them,
     (num_starts, num_seen, size), units of the log; beyond the log's end the last command is held.

@@ -1,4 +1,4 @@
-"""Errors of a model on a measured flight: of one step by channel, of free flight, of thrust by action."""
+"""Errors of a model on a measured flight: one step by channel, free flight, thrust by action."""
 
 from typing import Any, NamedTuple
 
@@ -22,7 +22,9 @@ UNITS = {"p": "m", "v": "m/s", "q": "1", "w": "rad/s", "a": "m/s^2", "f": "m/s^2
 BY_CHANGE, BY_SPREAD = "measured change in one step", "measured channel's spread"
 NORMALISED_BY = {**dict.fromkeys("pvq", BY_CHANGE), **dict.fromkeys("waf", BY_SPREAD)}
 NRMSE_MEANING = {
-    BY_CHANGE: "rmse over the rms of the measured change in one step: 1 is as good as 'nothing changes'",
+    BY_CHANGE: (
+        "rmse over the rms of the measured change in one step: 1 is as good as 'nothing changes'"
+    ),
     BY_SPREAD: "rmse over the standard deviation of the measured channel: 1 is as good as its mean",
 }
 # Free flight.
@@ -44,7 +46,9 @@ LEAST_VOLTAGE_RANGE = 0.1
 
 
 class ChannelError(NamedTuple):
-    """One-step errors of a channel, measured minus modelled; of q with the sign nearer to the measured one.
+    """One-step errors of a channel, measured minus modelled.
+
+    Those of q are with the sign that is nearer to the measured one.
 
     mse: mean over steps and components. nrmse: None where the measured channel never changes.
     angle_rms_deg: rms of the angle between measured and modelled attitude, deg; None but for q.
@@ -91,7 +95,10 @@ def predicted_channel(name: str, prediction: Prediction) -> np.ndarray:
 
 
 def turn_between(quats: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors, body frame, rad, that turn (num, 4) attitudes into others; (num, 3)."""
+    """Return the rotation vectors, (num, 3) rad, that turn attitudes (num, 4) into others.
+
+    They are in the body frame.
+    """
     first, second = (Rotation.from_quat(values, scalar_first=True) for values in (quats, others))
     return (first.inv() * second).as_rotvec()
 
@@ -163,7 +170,9 @@ class Rollout(NamedTuple):
 
 
 def _starts_and_ends(prediction: Prediction, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows to start from, (num_starts,), and those at the horizons, (num_starts, num_horizons).
+    """Return the rows to start from, and those at the horizons.
+
+    Shapes are (num_starts,) and (num_starts, num_horizons).
 
     An end is the row nearest to its horizon; -1 where the judged run ends before.
     """
@@ -223,7 +232,10 @@ def rollout_errors(prediction: Prediction, rows: np.ndarray) -> tuple[Rollout, .
 
 
 class ThrustError(NamedTuple):
-    """Measured minus modelled thrust; maps are (voltage bins, action bins), NaN where nothing flew, N."""
+    """Measured minus modelled thrust, N.
+
+    Maps are (voltage bins, action bins), NaN where nothing flew.
+    """
 
     source: str
     action_edges: np.ndarray
@@ -245,7 +257,9 @@ def _voltage_range(battery_v: np.ndarray, battery: Battery) -> tuple[float, floa
 
 
 def thrust_error(prediction: Prediction, rows: np.ndarray) -> ThrustError | None:
-    """Return the error of thrust of judged steps by applied action and voltage, by f, else a; None without.
+    """Return the thrust error of judged steps by applied action and voltage; None without any.
+
+    Thrust is measured by f, else by a.
 
     rows: (num_rows,) bool, those judged. Samples beyond an end are in its bin.
     """

@@ -81,7 +81,7 @@ def chunks_of(windows: Windows) -> list[Windows]:
 
 
 def make_windows(log: FlightLog, judged: np.ndarray, every_s: float, most: int) -> Windows:
-    """Return windows over judged rows, (num_rows,) bool, one every so many seconds, ``most`` at most.
+    """Return at most ``most`` windows over judged rows, (num_rows,) bool, one every ``every_s``.
 
     A window counts at the horizons that it reaches within rows that are judged and measured.
     """

@@ -186,7 +186,7 @@ def _padded(record: Record) -> Record:
 
 
 def is_applied_certain(record: Record, tau: np.ndarray) -> np.ndarray:
-    """Return where the applied action of a replay is known well enough to judge a model by, (num_rows, 4).
+    """Return where a replay's applied action is known well enough to judge by, (num_rows, 4).
 
     Doubt is from commands that were lost and from what was applied when a flight began; both are
     forgotten with the lags ``tau``, (4,) s.

@@ -22,7 +22,9 @@ from flytrack_sysid.record import Record
 
 
 class Step(NamedTuple):
-    """One replayed step: from ``before``, the drone as measured at ``row``, to ``moved.after``, as modelled.
+    """One replayed step.
+
+    It leads from ``before``, the drone as measured at ``row``, to ``moved.after``, as modelled.
 
     memories: of the effects, before the step.
     """
@@ -64,7 +66,7 @@ def replay(
     extras: Any = None,
     is_gyro_fed: bool = False,
 ) -> Any:
-    """Return what ``observe`` makes of the model's step from every row; differentiable in the model.
+    """Return what ``observe`` makes of a model's step from every row; differentiable in the model.
 
     gyro_b: (num_rows, 3) rad/s, with which a flight starts, or every step if ``is_gyro_fed``;
     without a gyro a flight starts with the rates of the sticks. observe: called with a step and the

@@ -20,7 +20,7 @@ class Samples(NamedTuple):
 
 
 def _brackets(times: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the rows before and after each of the times ``at``, and whether both are near, (num_at,) each.
+    """Return the rows before and after each time, and whether both are near, (num_at,) each.
 
     Near: at most three usual steps of the channel lie between the two rows.
     """
@@ -49,7 +49,7 @@ def interpolate(
 def interpolate_quaternions(
     times: np.ndarray, quat: np.ndarray, at: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return quaternions (num_at, 4) on the arc between their neighbours, and where they are known."""
+    """Return quaternions (num_at, 4) on the arcs between neighbours, and where they are known."""
     _, _, is_known = _brackets(times, at)
     if len(times) < 2:
         return np.tile(quat[:1], (len(at), 1)), is_known
@@ -58,7 +58,9 @@ def interpolate_quaternions(
 
 
 def hold(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the last of the values (num_rows, n) up to each time, as commands act, and where it is known.
+    """Return the last of the values (num_rows, n) up to each time, and where it is known.
+
+    Commands act like this.
 
     Known: not older than three usual steps of the channel. Returns (num_at, n), (num_at,) bool.
     """
@@ -76,7 +78,8 @@ def slow_channels(samples: Mapping[str, Samples]) -> list[str]:
         if step_s > SLOW_STEP_S and name != "v_bat":
             how = "held" if name in HELD else "interpolated"
             found.append(
-                f"{name} at {1.0 / step_s:.3g} Hz, {how} in between: faster dynamics do not show in it"
+                f"{name} at {1.0 / step_s:.3g} Hz, {how} in between: faster dynamics do not show "
+                "in it"
             )
     return found
 
@@ -84,7 +87,9 @@ def slow_channels(samples: Mapping[str, Samples]) -> list[str]:
 def on_one_base(
     samples: Mapping[str, Samples], base: np.ndarray
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return channels (num_base, n) at the times of the base, and where all are known, (num_base,) bool.
+    """Return channels (num_base, n) at the times of the base, and where all of them are known.
+
+    The latter is (num_base,) bool.
 
     Commands are held, attitudes interpolated on the arc, others linearly. The battery changes
     slowly: its ends are held, and gaps do not matter.

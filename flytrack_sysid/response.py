@@ -1,4 +1,4 @@
-"""Time from a step of a stick to half of the response, per axis: delay, lags and limits in one number."""
+"""Time from a stick step to half of the response, by axis: delay, lags and limits together."""
 
 from typing import Any
 
@@ -23,11 +23,12 @@ BATCH = 8  # models at once
 
 
 def half_response_s(model: ModelParameters, stick_step: float = SMALL_STEP) -> np.ndarray:
-    """Return the times from a step of roll, pitch, yaw and thrust to half of the steady change, (4,) s.
+    """Return the times, (4,) s, from a step of each stick to half of the steady change.
 
-    Of the body rates and the thrust, as a drone that moves continuously; its sensors' delays are
-    not in them. NaN where the response takes longer than 1.5 s, or there is none. stick_step: from
-    the centre, which for thrust is half a stick.
+    The sticks are roll, pitch, yaw and thrust; the responses are the body rates and the thrust of a
+    drone that moves continuously. Delays of its sensors are not included. NaN where the response
+    takes longer than 1.5 s, or there is none. stick_step: from the centre, which for thrust is half
+    a stick.
     """
     with jax.enable_x64(True):
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
@@ -35,7 +36,9 @@ def half_response_s(model: ModelParameters, stick_step: float = SMALL_STEP) -> n
 
 
 def half_responses(vectors: np.ndarray, like: ModelParameters, stick_step: float) -> np.ndarray:
-    """Return ``half_response_s`` of models as vectors, (num_models, 4) s; inside ``jax.enable_x64(True)``.
+    """Return ``half_response_s`` of models as vectors, (num_models, 4) s.
+
+    Call it inside ``jax.enable_x64(True)``.
 
     vectors: (num_models, parameters), in the order of ``parameters.names_of(like)``.
     """
@@ -58,7 +61,10 @@ def _of_model(model: ModelParameters, stick_step: jax.Array) -> jax.Array:
 
 
 def _of_stick(model: ModelParameters, stick: jax.Array, stick_step: jax.Array) -> jax.Array:
-    """Return the time of one stick, s, given as a row of the unit matrix, for a drone held in place."""
+    """Return the time of one stick, s, for a drone held in place.
+
+    stick: a row of the unit matrix.
+    """
     drone = _standing(model)
     has_loop = acts(model.effects, "respond")
     step_s = FRAME_S if has_loop else STEP_S
@@ -98,7 +104,10 @@ def _standing(model: ModelParameters) -> Drone:
 
 
 def _first_crossing(shares: jax.Array) -> jax.Array:
-    """Return after how many steps shares, (num_steps,) from the first step on, pass a half; NaN if never."""
+    """Return after how many steps shares, (num_steps,), first pass a half; NaN if never.
+
+    The first share is that after one step.
+    """
     shares = jnp.concatenate([jnp.zeros(1), shares])
     is_past = shares >= HALF
     place = jnp.argmax(is_past)

@@ -24,7 +24,7 @@ class ScriptError(ValueError):
 
 
 class Script(NamedTuple):
-    """Flights to be flown: names of manoeuvres (N,), starts (N, 21), commands (N, T, 4) per 0.01 s."""
+    """Flights to be flown: manoeuvre names (N,), starts (N, 21), commands (N, T, 4) per 0.01 s."""
 
     kinds: tuple[str, ...]
     starts: np.ndarray
@@ -38,7 +38,7 @@ def script_of(flights: Iterable[excitation.ScriptedFlight]) -> Script:
 
 
 def check_script(script: Script, source: str = "script") -> None:
-    """Raise ScriptError unless a script can be flown; the message names source, flight and array."""
+    """Raise ScriptError unless a script can be flown; the message says source, flight and array."""
     kinds, starts, commands = script
     number, (low, high) = len(kinds), excitation.SCRIPT_HEIGHTS
     is_shaped = starts.shape == (number, STATE_SIZE) and commands.shape[::2] == (

@@ -22,7 +22,9 @@ def blocks_of(log: FlightLog) -> np.ndarray:
 
 
 def cut_evenly(times: np.ndarray, is_first: np.ndarray, longest_s: float) -> np.ndarray:
-    """Return numbers of pieces, (num_rows,) int: stretches cut evenly into pieces of at most so many seconds.
+    """Return the number of each row's piece, (num_rows,) int.
+
+    Each stretch is cut evenly into pieces of at most ``longest_s``.
 
     is_first: (num_rows,) bool, where a stretch begins.
     """
@@ -37,7 +39,7 @@ def cut_evenly(times: np.ndarray, is_first: np.ndarray, longest_s: float) -> np.
 
 
 def held_out_rows(log: FlightLog, every: int = HELD_OUT_EVERY) -> np.ndarray:
-    """Return which rows are held out, (num_rows,) bool: the last of every ``every`` blocks; none if 0.
+    """Return held-out rows, (num_rows,) bool: the last of every ``every`` blocks; none if 0.
 
     Raises ValueError for 1, which leaves nothing, and below 0.
     """

@@ -18,7 +18,9 @@ TIME_ROUNDING_S = 1e-6
 
 
 class StepResponse(NamedTuple):
-    """One commanded step: the measured body rate, and that of the model flying freely from before it.
+    """One commanded step: the body rate as measured, and as modelled in free flight.
+
+    The free flight starts before the step.
 
     time_s, segment: where in the log. command_before, command_after: in [-1, 1]. since_step:
     (num_rows,) s. command: (num_rows,). measured, modelled: (num_rows,) rad/s. rms: of their
@@ -52,7 +54,7 @@ def _steps_in(time: np.ndarray, command: np.ndarray) -> np.ndarray:
 def _largest_steps(
     prediction: Prediction, rows: np.ndarray, axis: int
 ) -> list[tuple[int, int, int]]:
-    """Return the largest steps of an axis: first row shown, row of the step, end of the rows shown."""
+    """Return the largest steps of an axis: first row shown, row of the step, end of shown rows."""
     found, log = [], prediction.log
     command = log["u"][:, axis]
     for start, end in runs_of(rows, prediction.record):

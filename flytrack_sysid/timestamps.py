@@ -121,7 +121,10 @@ def read_clock(source: str, name: str, stamps: np.ndarray, are_events: bool = Fa
     steps = np.diff(stamps[rows])
     breaks = np.flatnonzero((steps <= 0.0) | (steps > max_gap_s)) + 1
     if len(breaks) > max(MIN_BREAKS, MAX_BREAK_FRACTION * len(rows)):
-        found = f"found {len(breaks)} jumps in {len(rows)} stamps, expected steps of up to {max_gap_s:.3g} s"
+        found = (
+            f"found {len(breaks)} jumps in {len(rows)} stamps, expected steps of up to "
+            f"{max_gap_s:.3g} s"
+        )
         raise LogError(f"{source}: time of {name}: {found}")
     times, is_kept, is_start, faults[ROLL_OVER] = _join_runs(
         stamps[rows], breaks, step_s, max_gap_s
@@ -195,7 +198,7 @@ def _join_runs(
 def _cheapest_joint(
     times: np.ndarray, tail: np.ndarray, head: np.ndarray, step_s: float, max_gap_s: float
 ) -> tuple[int, int, float] | None:
-    """Return the last row of the tail and the first of the head that fit each other, and the roll-over, s.
+    """Return the last row of the tail, the first of the head that fits it, and the roll-over, s.
 
     The pair leaves out the fewest rows; None if no pair fits.
     """
@@ -275,5 +278,5 @@ def _check_common(
 
 
 def number_segments(times: np.ndarray, max_gap_s: float) -> np.ndarray:
-    """Return the segment of each row, (num_rows,) int; a step above the longest gap begins the next."""
+    """Return the segment of each row, (num_rows,) int; a step above ``max_gap_s`` begins one."""
     return np.cumsum(np.diff(times, prepend=times[:1]) > max_gap_s)

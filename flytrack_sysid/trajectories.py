@@ -1,4 +1,4 @@
-"""A flight log as trajectories to record: as measured, and as models fly it. Needs ``flytrack[viz]``.
+"""Trajectories of a flight log, as measured and as models fly it. Needs ``flytrack[viz]``.
 
 At the measured drone are the specific forces that models do not explain, means over 0.1 s in the
 world frame. A model flies by itself under the logged commands, and starts anew from a measured row
@@ -85,7 +85,7 @@ def trajectories_of(
 
 
 def position_of(log: FlightLog) -> tuple[np.ndarray, str]:
-    """Return positions, (num_rows, 3) m, world, and a remark on their origin, "" where they were measured.
+    """Return world positions, (num_rows, 3) m, and a remark on their origin, "" if measured.
 
     Without them, the integrated velocity of each segment from 0 on; 0 without velocity, too.
     """
@@ -100,7 +100,7 @@ def position_of(log: FlightLog) -> tuple[np.ndarray, str]:
 
 
 def states_of(channels: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return channels, (..., size), as states with unit quaternions, (..., 21); NaN where one is absent."""
+    """Return channels (..., size) as states (..., 21), with unit quaternions; NaN if absent."""
     states = np.full((*next(iter(channels.values())).shape[:-1], STATE_SIZE), np.nan)
     for name in IN_STATE.keys() & channels.keys():
         states[..., IN_STATE[name]] = channels[name]
@@ -110,7 +110,9 @@ def states_of(channels: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def force_w(residuals: Traces, model: str, time_s: np.ndarray) -> np.ndarray:
-    """Return the specific force that a model does not explain, (num_rows, 3) m/s^2, world, means over 0.1 s.
+    """Return the specific force that a model does not explain, (num_rows, 3) m/s^2, world frame.
+
+    It is a mean over 0.1 s.
 
     NaN where nothing is judged. time_s: (num_rows,) of the log, as of ``time_in_line``.
     """
@@ -150,7 +152,7 @@ def _measured(timed: _Timed, name: str, residuals_w: Mapping[str, np.ndarray]) -
 
 
 def _starts_and_ends(prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows that free flights start from, one a second, and those where the next one takes over."""
+    """Return the rows where free flights start, one a second, and where the next one takes over."""
     log, can_start = prediction.log, prediction.is_settled & prediction.is_measured
     half_step = 0.5 * prediction.step_s
     edges = np.append(np.flatnonzero(log.is_start()), len(log))
@@ -166,7 +168,7 @@ def _starts_and_ends(prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _free_flight(timed: _Timed, name: str, model: ModelParameters) -> Trajectory | None:
-    """Return a model's free flight, anew every second; None where the log lacks what it starts from."""
+    """Return a model's free flight, restarted every second; None where the log lacks its start."""
     model = with_neutral_effects(model, BY_NAME)  # so that one program flies all models
     if inputs_that_lack(model, timed.log)["p"]:
         return None

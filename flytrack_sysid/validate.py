@@ -65,7 +65,7 @@ class Validation(NamedTuple):
 
 
 def _json_of(value: Any) -> Any:
-    """Return JSON values, with null for numbers that are not finite: empty bins, a model that diverged."""
+    """Return JSON values, with null for non-finite numbers: empty bins, a model that diverged."""
     if hasattr(value, "_asdict"):
         value = value._asdict()
     if isinstance(value, dict):
@@ -92,14 +92,14 @@ def _notes_of(prediction: Prediction) -> list[str]:
         notes.append("acceleration (a) and specific force (f): not in the log")
     if "uprev" not in log:
         notes.append(
-            "applied action (uprev): not in the log; computed from the commands by the model's own lags, as "
-            "if the first command of a segment had been held before"
+            "applied action (uprev): not in the log; computed from the commands by the model's own "
+            "lags, as if the first command of a segment had been held before"
         )
     if not prediction.is_settled.all():
         count = int(np.sum(~prediction.is_settled))
         notes.append(
-            f"{count} rows after a segment's start or lost commands start no judged step or flight: the "
-            "applied action, or the memory of the model's effects, is not known there"
+            f"{count} rows after a segment's start or lost commands start no judged step or "
+            "flight: the applied action, or the memory of the model's effects, is not known there"
         )
     return notes
 
@@ -141,8 +141,8 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
     steps = step_responses(prediction, rows)
     if not steps:
         notes.append(
-            "step responses: no judged command of roll, pitch or yaw jumps by "
-            f"{LEAST_JUMP:g} between {HELD_BEFORE_S:g} s and {HELD_AFTER_S:g} s of constant command, with "
-            "body rates measured"
+            f"step responses: no judged command of roll, pitch or yaw jumps by {LEAST_JUMP:g} "
+            f"between {HELD_BEFORE_S:g} s and {HELD_AFTER_S:g} s of constant command, with body "
+            "rates measured"
         )
     return Validation(num_rows, num_judged, one_step, rollouts, thrust, steps, tuple(notes))

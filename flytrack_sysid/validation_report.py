@@ -29,7 +29,10 @@ HEADINGS = {
     "thrust": "Thrust by command and voltage",
 }
 CAPTIONS = {
-    "steps": "Body rates, measured (solid) and of the model flying by itself from 0.1 s before the command.",
+    "steps": (
+        "Body rates, measured (solid) and of the model flying by itself from 0.1 s before the "
+        "command."
+    ),
     "thrust": "Mass times specific force along body z: mean error by applied action and voltage.",
 }
 
