@@ -1,4 +1,7 @@
-"""Build and try the firmware: ``flytrack firmware build [--sdist FILE]``, ``flytrack firmware check``."""
+"""Build and try the firmware.
+
+Usage: ``flytrack firmware build [--sdist FILE]``, ``flytrack firmware check``.
+"""
 
 import argparse
 import hashlib

@@ -1,4 +1,4 @@
-"""The quadcopter's body in numbers: what ``body.c`` moves, and the truth that a diagnosis is graded on."""
+"""The quadcopter's body in numbers: what ``body.c`` moves and a diagnosis is graded on."""
 
 import dataclasses
 import json
@@ -22,12 +22,14 @@ LARGEST_BYTES = 2**20  # of a body's file
 
 
 class FirmwareError(ValueError):
-    """Firmware that cannot be built, configured or flown; the message is one sentence that names what."""
+    """Firmware cannot be built, configured or flown; the message is one sentence that says what."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body, four motors and a battery; x forward, y left, z up. The default is a 1 kg racer.
+    """A rigid body, four motors and a battery; x forward, y left, z up.
+
+    The default is a 1 kg racer.
 
     A motor's speed follows its command c in [0, 1] with a lag; in the steady state its thrust is
     ``health * max_thrust_n * (linear c + (1 - linear) c^2) (V / full_v)^volt_exponent``. V is the
@@ -53,7 +55,7 @@ class Body:
     health: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
     """Factor on each motor's thrust: rear right, front right, rear left, front left."""
     linear: float = 0.0
-    """Share of the thrust curve that is linear in the command, from 0 to 1; the rest is quadratic."""
+    """Linear share of the thrust curve, from 0 to 1; the rest is quadratic in the command."""
     lag_up_s: float = 0.018
     lag_down_s: float = 0.018
     """Time constants of a motor that speeds up, and of one that slows down."""
@@ -111,8 +113,8 @@ class Body:
         """Return what each field must be, and whether it is."""
         positive = "mass_kg gravity max_thrust_n full_v full_current_a lag_up_s lag_down_s"
         not_negative = (
-            "linear_drag quadratic_drag rotor_drag translational_lift torque_m rotor_inertia volt_exponent "
-            "drain_v_per_min resistance_ohm gyro_noise acc_noise"
+            "linear_drag quadratic_drag rotor_drag translational_lift torque_m rotor_inertia "
+            "volt_exponent drain_v_per_min resistance_ohm gyro_noise acc_noise"
         )
         checks = {name: ("more than 0", getattr(self, name) > 0) for name in positive.split()}
         checks |= {
@@ -145,7 +147,7 @@ class Body:
         return sum(self.health) * self.max_thrust_n
 
     def command_of(self, speeds: np.ndarray, volts: np.ndarray) -> np.ndarray:
-        """Return the mean command of motors at these speeds (..., 4) if they are steady, (...) in [0, 1].
+        """Return the mean command, (...) in [0, 1], of steady motors at these speeds, (..., 4).
 
         speeds: as shares of full speed. volts: (...) under load, V.
         """
@@ -156,7 +158,10 @@ class Body:
         return (np.sqrt(half**2 + rest * share) - half) / rest
 
     def pack(self, is_reversed: bool) -> bytes:
-        """Return the bytes of body.h's ``Body``; is_reversed: the firmware's ``yaw_motors_reversed``."""
+        """Return the bytes of body.h's ``Body``.
+
+        is_reversed: the firmware's ``yaw_motors_reversed``.
+        """
         blends = [-math.expm1(-STEP_S / lag) for lag in (self.lag_up_s, self.lag_down_s)]
         numbers = [
             *(self.mass_kg, self.gravity, *self.inertia, *self.arm_m, *self.center_of_mass_m),

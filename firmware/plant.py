@@ -1,4 +1,4 @@
-"""``Betaflight``: the firmware on a body, as a plant for ``collect``, the evaluator and environments.
+"""``Betaflight``: the firmware on a body, as a plant for collecting, evaluation and environments.
 
 A flight is a process. A plant's state holds the drone as it was reported, the number of its flight
 (0: not begun) and its steps so far; a step passes through a callback to the processes, all rows of
@@ -64,7 +64,10 @@ class FirmwareState(NamedTuple):
 
 
 def _sticks(command: np.ndarray, throttle_us: float | None = None) -> tuple[float, ...]:
-    """Return the receiver's channels, us, of a command in [-1, 1], armed; our yaw is positive to the left."""
+    """Return the receiver's channels, us, armed, of a command in [-1, 1].
+
+    The command's yaw is positive to the left.
+    """
     roll, pitch, yaw, thrust = (float(value) for value in np.clip(command, -1.0, 1.0))
     throttle = CENTER_US + STICK_US * thrust if throttle_us is None else throttle_us
     sticks = (
@@ -115,7 +118,10 @@ class _Flight:
         )
 
     def land(self, box: Path | None) -> None:
-        """End the flight; box: folder for its blackbox log, which the firmware ends after disarming."""
+        """End the flight.
+
+        box: folder for its blackbox log, which the firmware ends after disarming.
+        """
         try:
             if box is not None and self.steps >= FEWEST_LOG_STEPS:
                 self.link.call(FLY, duration_us=LANDING_US, is_held=True)
@@ -181,7 +187,10 @@ class Betaflight(Plant):
         self.close()
 
     def close(self) -> None:
-        """End all flights, write their blackbox logs, end every process; a closed plant cannot be flown."""
+        """End all flights, write their blackbox logs, and end every process.
+
+        A closed plant cannot be flown.
+        """
         with self._lock:
             try:
                 for flight in list(self._flights.values()):
@@ -190,11 +199,11 @@ class Betaflight(Plant):
                 self._stop()
 
     def value(self, name: str) -> str:
-        """Return the value of a setting as the firmware has it, '' for a name that it does not have."""
+        """Return the value of a setting as the firmware has it, '' for an unknown name."""
         return self.firmware.value(name)
 
     def nominal_model(self) -> ModelParameters:
-        """Return the model to fit from: the nominal one with the craft's settings, moving as drones do."""
+        """Return the nominal model with the craft's settings and continuous motion, to fit from."""
         full = np.array(self.full_stick_deg_s, np.float32)
         curve = stick_curve(
             self.value("rates_type"), _rates(self.firmware, "rc_rate", "srate", "expo")
@@ -240,7 +249,10 @@ class Betaflight(Plant):
         return np.stack(states, axis=1)
 
     def check_alive(self) -> None:
-        """Raise FirmwareError if a step failed, since when all states are NaN, or the plant was closed."""
+        """Raise FirmwareError if a step failed or the plant was closed.
+
+        All states are NaN since a failed step.
+        """
         if self._failure is not None:
             raise self._failure
         if not self._finalizer.alive:
@@ -249,7 +261,9 @@ class Betaflight(Plant):
     def _step_rows(
         self, drones: Any, flights: Any, steps: Any, commands: Any
     ) -> tuple[np.ndarray, ...]:
-        """Fly a step of each row: (..., 21), (...), (...), (..., 4). What is not finite is not flown: NaN.
+        """Fly a step of each row: (..., 21), (...), (...), (..., 4).
+
+        Rows that are not finite are not flown and become NaN.
 
         Nothing is raised here, inside a compiled program: ``check_alive`` does.
         """
@@ -302,7 +316,11 @@ class Betaflight(Plant):
         return flown
 
     def _find(self, number: int, step: int, command: np.ndarray, start: np.ndarray) -> _Flight:
-        """Return the flight of a row, begun if need be; FirmwareError if it cannot go on from this state."""
+        """Return the flight of a row, and begin it if need be.
+
+        Raises:
+            FirmwareError: it cannot go on from this state.
+        """
         if number == 0:
             flight = _Flight(self, next(self._numbers), start)
             self._flights[flight.number] = flight
@@ -330,7 +348,7 @@ class Betaflight(Plant):
         flight.land(self.box)
 
     def _row(self, reply: Reply) -> np.ndarray:
-        """Return the handout's state (21,) float32 of a reply that has the motors' speeds for the action."""
+        """Return the handout's state, (21,) float32, of a reply with motor speeds as action."""
         row = reply.numbers.copy()
         command = self.body.command_of(row[layout.APPLIED_ACTION], row[layout.BATTERY])
         low, high = (reply.motor_range - LOWEST_PULSE_US) / PULSE_RANGE_US

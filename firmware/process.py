@@ -51,7 +51,10 @@ class Reply(NamedTuple):
 
 
 class Link:
-    """One end of a process's socket: ``ask`` sends, ``answer`` waits; FirmwareError if it ends or hangs."""
+    """One end of a process's socket: ``ask`` sends, ``answer`` waits.
+
+    Both raise FirmwareError if the process ends or hangs.
+    """
 
     def __init__(self, end: socket.socket, name: str):
         self.end, self.name, self.pid = end, name, 0
@@ -66,7 +69,10 @@ class Link:
         is_held: bool = False,
         passed: socket.socket | None = None,
     ) -> None:
-        """Send a request; duration_us: how long it flies or types. passed: a socket for the copy."""
+        """Send a request.
+
+        duration_us: how long the firmware flies or types. passed: a socket for the copy.
+        """
         frame_us = FRAME_US if kind == FLY else 0
         packed = REQUEST.pack(kind, duration_us, frame_us, is_held, len(payload), *rc) + payload
         try:
@@ -120,7 +126,7 @@ class Link:
 
 
 class Firmware:
-    """The firmware with its settings, started and ready to be armed, in a process that is copied for flights.
+    """The firmware with its settings, ready to be armed, in a process that is copied for flights.
 
     values: every setting it has, by scope, profile and name. is_reversed: ``yaw_motors_reversed``.
     """
@@ -144,12 +150,12 @@ class Firmware:
             raise
 
     def value(self, name: str) -> str:
-        """Return the value of a setting in the selected profiles; '' for a name it does not have."""
+        """Return the value of a setting in the selected profiles; '' for an unknown name."""
         last = self.settings[-1]
         return value_of(self.values, last._replace(name=name)) or ""
 
     def copy(self, folder: Path, name: str) -> Link:
-        """Return the link to a copy that continues from the moment it is ready, in a folder of its own."""
+        """Return the link to a copy in its own folder, which continues from the ready state."""
         ours, theirs = socket.socketpair()
         try:
             self.link.ask(FORK, payload=str(folder).encode(), passed=theirs)

@@ -1,4 +1,6 @@
-"""Settings of the firmware: from a dict or the text of a pilot's ``dump`` or ``diff all``, each read back.
+"""Settings of the firmware, from a dict or the text of a pilot's ``dump`` or ``diff all``.
+
+Each setting is read back.
 
 A setting's name is that of the command line's ``set``, or ``feature NAME`` with the value ON or
 OFF.
@@ -102,7 +104,9 @@ DEFAULTS, REQUIRED = _values_in("defaults.txt"), _values_in("required.txt")
 def settings_of(
     given: str | Mapping[str, object], skip: Iterable[str] = (), has_blackbox: bool = False
 ) -> list[Setting]:
-    """Return the settings to make: those given, above ``DEFAULTS`` (a dict) or the firmware's own (a dump).
+    """Return the settings to make: those given, above the defaults.
+
+    The defaults are ``DEFAULTS`` for a dict, and the firmware's own for a dump.
 
     ``REQUIRED`` ones come last. skip: patterns of names to leave out, ``osd_*`` say. has_blackbox:
     it logs.
@@ -144,7 +148,10 @@ def _text(value: object) -> str:
 
 
 def lines_of(settings: list[Setting]) -> list[str]:
-    """Return the lines to type, without ``save``: profiles are selected before the settings made in them."""
+    """Return the lines to type, without ``save``.
+
+    Profiles are selected before the settings made in them.
+    """
     lines, profile, rate_profile = [], 0, 0
     for one in settings:
         if one.profile != profile:
@@ -158,7 +165,7 @@ def lines_of(settings: list[Setting]) -> list[str]:
 
 
 def values_of(dump: str) -> dict[tuple[str, int, str], str]:
-    """Return the values in the firmware's own ``dump all`` by scope, number of the profile, name."""
+    """Return the values in the firmware's own ``dump all`` by scope, profile number and name."""
     scope, number, found = "master", 0, {}
     for raw in dump.splitlines():
         line = raw.partition("#")[0].strip()
