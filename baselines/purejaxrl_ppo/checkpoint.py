@@ -1,4 +1,4 @@
-"""Checkpoints: a policy, all that is needed to fly it and, in a run, all that training needs to continue.
+"""Checkpoints: a policy, all that is needed to fly it and, in a run, the state of its training.
 
 A checkpoint is a safetensors file: arrays named ``policy.*`` and ``training.*``, and in the header
 a JSON description and a SHA-256 checksum of description and arrays. Nothing in it is executed.
@@ -65,7 +65,7 @@ class _Description(msgspec.Struct):
 
 
 class _Progress(msgspec.Struct):
-    """What the checkpoint of a run says in addition, and is used before it is compared with the run."""
+    """Fields that the checkpoint of a run adds, used before it is compared with the run."""
 
     steps: Annotated[int, msgspec.Meta(ge=0)]
     seed: int
@@ -109,7 +109,7 @@ class Checkpoint(NamedTuple):
         return Policy(self.network, self.params)
 
     def check_fits(self, env: Any) -> None:
-        """Raise CheckpointError unless the policy's input is this environment's observation, row by row."""
+        """Raise CheckpointError unless the policy's input is the observation, row by row."""
         shape = env.observation_space(env.default_params).shape
         if shape != (self.observation_size,):
             raise CheckpointError(
@@ -122,7 +122,10 @@ class Checkpoint(NamedTuple):
 
 
 def observation_layout(env: Any) -> dict[str, Any]:
-    """Return an environment's observation as JSON values: each row's meaning, frame, unit, scale, limit."""
+    """Return the layout of an environment's observation as JSON values.
+
+    Each row has its meaning, frame, unit, scale and limit.
+    """
     rows = {f"row {i} ({e.key})": e._asdict() for i, e in enumerate(env.observation_table)}
     return dict(json.loads(json.dumps(rows)))
 
@@ -165,7 +168,7 @@ def _is_key(leaf: Any) -> bool:
 
 
 def as_named_arrays(tree: Any) -> Arrays:
-    """Return the leaves of a tree by their dotted paths, bit for bit; random keys as their integers."""
+    """Return a tree's leaves by dotted path, bit for bit; random keys become integers."""
     return {
         name: np.asarray(
             jax.random.key_data(leaf) if isinstance(leaf, jax.Array) and _is_key(leaf) else leaf
@@ -314,7 +317,10 @@ def step_file(steps: int) -> str:
 
 
 def checkpoints_in(folder: Path) -> list[Path]:
-    """Return the checkpoints in a folder, newest first: the final one, then by the steps in their names."""
+    """Return the checkpoints in a folder, newest first.
+
+    The final one is the newest; the others are ordered by the steps in their names.
+    """
     steps = {folder / FINAL: sys.maxsize} if (folder / FINAL).exists() else {}
     for path in folder.glob(f"step_*{SUFFIX}"):
         if match := STEP_FILE.fullmatch(path.name):
@@ -362,7 +368,7 @@ def describe_run(env: Any, env_id: str, track: str, config: Config, seed: int) -
 
 
 def check_same_run(start: Checkpoint, description: dict[str, Any]) -> None:
-    """Check that a run can continue from a checkpoint, and warn where it will not do so bit for bit.
+    """Check that a run can continue from a checkpoint; warn where that is not bit for bit.
 
     The length may differ: a longer ``total_timesteps`` extends the run.
 

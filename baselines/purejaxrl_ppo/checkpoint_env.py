@@ -41,7 +41,9 @@ RANGES = {
 def plant_env(
     checkpoint: Checkpoint, plant: Plant, track: str | Path | Track | None = None
 ) -> EpisodicEnvironment:
-    """Return the checkpoint's environment with a plant (a black box, say) in place of the simulator.
+    """Return the checkpoint's environment with a plant in place of the simulator.
+
+    The plant may be a black box, for example.
 
     track: name or file; the checkpoint's if None.
 
@@ -92,7 +94,7 @@ def _checked_env(
 
 
 def with_model_as_given(params: EnvParams) -> EnvParams:
-    """Return parameters with which an id that randomises the model in every episode keeps the given one."""
+    """Return parameters that keep the given model where the id randomises it in every episode."""
     if DomainRandomization.key not in params.wrappers:
         return params
     return params.replace(wrappers={**params.wrappers, DomainRandomization.key: MODEL_AS_GIVEN})

@@ -68,16 +68,17 @@ class Config:
     num_steps: PositiveInt = 64
     """Steps of every environment per update."""
     episode_steps: PositiveInt = 200
-    """Time limit of training episodes, in environment steps. Long ones spend most experience on the one
-    line that the policy flies already, and a policy that knows nothing beside it fails on another
-    plant."""
+    """Time limit of training episodes, in environment steps. Long ones spend most experience on the
+    one line that the policy flies already, and a policy that knows nothing beside it fails on
+    another plant."""
     gate_margin: NonNegativeFloat = 0.15
-    """Metres by which the drone is thicker, to every side, in training than in the race. A policy that
-    uses the whole opening is perfect in the simulator and crashes where the plant differs a
+    """Metres by which the drone is thicker, to every side, in training than in the race. A policy
+    that uses the whole opening is perfect in the simulator and crashes where the plant differs a
     little."""
     update_epochs: PositiveInt = 1
-    """Passes over the collected batch per update. Gradients are nearly all of the time that training takes,
-    so that one pass in many small steps gets further in a second than several in larger ones."""
+    """Passes over the collected batch per update. Training spends nearly all of its time on
+    gradients, so that one pass in many small steps gets further in a second than several in larger
+    ones."""
     num_minibatches: PositiveInt = 64
     """Gradient steps per pass."""
     learning_rate: PositiveFloat = 3e-3
@@ -101,19 +102,19 @@ class Config:
     hidden_sizes: Annotated[tuple[Width, ...], Meta(min_length=1, max_length=MAX_LAYERS)] = (64, 64)
     """Widths of the hidden layers, tanh, of actor and critic each."""
     memory_size: Annotated[int, Meta(ge=0, le=MAX_WIDTH)] = 0
-    """Width of a gated recurrent unit whose memory of the episode the layers see beside the observation; 0:
-    none. A policy that remembers can adapt to the drone that it flies."""
+    """Width of a gated recurrent unit whose memory of the episode the layers see beside the
+    observation; 0: none. A policy that remembers can adapt to the drone that it flies."""
     initial_std: PositiveFloat = 0.5
-    """Standard deviation of the actions at the start; it does not depend on the state. PureJaxRL: 1."""
+    """Initial standard deviation of the actions, independent of the state. PureJaxRL: 1."""
     min_std: NonNegativeFloat = 0.05
     """Floor of that standard deviation. PureJaxRL: 0, no floor."""
     initial_action: tuple[FiniteFloat, ...] = (0.0, 0.0, 0.0, -0.2)
-    """Mean action of the untrained policy: sticks centred, thrust about that of hovering. PureJaxRL: zeros.
-    Its length is the number of actions; unused where actions are discrete."""
+    """Mean action of the untrained policy: sticks centred, thrust about that of hovering.
+    PureJaxRL: zeros. Its length is the number of actions; unused where actions are discrete."""
     bootstrap_at_truncation: bool = True
-    """Add the value of the final observation where the time limit cuts an episode off. PureJaxRL: no."""
+    """Add the final observation's value where the time limit ends an episode. PureJaxRL: no."""
     batched_step: bool = True
-    """Step the environments as a batch where they offer it, not one by one under vmap. PureJaxRL: no."""
+    """Step the environments as a batch where they offer it, not under vmap. PureJaxRL: no."""
     affine_shuffle: bool = True
     """Draw minibatches with an affine permutation, not with one from a sort. PureJaxRL: no."""
     anneal_every_gradient: bool = True
@@ -161,8 +162,8 @@ class Config:
         )
         if rows % config.num_minibatches:
             raise ConfigError(
-                f"num_minibatches: found {config.num_minibatches}, expected a divisor of the {rows} {what} "
-                "of an update"
+                f"num_minibatches: found {config.num_minibatches}, expected a divisor of "
+                f"the {rows} {what} of an update"
             )
         return config
 

@@ -1,4 +1,4 @@
-"""Evaluations of a checkpoint: flights on a black box or on drawn plants, their report, and its files."""
+"""Evaluations of a checkpoint on a black box or on drawn plants, their report and files."""
 
 import dataclasses
 import json
@@ -86,8 +86,8 @@ class EvaluationSettings:
     ghost: bool = False
     """Compare with the time-optimal flight, and write it beside the rollout."""
     out: OptionalPath = None
-    """Rollout of the first flight, rows [x 21 | u 4]; by default runs/eval/rollout.npy, or that of the next
-    free folder."""
+    """Rollout of the first flight, rows [x 21 | u 4]; by default runs/eval/rollout.npy, or that of
+    the next free folder."""
     rrd: OptionalPath = None
     """Write a Rerun recording of the first flight."""
     json: OptionalPath = None

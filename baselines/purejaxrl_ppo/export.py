@@ -53,22 +53,24 @@ OF_DRONE = tuple(entry for entry in OBSERVATION if entry.key not in OF_NEXT_GATE
 KINDS_OF_PAST = ("commanded", "applied")
 SENTENCES = {
     "state": (
-        "0:3 position, world, m; 3:6 velocity, world, m/s; 6:9 acceleration, not read; 9:13 attitude, "
-        "quaternion w, x, y, z of norm 1, body to world; 13:16 angular velocity, body, rad/s; 16:20 applied "
-        "action, that is the command after the drone's lag: roll, pitch, yaw, thrust; 20 battery, V, "
-        "from {empty_v} (empty) to {full_v} (full), as the policy was trained. World: "
-        "the track's, z up. Body: x forward, y left, z up."
+        "0:3 position, world, m; 3:6 velocity, world, m/s; 6:9 acceleration, not read; "
+        "9:13 attitude, quaternion w, x, y, z of norm 1, body to world; "
+        "13:16 angular velocity, body, rad/s; "
+        "16:20 applied action, that is the command after the drone's lag: roll, pitch, yaw, "
+        "thrust; "
+        "20 battery, V, from {empty_v} (empty) to {full_v} (full), as the policy was trained. "
+        "World: the track's, z up. Body: x forward, y left, z up."
     ),
     "gate": "index of the gate to fly, 0 to {last_gate}, in the order of the track {track}.",
     "past": (
-        "the last {num_actions} {kind} actions, the latest first, each roll, pitch, yaw, thrust in [-1, 1]; "
-        "at the start of a flight all of them are the applied action."
+        "the last {num_actions} {kind} actions, the latest first, each roll, pitch, yaw, thrust "
+        "in [-1, 1]; at the start of a flight all of them are the applied action."
     ),
     "action": (
-        "roll, pitch, yaw, thrust in [-1, 1]. Full stick asks for {full_stick} deg/s about body x, y, z; "
-        "thrust is -1 for none and 1 for full. With a full battery of {full_v} V the thrust map that the "
-        "policy was trained with gives {full_weights} times the weight at full thrust, and {hover} hovers: "
-        "compare both with the craft."
+        "roll, pitch, yaw, thrust in [-1, 1]. Full stick asks for {full_stick} deg/s about body "
+        "x, y, z; thrust is -1 for none and 1 for full. With a full battery of {full_v} V the "
+        "thrust map that the policy was trained with gives {full_weights} times the weight at full "
+        "thrust, and {hover} hovers: compare both with the craft."
     ),
 }
 
@@ -107,7 +109,9 @@ class ExportedPolicy(NamedTuple):
 
 
 def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> ExportedPolicy:
-    """Return the policy of a checkpoint on a track, by default its own; name: of the checkpoint's file.
+    """Return the policy of a checkpoint on a track, by default on its own.
+
+    name: of the checkpoint's file.
 
     Raises: CheckpointError, TrackError: a checkpoint that does not fit its environment, whose
             policy remembers, or whose observation has rows that cannot be exported; a track that
@@ -115,16 +119,16 @@ def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> Ex
     """
     if checkpoint.config.memory_size:
         raise CheckpointError(
-            f"{name}: memory_size: found {checkpoint.config.memory_size}, expected 0: no policy that "
-            "remembers can be exported yet"
+            f"{name}: memory_size: found {checkpoint.config.memory_size}, expected 0: no "
+            "policy that remembers can be exported yet"
         )
     env = simulated_env(checkpoint, track)
     past = env.observation_table[len(OBSERVATION) :]
     unknown = [entry.key for entry in past if entry.key.rpartition("_")[0] not in KINDS_OF_PAST]
     if unknown:
         raise CheckpointError(
-            f"{name}: observation: found {', '.join(unknown)}, expected rows of {' or '.join(KINDS_OF_PAST)} "
-            "actions after those of FlyTrack-v0"
+            f"{name}: observation: found {', '.join(unknown)}, expected rows of "
+            f"{' or '.join(KINDS_OF_PAST)} actions after those of FlyTrack-v0"
         )
     params = env.default_params
     model, battery = params.model, params.model.battery
@@ -155,7 +159,10 @@ def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> Ex
         past=past,
         layers=_layers(checkpoint),
         blend=1.0 - np.exp(-params.dt / np.asarray(params.model.tau, float)),
-        about=f"FlyTrack {flytrack_env.__version__}: policy of {name}, track {env.track.name}, {rate}.",
+        about=(
+            f"FlyTrack {flytrack_env.__version__}: policy of {name}, track {env.track.name}, "
+            f"{rate}."
+        ),
         meanings={
             key: text.format(**words) for key, text in SENTENCES.items() if past or key != "past"
         },
@@ -248,7 +255,9 @@ def _comment(text: str) -> str:
 
 
 def onnx_of(policy: ExportedPolicy, is_float64: bool = False) -> bytes:
-    """Return the content of an ONNX file; is_float64: the arithmetic between float32 inputs and action.
+    """Return the content of an ONNX file.
+
+    is_float64: compute in float64 between the float32 inputs and the float32 action.
 
     Raises:
         ImportError: onnx is not installed.
@@ -291,7 +300,9 @@ def onnx_of(policy: ExportedPolicy, is_float64: bool = False) -> bytes:
 
 
 def rotation_of_products() -> np.ndarray:
-    """Return the matrix (16, 9) from products q_i q_j to a rotation matrix, row by row, less the identity.
+    """Return the matrix (16, 9) from products q_i q_j to a rotation matrix less the identity.
+
+    The entries of the rotation matrix are listed row by row.
 
     A quadratic form's coefficient of q_i q_j and of q_j q_i is half of Q(e_i + e_j) - Q(e_i) -
     Q(e_j).

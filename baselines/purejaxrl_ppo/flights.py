@@ -61,7 +61,7 @@ class Rollout(NamedTuple):
         return np.asarray(self.lap_time_s)[np.asarray(self.lap_completed)]
 
     def end_reason(self, num_laps: int | None = None) -> str:
-        """Return the causes of termination, that the laps were completed, or that the steps ran out."""
+        """Return the causes of termination, or that laps or steps are complete."""
         causes = [name for name, happened in self.causes._asdict().items() if np.any(happened)]
         if num_laps is not None and len(self.lap_times()) >= num_laps:
             return "laps complete"
@@ -92,7 +92,7 @@ class Outcomes(NamedTuple):
         return np.asarray(self.laps) >= np.shape(self.lap_times_s)[-1]
 
     def first_laps_s(self) -> np.ndarray:
-        """Return the times of the first laps that were completed, from standstill, s, (number of these,)."""
+        """Return the times of completed first laps, from standstill, s, (number of these,)."""
         times = np.asarray(self.lap_times_s)[..., 0]
         return times[np.isfinite(times)]
 
@@ -102,7 +102,7 @@ class Outcomes(NamedTuple):
         return times[np.isfinite(times)]
 
     def ends(self) -> dict[str, np.ndarray]:
-        """Return masks, (num_flights,), of the flights that each cause ended before their last lap."""
+        """Return, by cause, masks (num_flights,) of the flights it ended before their last lap."""
         is_complete = self.is_complete()
         causes = {
             name: np.asarray(cause) & ~is_complete for name, cause in self.causes._asdict().items()
@@ -193,7 +193,7 @@ def score(outcomes: Outcomes) -> Score:
 
 
 def start_pose_params(params: EnvParams, num_steps: int) -> EnvParams:
-    """Return parameters whose episodes begin at the noisy start pose and may last that many steps."""
+    """Return parameters for episodes of at most ``num_steps`` from the noisy start pose."""
     return params.replace(
         reset=params.reset._replace(course_fraction=0.0), max_steps_in_episode=num_steps
     )
@@ -348,7 +348,10 @@ def _race_batch(
     num_steps: int,
     num_laps: int,
 ) -> Outcomes:
-    """Return the outcomes of one batch; models: one for each key, or None for that of ``params``."""
+    """Return the outcomes of one batch of flights.
+
+    models: one for each key, or None for that of ``params``.
+    """
 
     def race(key: jax.Array, model: ModelParameters | None) -> Outcomes:
         own = params if model is None else params.replace(model=model)

@@ -1,4 +1,4 @@
-"""Flights of a policy while it trains: their metrics, their files, and where they spend their time."""
+"""Evaluation flights during training: their metrics, files, and where they spend their time."""
 
 import logging
 from pathlib import Path
@@ -43,7 +43,7 @@ logger = logging.getLogger(__name__)
 
 
 def evaluation_metrics(outcomes: Outcomes) -> dict[str, float]:
-    """Return the metrics of evaluation flights (docs/baseline.md), without times where there are none."""
+    """Return the metrics of evaluation flights (docs/baseline.md); missing times are left out."""
     values = {
         **score(outcomes)._asdict(),
         "laps": outcomes.laps.mean(),

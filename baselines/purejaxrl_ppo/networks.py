@@ -1,4 +1,7 @@
-"""Actor and critic: separate tanh networks, orthogonal initialisation, state-independent deviation."""
+"""Actor and critic: separate tanh networks with orthogonal initialisation.
+
+The standard deviation of the actions does not depend on the state.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,7 +19,7 @@ Memory = Any  # what a policy remembers of an episode, a pytree; () of one that 
 
 
 class _Gru(nn.Module):
-    """A gated recurrent unit over steps that forgets where an episode ends (K. Cho et al., arXiv 1406.1078).
+    """A gated recurrent unit (K. Cho et al., arXiv 1406.1078), reset where an episode ends.
 
     Attributes:
         size: of its memory.
@@ -35,7 +38,7 @@ class _Gru(nn.Module):
 
 
 class ActorCritic(nn.Module):
-    """Policy and value of what is known: an observation, and what is remembered of the episode, if anything.
+    """Policy and value of an observation and, if the network has one, a memory of the episode.
 
     The attributes are the fields of ``Config`` of the same names.
 
@@ -92,7 +95,7 @@ class ActorCritic(nn.Module):
 
     @nn.nowrap
     def first_memory(self, batch_shape: tuple[int, ...] = ()) -> Memory:
-        """Return what is remembered at the start of an episode, (*batch_shape, memory_size); or ()."""
+        """Return the memory at the start of an episode, (*batch_shape, memory_size), or ()."""
         return jnp.zeros((*batch_shape, self.memory_size)) if self.memory_size else ()
 
     def step(
@@ -138,14 +141,20 @@ class ActorCritic(nn.Module):
 
 @struct.dataclass
 class Policy:
-    """A network, with ``first_memory()`` and ``act(params, memory, observation)``, and its parameters."""
+    """A network and its parameters.
+
+    The network has ``first_memory()`` and ``act(params, memory, observation)``.
+    """
 
     network: Any = struct.field(pytree_node=False)
     params: Any
 
 
 def make_network(config: Config, num_choices: int = 0) -> ActorCritic:
-    """Return the network that a configuration describes; num_choices: of discrete actions, if they are."""
+    """Return the network that a configuration describes.
+
+    num_choices: number of discrete actions; 0 for continuous ones.
+    """
     return ActorCritic(
         hidden_sizes=config.hidden_sizes,
         initial_action=config.initial_action,

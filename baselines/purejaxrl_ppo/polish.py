@@ -70,7 +70,7 @@ class Flown(NamedTuple):
 def fly(
     env: EpisodicEnvironment, policy: Policy, key: jax.Array, params: EnvParams, settings: Settings
 ) -> Flown:
-    """Fly the mean action, differentiable in the policy; the drone stands still once the flight is over."""
+    """Fly the mean action, differentiable in the policy; the state is frozen after the end."""
     gates = params.course.gates
     free = gates.half_opening - params.drone_radius
     # Of a pass in units of the real opening; all gates of a track may differ.
@@ -117,7 +117,7 @@ def fly(
 
 
 def decay_gradient(tree: Any, share: float) -> Any:
-    """Return a tree as it is, that passes only a share of its gradient on to what comes before it."""
+    """Return a tree unchanged, and pass on only a share of the gradient through it."""
 
     def decay_leaf(value: Any) -> Any:
         if share == 1.0 or not jnp.issubdtype(jnp.asarray(value).dtype, jnp.floating):
@@ -187,8 +187,9 @@ def polish(
         policy_params, optimizer_state, num_complete = update(policy_params, optimizer_state, key)
         if int(num_complete) == 0:
             raise ValueError(
-                f"policy: found none of {settings.flights} flights that passed {last_gate} gates within "
-                f"{settings.laps * settings.slowest_lap_s:g} s, expected one that already races"
+                f"policy: found none of {settings.flights} flights that passed {last_gate} gates "
+                f"within {settings.laps * settings.slowest_lap_s:g} s, expected one that already "
+                "races"
             )
         report(done, settings.updates)
     return policy_params

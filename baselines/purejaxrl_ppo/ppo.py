@@ -3,21 +3,24 @@
 Source: J. Schulman et al., arXiv 1707.06347; C. Lu et al., PureJaxRL. Differences from PureJaxRL,
 the reason for each, and the setting (``config.py``) that switches it off:
 
-- Truncation is bootstrapped: the value of the final observation is added to the last reward of an episode
-  that the time limit cut off, because the race would have gone on (``bootstrap_at_truncation = false``).
+- Truncation is bootstrapped: the value of the final observation is added to the last reward of an
+  episode that the time limit cut off, because the race would have gone on
+  (``bootstrap_at_truncation = false``).
 - Environments are stepped as a batch where they offer ``step_batch``, which is faster
   (``batched_step = false``: one by one under ``vmap``).
-- Minibatches come from an affine permutation, i -> a i + b mod n, because sorting all keys of an epoch
-  costs as much as the environments (``affine_shuffle = false``).
-- The standard deviation has a floor, so that exploration cannot die out early, and starts at 0.5, because
-  random full stick crashes at once (``min_std = 0``, ``initial_std = 1``).
+- Minibatches come from an affine permutation, i -> a i + b mod n, because sorting all keys of an
+  epoch costs as much as the environments (``affine_shuffle = false``).
+- The standard deviation has a floor, so that exploration cannot die out early, and starts at 0.5,
+  because random full stick crashes at once (``min_std = 0``, ``initial_std = 1``).
 - The untrained policy's mean thrust is about that of hovering, so that its episodes last
   (``initial_action`` of zeros).
-- The step size falls with every gradient step, which is optax's own schedule, and not to 0, so that the
-  last updates still learn (``anneal_every_gradient = false``, ``final_learning_rate_fraction = 0``).
-- The network may remember (``memory_size = 0``: it does not), so that it can adapt to the drone it flies.
-- One update is a function of its own (``Algorithm``), so that a run can be logged, stored and resumed
-  between updates; ``make_train`` is PureJaxRL's: one ``jit``, a ``scan`` over updates.
+- The step size falls with every gradient step, which is optax's own schedule, and not to 0, so that
+  the last updates still learn (``anneal_every_gradient = false``,
+  ``final_learning_rate_fraction = 0``).
+- The network may remember (``memory_size = 0``: it does not), so that it can adapt to the drone it
+  flies.
+- One update is a function of its own (``Algorithm``), so that a run can be logged, stored and
+  resumed between updates; ``make_train`` is PureJaxRL's: one ``jit``, a ``scan`` over updates.
 """
 
 from collections.abc import Callable
@@ -37,7 +40,10 @@ Metrics = dict[str, jax.Array]
 
 
 class Batch(NamedTuple):
-    """One update's experience; leaves (num_steps, num_envs, ...); memory and observation before the step."""
+    """One update's experience; leaves (num_steps, num_envs, ...).
+
+    Memory and observation are those before the step.
+    """
 
     memory: Memory
     observation: jax.Array
@@ -165,7 +171,7 @@ def ppo_loss(
 
 
 def make_schedule(config: Config) -> optax.Schedule:
-    """Return the step size over the number of gradient steps taken: linear, from first to last update."""
+    """Return the step size over the number of gradient steps, linear over all updates."""
     last = config.learning_rate * config.final_learning_rate_fraction
     if config.anneal_every_gradient:
         num_gradients = config.num_updates * config.gradients_per_update
@@ -191,8 +197,8 @@ def make_network_for(env: Any, env_params: Any, config: Config) -> ActorCritic:
         return make_network(config, int(space.n))
     if space.shape != (len(config.initial_action),):
         raise ValueError(
-            f"initial_action: found {len(config.initial_action)} values, expected the environment's "
-            f"action shape {space.shape}"
+            f"initial_action: found {len(config.initial_action)} values, expected the "
+            f"environment's action shape {space.shape}"
         )
     return make_network(config)
 
@@ -319,7 +325,9 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
 def make_train(
     env: Any, env_params: Any, config: Config
 ) -> Callable[[jax.Array], tuple[Runner, Metrics]]:
-    """Return ``train(key) -> (runner, metrics)``, to be jitted: a whole run; metrics (num_updates,).
+    """Return ``train(key) -> (runner, metrics)``, a whole run, to be jitted.
+
+    The metrics have shape (num_updates,).
 
     Raises:
         ValueError: a configuration that cannot be trained with.

@@ -19,7 +19,9 @@ LAPS = {"first_lap_s": "first lap", "flying_lap_s": "flying laps"}
 
 
 def share(is_success: np.ndarray) -> dict[str, Any]:
-    """Return number of successes, number of trials, share, and its 95 % interval, ``low`` to ``high``.
+    """Return the numbers of successes and trials, the share, and its 95 % interval.
+
+    The interval is ``low`` to ``high``.
 
     Wilson's interval, which is valid near 0 and 1 too. Trials are assumed to be independent.
     """
@@ -30,7 +32,7 @@ def share(is_success: np.ndarray) -> dict[str, Any]:
 
 
 def distribution(times_s: np.ndarray) -> dict[str, Any]:
-    """Return number, mean, shortest, and 5, 50 and 95 % quantiles of times; None where there are none."""
+    """Return number, mean, minimum, and 5, 50 and 95 % quantiles of times; None without any."""
     if not times_s.size:
         return {"number": 0, **dict.fromkeys(("mean", "min", *QUANTILES))}
     values = {"mean": times_s.mean(dtype=float), "min": times_s.min()}
@@ -107,7 +109,9 @@ def compare_with_optimum(summary: dict[str, Any], references: References) -> dic
 def compute_time_lost(
     outcomes: Outcomes, references: References, gate_ids: list[int]
 ) -> list[dict[str, Any]]:
-    """Return the mean time lost on the way to each gate, s, as JSON values: one row per gate, with its id.
+    """Return the mean time lost on the way to each gate, s, as JSON values.
+
+    There is one row per gate, with its id.
 
     Only complete laps count, so that the rows add up to mean lap time minus optimum; None without
     any.
@@ -145,13 +149,16 @@ def describe_share(share: dict[str, Any]) -> str:
 
 
 def describe_times(times: dict[str, Any], optimal: dict[str, Any] | None) -> str:
-    """Return number and times of one kind of lap, and by how much they exceed the time-optimal one."""
+    """Return the number and times of one kind of lap, and their excess over the time optimum."""
     if times["number"] == 0:
         return "none"
-    text = "{number}, mean {mean:.3f} s, shortest {min:.3f} s, 5/50/95 %: {q05:.3f}/{q50:.3f}/{q95:.3f} s"
+    text = (
+        "{number}, mean {mean:.3f} s, shortest {min:.3f} s, "
+        "5/50/95 %: {q05:.3f}/{q50:.3f}/{q95:.3f} s"
+    )
     if optimal is not None:
-        text += "\n  mean {mean_percent_above:.1f} %, shortest {min_percent_above:.1f} % above the time-optimal"
-        text += " {time_s:.3f} s"
+        text += "\n  mean {mean_percent_above:.1f} %, shortest {min_percent_above:.1f} % above"
+        text += " the time-optimal {time_s:.3f} s"
     return text.format(**times, **(optimal or {}))
 
 
@@ -161,7 +168,10 @@ def describe_report(report: dict[str, Any]) -> str:
     where = f"the black box {report['black_box']}"
     if plants is not None:
         number = plants["success"]["of"]
-        where = f"{number} plants drawn around the checkpoint's model, in the simulator, not on a black box"
+        where = (
+            f"{number} plants drawn around the checkpoint's model, in the simulator, "
+            "not on a black box"
+        )
     lines = [f"{report['flights']} flights, track {report['track']}: on {where}"]
     if report["success"] is not None:
         ended = (

@@ -67,7 +67,7 @@ class Settings:
 
 
 class RaceResults(NamedTuple):
-    """Shares of races in which the learner finishes, wins, and in which drones collide before a finish."""
+    """Shares of races that the learner finishes, wins, or that have a collision before a finish."""
 
     finishes: float
     wins: float
@@ -75,7 +75,7 @@ class RaceResults(NamedTuple):
 
 
 def widen_params(params: Any, observation_size: int) -> Any:
-    """Return a network's parameters for longer observations, whose additional rows have no weight."""
+    """Return a network's parameters for longer observations; the added rows have no weight."""
 
     def widen(path: tuple[Any, ...], leaf: jax.Array) -> jax.Array:
         if FIRST_LAYER not in jax.tree_util.keystr(path) or leaf.ndim != 2:
@@ -280,7 +280,8 @@ def main(settings: Settings) -> None:
         results = summarize(*fly_races(race, start.network, learner, opponent, slot, keys))
         print(
             f"{settings.num_races} races from {place} {settings.opponent.stem}: "
-            f"finishes {results.finishes:.1%}, wins {results.wins:.1%}, collisions {results.collisions:.1%}"
+            f"finishes {results.finishes:.1%}, wins {results.wins:.1%}, "
+            f"collisions {results.collisions:.1%}"
         )
 
 

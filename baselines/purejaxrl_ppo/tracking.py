@@ -106,7 +106,10 @@ class Tracker:
                 self.flush()
 
     def flush(self) -> None:
-        """Send all that is pending: before a checkpoint, because a resumed run does not repeat it."""
+        """Send all that is pending.
+
+        Called before a checkpoint, because a resumed run does not repeat it.
+        """
         if not self._uri or time.monotonic() < self._retry_s:
             return
         self._next_s = time.monotonic() + SEND_EVERY_S

@@ -51,8 +51,8 @@ class Sources:
     config: OptionalPath = None
     """TOML file of hyperparameters; flags override it."""
     resume: OptionalPath = None
-    """Continue from a checkpoint, or from a folder's newest intact one. Id, track, model, reward, seed and
-    hyperparameters are as they were; a larger --total-timesteps extends the run."""
+    """Continue from a checkpoint, or from a folder's newest intact one. Id, track, model, reward,
+    seed and hyperparameters are as they were; a larger --total-timesteps extends the run."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +103,10 @@ def parse(words: Sequence[str]) -> tuple[Settings, Checkpoint | None]:
 
 
 def make_trainer(settings: Settings, start: Checkpoint | None) -> Trainer:
-    """Return the trainer of a command line; errors name the checkpoint that some settings come from."""
+    """Return the trainer of a command line.
+
+    Errors name the checkpoint from which some settings come.
+    """
     reward = parse_rewards(settings.reward)
     arguments: dict[str, Any] = {"track": settings.track, "reward": reward, "model": settings.model}
     if start is None:
@@ -120,7 +123,7 @@ def make_trainer(settings: Settings, start: Checkpoint | None) -> Trainer:
 
 
 def train(words: Sequence[str]) -> None:
-    """Train as a command line says; print where the run continues from and where its checkpoint is."""
+    """Train as a command line says; print where the run continues from, and its checkpoint."""
     settings, start = parse(words)
     trainer = make_trainer(settings, start)
     options, out = settings.run, settings.out or DEFAULT_OUT
@@ -142,7 +145,10 @@ def leave(status: int, text: object) -> NoReturn:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train as the command line says; exit with 2 if it is refused, 1 if it fails, 128 + N for a signal N."""
+    """Train as the command line says.
+
+    Exits with 2 if it is refused, with 1 if it fails, and with 128 + N for a signal N.
+    """
     try:
         train(sys.argv[1:] if arguments is None else arguments)
     except Stopped as stopped:

@@ -42,7 +42,7 @@ MAX_NAMES = 4  # in the message on numbers that are not finite: where one is not
 
 
 class DivergedError(ValueError):
-    """A training whose numbers are not finite any more; the message says since when, and what to do."""
+    """The numbers of a training are not finite; the message says since when and what to do."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -74,7 +74,7 @@ DEFAULT_OPTIONS = Options(checkpoint_every=1_000_000, evaluate_every=4_000_000, 
 
 
 def is_due(steps: int, every: int, batch_size: int) -> bool:
-    """Return whether the update that ends at ``steps`` reaches another multiple of ``every`` steps."""
+    """Return whether the update that ends at ``steps`` reaches a new multiple of ``every``."""
     return every > 0 and steps // every > (steps - batch_size) // every
 
 
@@ -84,7 +84,7 @@ def stack(rows: list[Metrics]) -> Metrics:
 
 
 def training_params(env: EpisodicEnvironment, config: Config) -> EnvParams:
-    """Return the parameters to train with: short episodes, and a drone that is thicker than in the race."""
+    """Return the parameters to train with: short episodes, and a drone thicker than in the race."""
     params = env.default_params
     params = params.replace(
         max_steps_in_episode=config.episode_steps,
@@ -221,8 +221,8 @@ class Trainer:
         is_own = start is not None and start.path.parent.resolve() == out.resolve()
         if not is_own and files.checkpoints_in(out):
             raise ValueError(
-                f"{out} holds the checkpoints of a run; continue it (--resume {out}), give another folder "
-                "(--out), or remove it"
+                f"{out} holds the checkpoints of a run; continue it (--resume {out}), give "
+                "another folder (--out), or remove it"
             )
         if start is None:
             return
@@ -278,12 +278,13 @@ class Run:
         return self.update * self.config.batch_size
 
     def _report_learning_rate(self, before: Config) -> None:
-        """Print how the learning rate jumps where a run gets another length, with which it is annealed."""
+        """Print how the learning rate jumps where a new run length changes its schedule."""
         count = self.update * self.config.gradients_per_update
         old, new = (float(make_schedule(config)(count)) for config in (before, self.config))
         if old != new:
             print(
-                f"learning rate: {old:.3g} up to step {self.steps}, {new:.3g} from there: it is annealed anew"
+                f"learning rate: {old:.3g} up to step {self.steps}, {new:.3g} from there: "
+                "it is annealed anew"
             )
 
     def train(self, signals: list[int]) -> tuple[Checkpoint, Metrics]:
@@ -365,7 +366,7 @@ class Run:
         self.tracker.record(self.steps, {}, [(self.last_stored, "checkpoints")])
 
     def _format_progress(self) -> str:
-        """Return the mean return of the last episodes and, of the last evaluation, success and best lap."""
+        """Return the mean return and the last evaluation's success and best lap as text."""
         text = f"return {self.history[-1]['last_return']:.1f}"
         if "evaluation_success" in self.evaluation:
             text += f", success {self.evaluation['evaluation_success']:.0%}"
