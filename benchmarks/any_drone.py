@@ -60,7 +60,10 @@ voltage_v = [{empty_v}, {full_v}]
 
 
 class TrueCraft(NamedTuple):
-    """A craft's truth: cells, mass in kg, peak specific force in m/s^2, full stick in deg/s, lags in s."""
+    """A craft's truth.
+
+    Mass in kg, peak specific force in m/s^2, full stick in deg/s, lags in s.
+    """
 
     name: str
     cells: int
@@ -182,7 +185,10 @@ def in_header(checkpoint: Path, folder: Path) -> Thrust:
 
 
 def on_evaluator(checkpoint: Checkpoint, model: ModelParameters) -> Thrust:
-    """Return what a flight of the evaluator shows: its force over that of the thrust map, times the map's."""
+    """Return the thrust that a flight of the evaluator shows.
+
+    It is that of the thrust map, times the median ratio of the flight's force to the map's.
+    """
     env = simulated_env(checkpoint)
     params = flights.start_pose_params(env.default_params, NUM_STEPS)
     flown = flights.fly_episode(
@@ -206,7 +212,7 @@ def on_evaluator(checkpoint: Checkpoint, model: ModelParameters) -> Thrust:
 
 
 def race(checkpoint: Checkpoint) -> tuple[int, float]:
-    """Return how many noisy starts finish three laps in the simulator, and the median flying lap, s."""
+    """Return how many noisy starts finish three laps simulated, and the median flying lap, s."""
     env = simulated_env(checkpoint)
     keys = flights.start_keys(0, NUM_STARTS)
     outcomes = flights.race_many(env, checkpoint.policy, keys, NUM_STEPS, NUM_LAPS)
@@ -249,7 +255,7 @@ def measure(
 
 
 def largest_difference(rows: list[dict[str, Any]]) -> tuple[float, float]:
-    """Return by how much thrust at full stick (share) and hover stick differ most from the model's."""
+    """Return the largest differences from the model's full thrust (share) and hover stick."""
     full, hover = [], []
     for row in rows:
         for where in ("environment", "header", "evaluator"):
@@ -267,7 +273,10 @@ def table(rows: list[dict[str, Any]]) -> str:
         thrusts = [f"{row[place].full:.3f} / {row[place].hover:.3f}" for place in places]
         race_cells = [f"{row['finished']} of {NUM_STARTS}", f"{row['lap_s']:.2f} s"]
         lines.append([row["craft"], row["kind"], row["battery"], truth, *thrusts, *race_cells])
-    head = "craft | model | battery | truth | by the model | in the environment | in the C header | in a flight"
+    head = (
+        "craft | model | battery | truth | by the model | in the environment | in the C header | "
+        "in a flight"
+    )
     return report.table(f"{head} | finished | flying lap", lines)
 
 

@@ -1,4 +1,6 @@
-"""Laws without a name: ``python -m benchmarks.beyond [--laws 4] [--clean 20] [--listed 10] [--page]``.
+"""Laws outside the package's list: what the diagnosis learns of them.
+
+Usage: ``python -m benchmarks.beyond [--laws 4] [--clean 20] [--listed 10] [--page]``.
 
 Flies plants with laws outside the package's list (benchmarks.hidden.outside, equations of their
 own), clean ones, and ones with listed effects only, a minute each, and grades what the diagnosis
@@ -152,7 +154,7 @@ def figures(lines: Sequence[dict[str, Any]]) -> list[report.Figure]:
 
 
 def kind_rows(lines: Sequence[dict[str, Any]]) -> list[tuple[str, int, int, int]]:
-    """Return, by kind of law, how many plants there are, of how many the form is right, any law learnt."""
+    """Return, by kind of law, the numbers of plants, of right forms and of laws learnt."""
     rows = []
     for kind in RIGHT:
         own = [line for line in lines if line["row"] == kind]
@@ -173,7 +175,7 @@ def diagnoses_of(record: Any) -> list[dict[str, Any]]:
 
 
 def real_rows() -> list[tuple[str, str, str, str]]:
-    """Return, by diagnosis of measured flights, what was learnt and what it does to errors of free flight.
+    """Return what each diagnosis of measured flights learnt, and its ratios of errors.
 
     Errors are of velocity and position on held-out rows, over those of the extended model without
     it.

@@ -1,4 +1,6 @@
-"""The champions of the FlyTrack course: ``python -m benchmarks.champion [--names robust] [--seeds 0 1]``.
+"""The champions of the FlyTrack course.
+
+Usage: ``python -m benchmarks.champion [--names robust] [--seeds 0 1]``.
 
 Two policies, each trained by PPO and then polished, on the identified and extended model of the
 shipped black box: ``flytrack`` for that model as it is, flown on the black box itself; ``robust``
@@ -40,8 +42,8 @@ CHANGES: dict[str, Any] = {
 }
 RUNS = Path("runs/champion")
 HEADER = (
-    "seed | finish | first lap (s) | flying lap (s) | times the time-optimal | before polishing | PPO (s) | "
-    "polishing (s)"
+    "seed | finish | first lap (s) | flying lap (s) | times the time-optimal | before polishing | "
+    "PPO (s) | polishing (s)"
 )
 STEPS, FLIGHTS, LAPS, FLIGHT_SEED = 2500, 256, 3, 100
 
@@ -91,7 +93,7 @@ RECIPES = {
 
 
 class Flown(NamedTuple):
-    """A policy's file, its evaluation, the share of flights that finish, and times the time-optimal lap."""
+    """A policy's file, its evaluation, share of finishes, and flying lap over the time-optimal."""
 
     policy: Path
     found: Report
@@ -121,7 +123,7 @@ def fly(policy: Path, recipe: Recipe) -> Flown:
 
 
 def train(name: str, seed: int) -> tuple[Path, Path]:
-    """Train and polish a seed unless it is there; return the files of the policy before and after."""
+    """Train and polish a seed unless it is there; return the policy's files before and after."""
     recipe, folder = RECIPES[name], RUNS / name / f"seed{seed}"
     before, after = folder / "before.safetensors", folder / f"{name}.safetensors"
     if not before.exists():
@@ -160,7 +162,7 @@ def row_of(seed: int, before: Flown, after: Flown) -> list[str]:
 
 
 def section_of(name: str, seeds: list[int]) -> tuple[str, bool]:
-    """Train, fly and ship a champion; return its part of the page and whether the targets are met."""
+    """Train, fly and ship a champion; return its part of the page and whether targets are met."""
     recipe = RECIPES[name]
     flown = [[fly(policy, recipe) for policy in train(name, seed)] for seed in seeds]
     after = [pair[1] for pair in flown]
@@ -190,8 +192,8 @@ def section_of(name: str, seeds: list[int]) -> tuple[str, bool]:
     ]
     lines = [
         f"## `{path}`",
-        f"PPO on {recipe.env_id}, {recipe.config.total_timesteps / 1e6:.0f} M steps, {changes}; polishing: "
-        f"{polished}. Shipped: seed {best.found.checkpoint.meta['seed']}.",
+        f"PPO on {recipe.env_id}, {recipe.config.total_timesteps / 1e6:.0f} M steps, {changes}; "
+        f"polishing: {polished}. Shipped: seed {best.found.checkpoint.meta['seed']}.",
         report.figures_table(figures),
         report.table(
             HEADER, [row_of(seed, *pair) for seed, pair in zip(seeds, flown, strict=True)]

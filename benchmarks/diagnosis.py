@@ -80,7 +80,7 @@ ROWS: dict[str, tuple[Callable[[Rng], hidden.Truth], str]] = {
 
 
 def model_of(truth: hidden.Truth) -> ModelParameters:
-    """Return the base of a plant: what its team believes in. How the plant moves they do not know."""
+    """Return the model that a plant's team believes in; they do not know how the plant moves."""
     return ModelParameters(
         tau=np.array(truth.tau, np.float32),
         thrust_coeffs=np.array(truth.coeffs, np.float32),
@@ -92,7 +92,9 @@ def model_of(truth: hidden.Truth) -> ModelParameters:
 
 
 def make_log(trial: Trial) -> tuple[hidden.Truth, FlightLog, FlightLog, ModelParameters, Rng]:
-    """Return a plant, its flight without and with noise, its team's model, and the generator that drew it.
+    """Return a plant, its clean and its noisy flight, its team's model, and its generator.
+
+    The generator is the random one that drew the plant.
 
     The plant's parameters do not depend on its motion and the log's rate.
     """

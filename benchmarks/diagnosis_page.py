@@ -52,7 +52,10 @@ def is_clear(line: Line) -> bool:
 
 
 def exact_sets(lines: Iterable[Line]) -> list[bool]:
-    """Return, of plants all of whose effects are shown and separable, whether exactly they are named."""
+    """Return whether exactly the true effects are named, for plants whose effects are clear.
+
+    Effects are clear if all of them are shown and separable.
+    """
     return [is_exact(line) for line in lines if is_clear(line)]
 
 
@@ -79,7 +82,7 @@ def is_clock_right(line: Line) -> bool:
 
 
 def is_onset_right(line: Line) -> bool:
-    """Return whether exactly the effect that begins in flight is found, and its onset within a second."""
+    """Return whether exactly the true effect is found, and its onset within a second."""
     times = [cause.get("onset_s", [np.inf])[0] for cause in found(line)]
     return is_exact(line) and all(abs(one - line["onset"]) <= ONSET_WITHIN_S for one in times)
 

@@ -1,4 +1,6 @@
-"""Environment steps per second of process CPU time on one core, beside Pendulum and l2f; races, Gymnasium.
+"""Environment steps per second of process CPU time on one core.
+
+FlyTrack is measured beside Pendulum and l2f, in races of two, and through Gymnasium.
 
 ``python -m benchmarks.env_speed [--repeats 7] [--out PAGE]`` prints a table and writes it; with
 ``--effects`` that of the step's cost with each effect, and with each motion. Keys and actions are
@@ -44,7 +46,9 @@ class Contestant(NamedTuple):
 def jax_contestant(
     name: str, env_id: str, num_envs: int, length: int, is_batch: bool, model: Any = None
 ) -> Contestant:
-    """Return a scan of ``length`` steps of a gymnax environment, all outputs in the carry; with a model.
+    """Return a scan of ``length`` steps of a gymnax environment, all outputs in the carry.
+
+    model: that the environment simulates; None for its default.
 
     Of a race of two, all drones' actions are given.
     """
@@ -127,7 +131,7 @@ def l2f_contestant(name: str, num_envs: int, length: int) -> Contestant:
 def gymnasium_contestant(
     num_envs: int, length: int, autoreset_mode: str = "SameStep"
 ) -> Contestant:
-    """Return steps through Gymnasium, NumPy in and out: of a vector environment, or of a single one."""
+    """Return steps through Gymnasium, NumPy in and out, of a vector or a single environment."""
     import gymnasium
     import numpy as np
 
@@ -196,7 +200,10 @@ def cost_figure(name: str, cost: float, repeats: int) -> report.Figure:
 
 
 def effect_costs(repeats: int) -> str:
-    """Return a table of the step's cost with each effect or motion, over the plain step in turns with it."""
+    """Return a table of the step's cost with each effect or motion, relative to the plain step.
+
+    Both are timed in turns.
+    """
     plain, rows = jax_contestant(PLAIN, "FlyTrack-v0", 1024, 200, is_batch=False), []
     for name, model in report.progress(with_effects().items(), "model"):
         entry = jax_contestant(name, "FlyTrack-v0", 1024, 200, is_batch=False, model=model)
@@ -237,8 +244,8 @@ def main(repeats: int = 7, out: Path | None = None, effects: bool = False) -> No
     if effects:
         where = f"{repeats} rounds, {core}. {report.provenance_line(report.provenance())}"
         told = (
-            f"{report.command_line()}: `vmap(step)` of 1,024 environments, CPU time over that of the plain "
-            "step, median of the rounds."
+            f"{report.command_line()}: `vmap(step)` of 1,024 environments, CPU time over that "
+            "of the plain step, median of the rounds."
         )
         text = report.page("What an effect costs", told, effect_costs(repeats), where)
         report.write_page(out, text)

@@ -136,7 +136,10 @@ KINDS = {
 
 
 class Trial(NamedTuple):
-    """One flown set-up: its row (matched, single, pair), nominal set-up, excitation, what changed, number."""
+    """One flown set-up.
+
+    It has a row (matched, single or pair), a nominal set-up, an excitation, changes and a number.
+    """
 
     row: str
     setup: str
@@ -146,7 +149,7 @@ class Trial(NamedTuple):
 
 
 class Known(NamedTuple):
-    """What a team knows of its nominal set-up: its log, the model made from it, where sticks take it."""
+    """What a team knows of its nominal set-up: log, model, and where the sticks take it (m)."""
 
     log: FlightLog
     model: Any
@@ -171,7 +174,7 @@ def know(setup: str, flown: str, seed: int) -> Known:
 
 
 def places(settings: Mapping[str, Any], body: Body, seed: int) -> np.ndarray:
-    """Return where the sticks of ``collect``'s excitation take a craft in a second, (flights, 3), m."""
+    """Return displacements after a second of ``collect``'s excitation, (flights, 3), m."""
     hover = hover_action(nominal_parameters())
     flown = script_of(script(FLIGHTS, hover, np.random.default_rng(seed)))
     with Betaflight(settings, body) as plant:
@@ -209,7 +212,10 @@ def graded(trial: Trial, known: Known, seed: int) -> dict[str, Any]:
 
 
 def by_name(cause: Cause) -> dict[str, Mapping[str, Any]]:
-    """Return a cause's parameters by name; of the loop, by the first of the settings that change together."""
+    """Return a cause's parameters by name.
+
+    Those of the loop are grouped by the settings that change together, under the first of them.
+    """
     if cause.effect != "betaflight_loop":
         return {cause.effect: cause.parameters}
     groups = Candidate(
@@ -227,7 +233,7 @@ def names_of(kind: str, body: Body) -> tuple[set[str], set[str]]:
 
 
 def grade(changes: Sequence[tuple[set[str], set[str]]], names: list[str]) -> dict[str, bool]:
-    """Return whether the names are exactly those of what changed, in its classes, and whether one is false.
+    """Return whether the names are exact, exact up to their classes, and whether one is false.
 
     changes: as of ``names_of``. Each has at least one of its names, and each name belongs to a
     change.
@@ -245,7 +251,7 @@ def grade(changes: Sequence[tuple[set[str], set[str]]], names: list[str]) -> dic
 
 
 def error_ratios(found: Diagnosis) -> dict[str, float]:
-    """Return held-out position errors of the extended model over those of the refitted one, by horizon."""
+    """Return held-out position errors, extended over refitted model, by horizon."""
     errors = {name: one.get("position_m", {}) for name, one in found.prediction.errors.items()}
     base = errors.get("refitted_base", {})
     return {
@@ -299,7 +305,8 @@ def tables(lines: list[dict[str, Any]]) -> str:
         if line["row"] == "champion":
             share = f"{line['success']:.1%} of {line['episodes']} starts finish 3 laps"
             parts.append(
-                f"The shipped champion, blind: {share}; {line['gates']:.1f} of 24 gates in the mean."
+                f"The shipped champion, blind: {share}; "
+                f"{line['gates']:.1f} of 24 gates in the mean."
             )
     return "\n\n".join(parts)
 

@@ -32,9 +32,9 @@ NUM_FLIGHTS = 256
 REPEATS, LENGTH = 5, 64  # calls, and steps of each
 PAGE = report.RESULTS / "gpu.md"
 WHAT = (
-    "256 flights on the accelerator and on the CPU; rates with random actions, observations and resets "
-    "included, compilation excluded, wall time; training by PPO as shipped. Both devices run the same "
-    "equations: their agreement says something of rounding, not of physics."
+    "256 flights on the accelerator and on the CPU; rates with random actions, observations and "
+    "resets included, compilation excluded, wall time; training by PPO as shipped. Both devices "
+    "run the same equations: their agreement says something of rounding, not of physics."
 )
 
 
@@ -45,7 +45,10 @@ def rate_of(entry: Contestant) -> float:
 
 
 def open_loop(keys: jax.Array) -> jax.Array:
-    """Return positions, (num_flights, 3), after the same second of random actions from the start pose."""
+    """Return positions, (num_flights, 3), after a second of random actions from the start pose.
+
+    The actions are the same in every call.
+    """
     env = flytrack_env.make("FlyTrack-v0")
     actions = jax.random.uniform(jax.random.key(1), (NUM_FLIGHTS, 100, 4), minval=-1.0)
 
@@ -61,7 +64,7 @@ def open_loop(keys: jax.Array) -> jax.Array:
 
 
 def agreement() -> str:
-    """Return how far flights on the accelerator are from those on the CPU, and a champion's races on both."""
+    """Compare flights on the accelerator with those on the CPU, and a champion's races on both."""
     champion = load_checkpoint(CHAMPION)
     env = flytrack_env.make("FlyTrack-v0", model=MODEL)
     ends, rows = [], []
@@ -74,7 +77,8 @@ def agreement() -> str:
     apart_m = np.abs(ends[0] - ends[1]).max()
     return (
         report.table("the champion on | finish | flying lap (s)", rows)
-        + f"\n\nAfter the same second of random actions, positions differ by at most {apart_m:.1g} m."
+        + "\n\nAfter the same second of random actions, positions differ by at most "
+        f"{apart_m:.1g} m."
     )
 
 
@@ -116,7 +120,10 @@ def race(config: Config) -> str:
     started, held = time.perf_counter(), held_from(train(Trainer(config), 0))
     since = "never" if held is None else f"from {held.steps / 1e6:.2f} M steps on"
     spent = f"{time.perf_counter() - started:.0f} s with evaluations and compilation"
-    return f"Seed 0, {config.total_timesteps / 1e6:g} M steps: 95 % of 256 starts finish {since}; {spent}."
+    return (
+        f"Seed 0, {config.total_timesteps / 1e6:g} M steps: 95 % of 256 starts finish {since}; "
+        f"{spent}."
+    )
 
 
 def main(most: int = 20, steps: int = 8_000_000, cpu: bool = False) -> None:

@@ -28,8 +28,8 @@ EVERY = 250_000  # environment steps
 NUM_EPISODES, NUM_LAPS, NUM_STEPS = 256, 3, 2500
 EVALUATION_SEED = 30_000
 HEADER = (
-    "seed | 95 % held from (M steps) | CPU s until then | CPU s of the whole run | success at the end | "
-    "first lap (s) | flying lap (s)"
+    "seed | 95 % held from (M steps) | CPU s until then | CPU s of the whole run | "
+    "success at the end | first lap (s) | flying lap (s)"
 )
 
 
@@ -72,7 +72,7 @@ def train(trainer: Trainer, seed: int) -> list[Point]:
 
 
 def held_from(points: list[Point]) -> Point | None:
-    """Return the first evaluation from which on the target is met at every one, to the end; None: never."""
+    """Return the first evaluation from which on all meet the target; None without one."""
     missed = [index for index, point in enumerate(points) if point.success < TARGET_SUCCESS]
     first = missed[-1] + 1 if missed else 0
     return points[first] if first < len(points) else None
@@ -116,7 +116,10 @@ def main(seeds: int = 5, out: Path = report.RESULTS / "learning_curve.md") -> No
     draw(chart, curves)
     held = [held_from(points) for points in curves.values()]
     is_held = [point is not None and point.steps <= TARGET_STEPS for point in held]
-    name = f"seeds that hold {TARGET_SUCCESS:.0%} from at most {TARGET_STEPS / 1e6:g} M steps on, to the end"
+    name = (
+        f"seeds that hold {TARGET_SUCCESS:.0%} from at most {TARGET_STEPS / 1e6:g} M steps on, "
+        "to the end"
+    )
     report.fill_page(
         out,
         "learning_curve",

@@ -1,4 +1,4 @@
-"""What is read of faulty logs: a table of the outcomes of the tests, for ``benchmarks.any_drone``."""
+"""A table of the outcomes of the tests of faulty logs, for ``benchmarks.any_drone``."""
 
 import subprocess
 import sys
@@ -17,7 +17,7 @@ ULOG, DATAFLASH = "tests/unit/test_import_ulog.py", "tests/unit/test_import_data
 
 
 class Format(NamedTuple):
-    """A kind of log: its name in the tests of clocks, that of its format, and its test of two batteries."""
+    """A kind of log: its name in the tests of clocks, its format, and its test of two batteries."""
 
     name: str
     form: str
@@ -36,7 +36,7 @@ FORMATS = (
 
 
 def clock(fault: str) -> Callable[[Format], list[tuple[str, str]]]:
-    """Return the tests of a fault of clocks: pairs of the beginning of a test's name and what it shows."""
+    """Return the tests of a clock fault: beginnings of their names, and what each shows."""
     return lambda one: [(f"test_every_format_reads_every_clock[{one.name}-{fault}]", "right")]
 
 

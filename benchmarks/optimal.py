@@ -124,7 +124,9 @@ def _evaluate(jaxpr: Any, constants: Any, arguments: list[Any]) -> list[Any]:
 
 
 def step_function(model: ModelParameters) -> casadi.Function:
-    """Return the model's step, (21,), (4,), s -> (21,), packed as ``flytrack_env.state`` says, float64.
+    """Return the model's step in float64, (21,), (4,), s -> (21,).
+
+    States are packed as ``flytrack_env.state`` says.
 
     Raises:
         ValueError: an effect with a memory, or an operation that has no counterpart in CasADi.
@@ -206,7 +208,7 @@ class Solution(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """The task: kind "flying" or "standing", gates and bounds, drone radius, m, and the first state.
+    """The task: kind "flying" or "standing", gates and bounds, drone radius, and first state.
 
     start: (21,): where a standing start begins; of a flying lap only the battery voltage is taken.
     """
@@ -226,7 +228,10 @@ Limit = tuple[Any, float, float]  # an expression and its bounds, elementwise
 
 
 def _gate_limits(task: Task, index: int, point: Any, velocity: Any) -> list[Limit]:
-    """Return that a point is on a gate's plane, within its opening less the drone, flown in its direction."""
+    """Return the limits of a gate: on its plane, within its opening, flown in its direction.
+
+    The drone's radius and a clearance are taken off the opening.
+    """
     gates = task.course.gates
     vectors = (gates.centre, gates.forward, gates.left(), gates.up)
     centre, forward, left, up = (np.array(axes, float)[:, index] for axes in vectors)
@@ -241,7 +246,7 @@ def _gate_limits(task: Task, index: int, point: Any, velocity: Any) -> list[Limi
 
 
 class Problem:
-    """The program of a task and a model for given numbers of steps; solved again from other guesses.
+    """The program of a task and model for given numbers of steps; solved again from new guesses.
 
     step: the model's step. needed: the places of the state vector that it depends on. counts:
     (num_gates,), steps of each segment. closure: as ``Guess.closure`` says, of a flying lap.
@@ -313,7 +318,7 @@ class Problem:
             yield from _gate_limits(self.task, index, between[position], after[velocity])
 
     def _cost(self) -> Any:
-        """Return the time to the last gate, s, and that of changes of the commands, as an expression."""
+        """Return the cost: time to the last gate, s, and a penalty on changes of the commands."""
         whole_s = casadi.dot(self.steps_s, casadi.DM(self.counts).T)
         total_s = whole_s - (1.0 - self.fractions[-1]) * self.steps_s[-1]
         return total_s + SMOOTHING_S * casadi.sumsqr(casadi.diff(self.commands, 1, 1))
@@ -385,7 +390,7 @@ class Problem:
         )
 
     def _unstack(self, values: np.ndarray) -> Guess:
-        """Return the flight of the solver's variables, with the places of the state that it does not need."""
+        """Return the flight of the solver's variables, with all entries of the state."""
         variables = (self.states, self.commands, self.steps_s)
         ends = np.cumsum([variable.numel() for variable in variables])
         short, commands, steps_s, fractions = np.split(values, ends)
@@ -511,14 +516,14 @@ class _Search:
     def solve(
         self, guess: Guess, counts: np.ndarray, is_on_grid: bool, options: dict[str, Any]
     ) -> Solution:
-        """Return the solution from a guess, for numbers of steps of each segment; counts iterations."""
+        """Return the solution from a guess for numbers of steps by segment; count iterations."""
         problem = Problem(self.task, self.step, self.needed, counts, guess.closure())
         found = problem.solve(guess, is_on_grid, QUIET | options)
         self.iterations += found.iterations
         return found
 
     def coarse(self) -> tuple[Guess, np.ndarray, list[float]]:
-        """Return the best of all starts, its numbers of steps, and all starts' times, s, NaN if failed."""
+        """Return the best of all starts, its numbers of steps, and all times, s (NaN if failed)."""
         counts = np.round(segment_lengths(self.task) / COARSE_STEP_M).astype(int)
         counts = np.maximum(counts, FEWEST_STEPS)
         best, times = None, []
@@ -543,7 +548,7 @@ class _Search:
         return found, new_counts
 
     def on_grid(self, flight: Guess, counts: np.ndarray) -> tuple[Solution, np.ndarray]:
-        """Return the optimum in steps of ``dt_s``, every gate passed within the step where it is best.
+        """Return the optimum in steps of ``dt_s``, each gate within the step where it is best.
 
         Gates at an end of their step move to the next one, as long as that is new and can be
         solved.
@@ -570,7 +575,10 @@ class _Search:
 
 
 def _lengthened(flight: Guess, num_steps: int, shifts: np.ndarray) -> Guess:
-    """Return a flight with its last step repeated or dropped, and moved gates at the other end of a step."""
+    """Return a flight of ``num_steps``, with moved gates at the other end of a step.
+
+    Its last step is repeated or dropped.
+    """
     ends = [FRACTION_EDGE, 1.0 - FRACTION_EDGE]
     fractions = np.select([shifts > 0, shifts < 0], ends, flight.fractions)
     rows = np.minimum(np.arange(num_steps + 1), len(flight.states) - 1)

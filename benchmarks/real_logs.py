@@ -1,10 +1,10 @@
 """The diagnosis of measured flights of five drones, and models judged on policies left out.
 
 ``python -m benchmarks.real_logs --diagnose crazyflie,payload,nanobench,gecko,betaflight [--data
-../shared/data]`` diagnoses flights and keeps the records in benchmarks/data/real; without ``--diagnose``,
-docs/results/real_logs_diagnosis.md and its pictures are made of the records there and of those of
-``python -m benchmarks.real.crazyflie``. Where the data or the reader of Betaflight logs are absent, it says
-so and writes nothing.
+../shared/data]`` diagnoses flights and keeps the records in benchmarks/data/real; without
+``--diagnose``, docs/results/real_logs_diagnosis.md and its pictures are made of the records there
+and of those of ``python -m benchmarks.real.crazyflie``. Where the data or the reader of Betaflight
+logs are absent, it says so and writes nothing.
 """
 
 import json

@@ -1,4 +1,6 @@
-"""What all benchmarks share: tables and pages in Markdown, and a record of what was measured where and when.
+"""What all benchmarks share: Markdown tables and pages, and records of measurements.
+
+A record says what was measured, where and when.
 
 Nothing here imports JAX at the top, so that ``pin_to_one_core`` can run before JAX starts its
 threads.
@@ -51,7 +53,7 @@ def cpu_name() -> str:
 
 
 def commit_of_checkout() -> str:
-    """Return the checkout's commit, with ``-dirty`` if tracked files but results have changed since."""
+    """Return the checkout's commit, with ``-dirty`` if tracked files but results changed."""
 
     def git(*command: str) -> str:
         run = subprocess.run(
@@ -96,18 +98,24 @@ def provenance(*packages: str) -> dict[str, Any]:
 def provenance_line(record: dict[str, Any]) -> str:
     """Return a record's provenance as the last line of a page."""
     packages = ", ".join(f"{name} {number}" for name, number in record["versions"].items())
-    return f"Measured at commit {record['commit']} on {record['date']}; {record['machine']}; {packages}."
+    return (
+        f"Measured at commit {record['commit']} on {record['date']}; {record['machine']}; "
+        f"{packages}."
+    )
 
 
 def table(header: str | Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Return a table in Markdown, without a newline at its end; header: "column | column" or a sequence."""
+    """Return a table in Markdown, without a newline at its end.
+
+    header: "column | column" or a sequence.
+    """
     columns = header.split(" | ") if isinstance(header, str) else header
     lines = [columns, ["---"] * len(columns), *rows]
     return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
 
 
 class Figure(NamedTuple):
-    """A figure of a page: its name, its target ("" for none), what was measured, and of how many values."""
+    """A figure of a page: name, target ("" for none), what was measured, number of values."""
 
     name: str
     target: str
@@ -121,7 +129,7 @@ def figures_table(figures: Iterable[Figure]) -> str:
 
 
 def share(flags: Sequence[bool | int]) -> tuple[str, int]:
-    """Return the share of true values as text, "none" of no values, and how many values there are."""
+    """Return the share of true values as text, "none" of no values, and the number of values."""
     return f"{100.0 * sum(flags) / len(flags):.1f} %" if len(flags) else "none", len(flags)
 
 

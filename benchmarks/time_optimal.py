@@ -54,7 +54,7 @@ def start_state(track: Track, battery_v: float) -> np.ndarray:
 
 
 def drained_in_float32(model: ModelParameters, start: np.ndarray, dt_s: float) -> ModelParameters:
-    """Return the model with the battery drain that results from float32, for the optimiser in float64.
+    """Return the model with the battery drain of float32 steps, for the optimiser in float64.
 
     A step drains so little that rounding the voltage changes the drain by up to a percent, in every
     step the same way: millimetres on a path, after seconds. start: (21,), the state at which
@@ -184,7 +184,7 @@ def is_verified(reference: Reference, flown: Replay) -> bool:
 
 
 def verified(folder: Path, tracks: list[Track]) -> tuple[list[tuple[Reference, str, Replay]], bool]:
-    """Return a folder's references with their replays, and whether those in the reference's model are right.
+    """Return a folder's references with their replays, and whether those in their model are right.
 
     References of the model ``black_box`` are flown on the shipped black box as well. tracks: where
     references may be of tracks that are not shipped.
@@ -213,7 +213,7 @@ def verified(folder: Path, tracks: list[Track]) -> tuple[list[tuple[Reference, s
 
 
 def write_pictures(page: Path, references: list[Reference], tracks: list[Track]) -> None:
-    """Write a picture per track of its flying lap from above, coloured by speed, beside the page."""
+    """Write, beside the page, a picture per track of its flying lap from above, by speed."""
     from flytrack_env.pictures import draw_flight, make_flight
     from flytrack_env.pictures.drawing import png_of  # matplotlib, needed only here
 

@@ -29,7 +29,7 @@ BOUND = (
 
 
 def matrix_limit(trainer: Trainer) -> float:
-    """Return the steps a CPU second if products of matrices at this core's best rate were all there is.
+    """Return the steps per CPU second if only matrix products at the best rate took time.
 
     The best rate: a chain of products of a minibatch and a layer, which stay in the cache. A step
     takes a product with every weight to act, one to learn, one for the gradient of the weights, and

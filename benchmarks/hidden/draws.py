@@ -21,7 +21,7 @@ OTHER_AXES, SIDEWAYS, GROUND_M, ZETA = (0.5, 1.0), (0.7, 1.4), (0.2, 0.5), (0.4,
 
 
 class EffectRange(NamedTuple):
-    """How an effect is drawn: smallest and largest size, their unit, and its parameters at a size."""
+    """How an effect is drawn: smallest and largest size, unit, and parameters at a size."""
 
     low: float
     high: float
@@ -89,7 +89,10 @@ def _ground(size: float, rng: Rng) -> Values:
 def _per_axis(
     suffix: str = "", signs: tuple[float, ...] = (1.0,)
 ) -> Callable[[float, Rng], Values]:
-    """Return a maker of values of one sign: the size on one axis, half of it or more on the others."""
+    """Return a function that draws a value per axis, all of one sign.
+
+    One axis has the size, the others half of it or more.
+    """
 
     def make(size: float, rng: Rng) -> Values:
         shares = rng.uniform(*OTHER_AXES, len(STICKS))
@@ -162,7 +165,10 @@ def log_uniform(low: float, high: float, rng: Rng) -> float:
 
 
 def draw_base(rng: Rng) -> Truth:
-    """Return a plant without effects: lags of 15 to 70 ms, a drawn thrust curve, else the handout."""
+    """Return a plant without effects: lags and thrust curve are drawn, the rest is the handout's.
+
+    Lags are between 15 and 70 ms.
+    """
     tau = tuple(log_uniform(*TAU_S, rng) for _ in range(4))
     full, idle = rng.uniform(*FULL_THRUST_N), rng.uniform(*IDLE_THRUST_N)
     curved, cubic = rng.uniform(*CURVED), rng.uniform(*CUBIC)
@@ -213,7 +219,7 @@ def draw_truth(rng: Rng, num_effects: int) -> Truth:
 
 
 def draw_gust(rng: Rng) -> Gust:
-    """Return gusts of 0.3 to 1.5 m/s^2 that last for 0.3 to 3 s; half of them turn the drone as well."""
+    """Return gusts of 0.3 to 1.5 m/s^2 that last 0.3 to 3 s; half of them also turn the drone."""
     rate_std = log_uniform(*GUST_RATE_STD, rng) if rng.random() < 0.5 else 0.0
     return Gust(log_uniform(*GUST_STD, rng), log_uniform(*GUST_S, rng), rate_std)
 

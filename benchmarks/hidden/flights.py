@@ -34,8 +34,8 @@ def fly(truth: Truth, seconds: float, rng: np.random.Generator) -> FlightLog:
             break
     else:
         raise RuntimeError(
-            f"flight of {truth.text()}: found {height:.2f} m and {speed:.1f} m/s after {TRIES} tries, "
-            f"expected {FLOOR_M} m or more and {FASTEST} m/s or less"
+            f"flight of {truth.text()}: found {height:.2f} m and {speed:.1f} m/s after "
+            f"{TRIES} tries, expected {FLOOR_M} m or more and {FASTEST} m/s or less"
         )
     rows["f"], rows["w"] = imu_readings(truth, rows["f"], rows["w"], rows.pop("slope"))
     for channel in "pvq":

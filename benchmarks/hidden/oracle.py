@@ -73,7 +73,7 @@ def clean_problem(
 
 
 def with_all(state: SearchState, effects: Mapping[str, Mapping[str, float]]) -> FittedModel:
-    """Return the model with all true effects that fits the clean log best, from the true parameters.
+    """Return the model with all true effects, fitted to the clean log from the true parameters.
 
     Each is looked for in the way that has its true parameters and the fewest others.
     """
@@ -141,7 +141,7 @@ def known(
 def removed(
     clean: FlightLog, base: ModelParameters, extended: ModelParameters
 ) -> tuple[float, float]:
-    """Return the share of a clean flight's explainable error that an extended model removes, and that error.
+    """Return the share of explainable error that a model removes on a clean flight, and the error.
 
     base: refitted, without effects, in the same motion. The error is the rms whitened residual of
     that, 1 is the noise.
@@ -183,7 +183,9 @@ def _expected(truth: Truth, log: FlightLog, tau: np.ndarray, coeffs: np.ndarray)
 
 
 def signal_to_noise(truth: Truth, log: FlightLog) -> float:
-    """Return how far clean accelerometer, gyro and voltage are from those of the plant without effects.
+    """Return how far clean sensors are from those of the plant without effects.
+
+    The sensors are accelerometer, gyro and voltage.
 
     The root of the sum of squared differences, each over the noise of ``benchmarks.hidden.noise``
     (voltage: over its resolution): by about how many standard deviations the effects are visible to

@@ -1,21 +1,21 @@
 """How effects outside the package's list are drawn: each a smooth function of one quantity.
 
-=============  ==================================================  =======================================
-kind           what it is                                          how it acts, at most
-=============  ==================================================  =======================================
-position       a thermal: a bump about a place on the way          force in the world
-time           a step or a hump somewhere in the flight            thrust, or body rates
-heading        waves of order 2 and 3 in the heading               force in the body's x, y, or yaw rate
-airspeed       a resonance: a bump about one airspeed              force against the airspeed
-attitude       a bump about one angle of tilt                      thrust lost
-command        a dead zone about one stick position, or backlash   stick of one axis
-periodic       a sine of 0.5 to 20 Hz                              force in the body, or body rates
-stochastic     strong gusts                                        force in the world, or body rates
-flapping       blades that flap: pitch with forward airspeed       body rates
-cable          a cable that pulls to one side, by heading          force in the world
-heating        motors that heat up with the square of thrust       thrust lost
-payload        a load on a string that swings                      force in the world
-=============  ==================================================  =======================================
+==========  =================================================  =====================================
+kind        what it is                                         how it acts, at most
+==========  =================================================  =====================================
+position    a thermal: a bump about a place on the way         force in the world
+time        a step or a hump somewhere in the flight           thrust, or body rates
+heading     waves of order 2 and 3 in the heading              force in the body's x, y, or yaw rate
+airspeed    a resonance: a bump about one airspeed             force against the airspeed
+attitude    a bump about one angle of tilt                     thrust lost
+command     a dead zone about one stick position, or backlash  stick of one axis
+periodic    a sine of 0.5 to 20 Hz                             force in the body, or body rates
+stochastic  strong gusts                                       force in the world, or body rates
+flapping    blades that flap: pitch with forward airspeed      body rates
+cable       a cable that pulls to one side, by heading         force in the world
+heating     motors that heat up with the square of thrust      thrust lost
+payload     a load on a string that swings                     force in the world
+==========  =================================================  =====================================
 
 Waves in the heading begin at order 2: a steady wind, which the list has, is of order 1 in the body.
 """
@@ -142,7 +142,9 @@ DRAWS |= {
 
 
 def draw_outside(rng: Rng, kind: str | None = None, amplitude: float | None = None) -> Outside:
-    """Return an effect outside the list; kind and amplitude are drawn if not given, the latter log-uniform.
+    """Return an effect outside the list, of a given or drawn kind and amplitude.
+
+    A drawn amplitude is log-uniform.
 
     amplitude: as a multiple of the sensor noise in its channel.
 

@@ -1,4 +1,4 @@
-"""A pilot who knows the drone, and plans of what is to be flown, put together from legs and manoeuvres.
+"""A pilot who knows the drone, and flight plans made of legs and manoeuvres.
 
 The pilot is cascaded control from position to sticks, on the true state. The gains follow the
 plant's own lags, so that slow drones are flown gently and no hidden effect makes the loop
@@ -87,7 +87,10 @@ Hands = tuple[float | None, ...]  # sticks moved by hand, None where the pilot f
 
 
 class Moment(NamedTuple):
-    """The target at one time: m, m/s, m/s^2, rad, world; sticks moved by hand, None where the pilot flies."""
+    """The target at one time, world: m, m/s, m/s^2, rad.
+
+    sticks: those moved by hand; None where the pilot flies.
+    """
 
     pos_w: Vector
     vel_w: Vector
@@ -175,7 +178,9 @@ def steps_of(seconds: float) -> int:
 
 
 def leg(sketch: Sketch, speed: float, hold_s: float, turning: float) -> None:
-    """Append a leg: accelerate to a speed, hold it, brake; the direction turns, rad/s, and leads home.
+    """Append a leg: accelerate to a speed, hold it, brake.
+
+    The direction turns at ``turning``, rad/s. A leg that begins far away leads home.
 
     The nose points anywhere and turns slowly.
     """
@@ -197,7 +202,10 @@ def leg(sketch: Sketch, speed: float, hold_s: float, turning: float) -> None:
 
 
 def wave(axis: int, amplitude: float, rng: Rng) -> np.ndarray:
-    """Return a doublet, chirp or short pulse on one rate stick, the other two centred, (num_rows, 4)."""
+    """Return sticks, (num_rows, 4), with a doublet, chirp or short pulse on one rate stick.
+
+    The other two rate sticks are centred.
+    """
     name, sign = rng.choice(["doublet", "chirp", "pulses"]), rng.choice([-1.0, 1.0])
     if name == "chirp":
         time = np.arange(steps_of(CHIRP_S)) * DT_S

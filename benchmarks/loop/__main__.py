@@ -50,7 +50,7 @@ def main(
     out: Path = Path("runs/loop"),
     page: Path | None = None,
 ) -> None:
-    """Run what is missing, print and write the page; exit 1 where a job failed or the target is missed.
+    """Run what is missing, print and write the page; exit 1 on a failed job or a missed target.
 
     plants: with hidden effects, beside the shipped one. laws: plants with a law outside the list,
     instead. seed: of plants, trainings, logs and evaluations. steps: of every training. out: folder

@@ -1,4 +1,4 @@
-"""The jobs of the loop's benchmark, each on one core: policies that need no plant, and one job per plant.
+"""The jobs of the loop's benchmark, each on one core: shared policies, and one job per plant.
 
 A job is ``nominal`` or ``randomised`` (shared policies), ``shipped``, the number of a hidden plant,
 or ``law_`` and that of a plant with a law outside the package's list. JAX is imported by the jobs
@@ -29,7 +29,7 @@ def pin(free_cores: Any) -> None:
 
 
 def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
-    """Return a job's result, from its file if it was finished before; an unfinished job starts again.
+    """Return a job's result, from its file if it has finished; an unfinished job starts again.
 
     What it prints, and the traceback of an error, go to a log in the job's folder. Programs are
     forgotten, since a process may map only so many into its memory.

@@ -1,4 +1,4 @@
-"""The page of the loop's benchmark: how each policy does on each plant, and whether the extension helped."""
+"""The page of the loop's benchmark: each policy on each plant, and what the extension changed."""
 
 import math
 from pathlib import Path

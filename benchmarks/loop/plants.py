@@ -78,7 +78,7 @@ def draw_plant(number: int, seed: int) -> Truth:
 
 
 def draw_plant_with_law(number: int, seed: int) -> Truth:
-    """Return a plant by its number, from 0, with a law outside the package's list; kinds take turns."""
+    """Return a plant by its number, from 0, with a law outside the list; kinds take turns."""
     rng = np.random.default_rng([seed, number, len(STATELESS_KINDS)])
     kind = STATELESS_KINDS[number % len(STATELESS_KINDS)]
     outside = draw_outside(rng, kind, log_uniform(*LAW_AMPLITUDES, rng))

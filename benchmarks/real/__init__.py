@@ -1,1 +1,4 @@
-"""Figures on measured flights: leave-one-policy-out on a Crazyflie, beside black boxes of the same rows."""
+"""Figures on measured flights: leave-one-policy-out on a Crazyflie, and black boxes.
+
+The black boxes learn from the same rows.
+"""

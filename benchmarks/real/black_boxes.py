@@ -62,7 +62,7 @@ Answer = Callable[[Rows], np.ndarray]
 
 
 def base_steps(model: ModelParameters, log: FlightLog) -> np.ndarray:
-    """Return the base's rates after the step from every row, and its specific force there, body frame."""
+    """Return the base's rates and specific force after a step from every row, body frame."""
     after = predict(model, fill_gaps(log)).after
     turned = Rotation.from_quat(log["q"], scalar_first=True)
     return np.c_[columns(after.rates_b), turned.inv().apply(columns(after.acc_w) + GRAVITY)]
@@ -194,7 +194,10 @@ def linear_ones(rows: Rows) -> Mapping[str, Answer]:
 
 
 def flown(answer: Answer, windows: Windows, base: np.ndarray) -> Tested:
-    """Return a black box's errors on windows of a log; base: of ``base_steps``, all rows of the log."""
+    """Return a black box's errors on windows of a log.
+
+    base: ``base_steps`` of all rows of the log.
+    """
     record, first = windows.record, windows.first_free - 1
     step_s = float(np.median(record.step_s))
     long, past_rates = _past(step_s)

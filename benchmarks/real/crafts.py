@@ -33,7 +33,8 @@ RIDGE = 1e-6
 HORIZON, TARGETS = "0.25", {"refitted_base": 0.8, "arx": 1.1}
 NANOBENCH = "nanobench"
 HALVES = (
-    "B2_circle_fast_rep1 B3_figure8_fast_rep1 B5_helix_fast_rep1 B8_star_fast_rep1 B9_trefoil_medium_rep12",
+    "B2_circle_fast_rep1 B3_figure8_fast_rep1 B5_helix_fast_rep1 B8_star_fast_rep1"
+    " B9_trefoil_medium_rep12",
     "B10_lissajous_fast_rep1 B3_figure8_slow_rep1 B6_linear_ramp_rep2 B7_oval_fast_rep1"
     " B9_trefoil_fast_rep14",
 )
@@ -47,7 +48,10 @@ UNWANTED = ("linear_drag", "quadratic_drag", "rotor_drag", "wind")
 
 
 def gecko(data: Path) -> Record:
-    """Return the diagnosis of a Betaflight craft, and black boxes' errors; the second half is held out."""
+    """Return the diagnosis of a Betaflight craft, and the errors of black boxes.
+
+    The second half of the flight is held out.
+    """
     found = imported(data / GECKO / GECKO_FILE, "betaflight", GECKO_MAPPING)
     held_out = found.log.time > 0.5 * (found.log.time[0] + found.log.time[-1])
     diagnosis, record = diagnosed(found.log, found.nominal_model(), held_out)
@@ -66,7 +70,7 @@ def gecko(data: Path) -> Record:
 
 
 def best_linear(log: FlightLog, held_out: np.ndarray) -> float:
-    """Return the rms error of rates, rad/s, on held-out rows of a linear law that knows later setpoints, too.
+    """Return the held-out rms error of rates, rad/s, of a linear law that knows later setpoints.
 
     No linear model of whatever order that is driven by the setpoints can do better but by chance.
     """
@@ -106,7 +110,9 @@ def gecko_part(record: Record) -> str:
 
 
 def nanobench(data: Path) -> Record:
-    """Return diagnoses of a Crazyflie in angle mode, under Vicon, and extended over base errors by flight.
+    """Return diagnoses of a Crazyflie in angle mode, under Vicon, with error ratios by flight.
+
+    The ratios are of the extended model's errors over the base's.
 
     The ten flights are of eight kinds of trajectory. Two diagnoses, each learnt from one half of
     the flights and judged on the other, so that every flight is held out once.
@@ -163,7 +169,7 @@ def nanobench_part(record: Record) -> str:
 
 
 class Pair(NamedTuple):
-    """Logs that a model is of, with the mass it states, kg, and logs that it is diagnosed on, with theirs."""
+    """Logs that a model is of and logs that it is diagnosed on, each with a stated mass, kg."""
 
     known: tuple[str, ...]
     known_kg: float
@@ -193,7 +199,9 @@ def payload_flights(
 
 
 def in_proportion(model: ModelParameters, per_command: float) -> ModelParameters:
-    """Return a model whose thrust is in proportion to the command, which is in N: hover shows no curve.
+    """Return a model whose thrust is proportional to the command.
+
+    The command is in N. A flight near hover does not show the curve of the thrust.
 
     per_command: specific force, m/s^2, of a command of one above the lowest.
     """
@@ -211,7 +219,7 @@ def thrust_of(model: ModelParameters, log: FlightLog) -> float:
 
 
 def payload(data: Path) -> Record:
-    """Return a record of each pair: a hidden payload, for models of a Crazyflie's flights with another mass.
+    """Return a record of each pair: a hidden payload, by a model of flights with another mass.
 
     Between series: the model of logs 182 and 183, on logs 202 and 203, which carry 5 g on a cable.
     Thrust commands of the two series do not compare (docs/real_logs.md), so there is a second pair
@@ -257,7 +265,8 @@ def payload_part(record: Record) -> str:
         rows.append([name, *logs, *found, f"{one['force_per_command_ratio']:.3f}", is_named, false])
     header = (
         "pair | model of logs | diagnosed on | thrust over mass, found | by the stated masses | "
-        f"off (target: {WITHIN:.0%}) | measured force per command | `thrust_scale` named | drag or wind named"
+        f"off (target: {WITHIN:.0%}) | measured force per command | `thrust_scale` named | "
+        "drag or wind named"
     )
     return table(header, rows)
 

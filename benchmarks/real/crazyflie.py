@@ -1,4 +1,4 @@
-"""Crazyflie flights: each policy's are judged by models that are refined on the flights of all others.
+"""Crazyflie flights: models refined on all other policies' flights judge those of each policy.
 
 ``python -m benchmarks.real.crazyflie [--policies 50,66] [--seconds 30]`` learns from at most so
 many seconds of each other policy, and judges on the left-out flights, which the models never see,
@@ -79,7 +79,7 @@ def shortened(log: FlightLog, seconds: float) -> FlightLog:
 
 
 def models_of(learnt: FlightLog, nominal: ModelParameters) -> tuple[np.ndarray, refinement.Refined]:
-    """Return the models of flights: base and proposed effects fitted to single steps, then refined."""
+    """Return the base and proposed effects of flights, fitted to single steps, then refined."""
     parts = split(learnt, nominal, None, None)
     problem, state = parts.train, SearchState.start(learnt, parts.train)
     ways = ([one for one in CANDIDATES if one.effect == name] for name in PROPOSED)
@@ -157,7 +157,7 @@ def by_flight(
 def fits_of(
     folder: Path, structure: Sequence[str], start: dict[str, float]
 ) -> list[dict[str, Any]]:
-    """Return values of one structure and times to half response, of the flights of each policy alone."""
+    """Return values of one structure and half-response times, of each policy's flights alone."""
     result = []
     for policy in report.progress(policies_in(folder), "policies"):
         log, model = flights(folder, [policy])
@@ -246,7 +246,7 @@ def policies_table(lines: list[Line]) -> str:
 
 
 def fits_table() -> str:
-    """Return the values of one structure fitted to the flights of each policy, and whether they agree."""
+    """Return a table of one structure's values by policy, and whether they agree."""
     fits = json.loads(FITS.read_text(encoding="utf-8"))
     rows = []
     for name in fits[0]["values"]:

@@ -1,4 +1,7 @@
-"""A diagnosis of a measured flight: its record, and on a page a paragraph for pilots, a picture, tables."""
+"""A diagnosis of a measured flight: its record, and its section of a page.
+
+The section has a paragraph for pilots, a picture and tables.
+"""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -79,7 +82,10 @@ def number(value: float | None, unit: str = "1") -> str:
 
 
 def in_degrees(key: str, value: float) -> tuple[float, str]:
-    """Return an error and its unit, turns in degrees; key: "attitude_rad", "rates_rad_per_s", ..."""
+    """Return an error and its unit, with angles in degrees.
+
+    key: "attitude_rad", "rates_rad_per_s", ...
+    """
     unit = key.split("_", 1)[1].replace("_per_", "/")
     return (
         (float(np.rad2deg(value)), unit.replace("rad", "deg"))
@@ -146,12 +152,15 @@ def _flights(prediction: Record) -> str:
     said = f"Errors of free flight that was held out: {'; '.join(texts)}." if texts else ""
     silent = [what for what, horizons in prediction["evidence"].items() if not horizons]
     if silent:
-        said += f" Of {' and '.join(silent)}, a guess from the start alone, without commands, is as good."
+        said += (
+            f" Of {' and '.join(silent)}, a guess from the start alone, without commands, "
+            "is as good."
+        )
     return said
 
 
 def draw(measured: Record) -> Figure | None:
-    """Draw errors of free flight on held-out rows over its length, a panel a quantity; None without any."""
+    """Draw held-out errors of free flight over its length, a panel a quantity; None without any."""
     errors = measured["diagnosis"]["prediction"]["errors"]
     if not errors:
         return None
@@ -256,7 +265,8 @@ def section(measured: Record, picture: str) -> str:
         f"![Errors of free flight over its length]({picture})"
         if found["prediction"]["errors"]
         else "",
-        f"{measured['num_rows']} rows; verdict `{found['verdict']}`; motion `{found['motion']}`; {cost}.",
+        f"{measured['num_rows']} rows; verdict `{found['verdict']}`; "
+        f"motion `{found['motion']}`; {cost}.",
         causes_table(found),
         f"Significant, and too small to matter: {small}." if small else "",
         errors_table(found),
