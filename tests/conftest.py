@@ -1,4 +1,4 @@
-"""Shared fixtures: one environment, its compiled functions, the trainer and the shipped black box."""
+"""Shared fixtures: an environment, its compiled functions, the trainer, the shipped black box."""
 
 from collections.abc import Callable
 from pathlib import Path

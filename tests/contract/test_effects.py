@@ -150,7 +150,7 @@ def test_changes_what_its_stages_may_and_nothing_else(effect: Effect) -> None:
 def final_and_slope(
     effects: tuple[Any, ...], change: tuple[Any, ...]
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the last row of a short flight, (37,), and its derivative along a change of the parameters."""
+    """Return a short flight's last row, (37,), and its derivative along a parameter change."""
     drone, commands = random_drone(1), 0.9 * random_commands(1, 14)
 
     def final(effects: tuple[Any, ...]) -> jax.Array:

@@ -1,4 +1,4 @@
-"""Every loader of files: a valid one is loaded, others are refused by name, soon; nothing in them runs."""
+"""Every loader loads a valid file and refuses others by name, soon; nothing in them runs."""
 
 import gzip
 import io
@@ -66,7 +66,7 @@ class Trap:
 
 
 class Kind(NamedTuple):
-    """A kind of file: a writer or content of a valid one, its loader, the error that the loader raises.
+    """A kind of file: a writer or content of a valid one, its loader, and the loader's error.
 
     hostile: return files made to do harm from a valid one. is_slow: the loader starts a process.
     """
@@ -217,7 +217,10 @@ SLOW = {"imported CSV, gzip", "black box"}  # seconds for the crafted files
 
 @st.composite
 def damaged(draw: st.DrawFn, valid: bytes) -> bytes:
-    """Return a file with one to four parts changed, cut, extended or duplicated; or one array of it."""
+    """Return a file with one to four parts, or one of its arrays, damaged.
+
+    A part is changed, cut, extended or duplicated.
+    """
     if valid[:2] == b"PK" and draw(st.booleans()):
         return draw(damaged_arrays(valid))
     is_packed = valid[:2] == b"\x1f\x8b" and draw(st.booleans())
@@ -253,7 +256,7 @@ def damaged_arrays(draw: st.DrawFn, valid: bytes) -> bytes:
 
 
 def loaded_or_refused(kind: Kind, path: Path) -> bool:
-    """Return whether a file is loaded; fails for anything but finite numbers or the loader's own error."""
+    """Return whether a file is loaded; only finite numbers or the loader's own error may result."""
     started_s = time.process_time()
     try:
         loaded = kind.load(path)

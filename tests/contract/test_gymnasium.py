@@ -105,7 +105,7 @@ def test_single_environment_agrees_with_gymnax(env: FlyTrack, still: EnvParams) 
 
 
 def assert_same(a: Any, b: Any) -> None:
-    """Compare nested infos: keys, types, and values to rounding; not the time that an episode took."""
+    """Compare nested infos, except elapsed time: keys, types, and values to rounding."""
     if isinstance(a, dict):
         assert set(a) == set(b)
         for name in set(a) - {"t"}:
@@ -256,7 +256,7 @@ def test_bad_options_are_refused_and_change_nothing(options: Any, message: str) 
     np.testing.assert_array_equal(following, env.reset()[0])
 
 
-# --- Arguments and misuse ----------------------------------------------------------------------------------
+# --- Arguments and misuse -------------------------------------------------------------------------
 
 
 def test_arguments_reach_the_environment(params: EnvParams) -> None:

@@ -72,7 +72,7 @@ REPOSITORY = (PACKAGE, *CONSUMERS)
 
 
 def import_graph() -> dict[str, set[str]]:
-    """Return the modules of the repository with those that each imports, wherever in it and for whatever."""
+    """Return the modules of the repository with those that each imports anywhere in it."""
     paths = [path for name in REPOSITORY for path in files_of(name)]
     names = {path: ".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths}
     modules = {path: name.removesuffix(".__init__") for path, name in names.items()}

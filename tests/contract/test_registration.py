@@ -133,7 +133,7 @@ def test_identical_seeds_fly_identically_in_another_process(env_ids: tuple[str, 
 @pytest.mark.slow
 @OVER_IDS
 def test_gradients_are_those_of_finite_differences(env_id: str) -> None:
-    """Through three steps in free flight, away from every gate, in every action of the first one."""
+    """In every action of the first of three steps in free flight, away from every gate."""
     env, params = gymnax.make(env_id)
     attached = env.with_transition_gradients()
     assert attached.transition_gradients_enabled and not env.transition_gradients_enabled
@@ -159,7 +159,7 @@ def test_gradients_are_those_of_finite_differences(env_id: str) -> None:
 def test_transition_gradients_are_detached_unless_asked_for(
     env: FlyTrack, params: EnvParams
 ) -> None:
-    """In double precision, of a smooth scalar of observation, reward and next state, in action and speed."""
+    """In float64, of a smooth scalar of observation, reward and next state, in action and speed."""
 
     def differentiable(env: FlyTrack, state: EnvState) -> Callable[..., jax.Array]:
         def scalar(action: jax.Array, speed: jax.Array) -> jax.Array:

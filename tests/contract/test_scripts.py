@@ -1,4 +1,4 @@
-"""Scripts: what manoeuvres are, their files, the flights a diagnosis asks for, and collecting them."""
+"""Scripts: manoeuvres, files, the flights that a diagnosis asks for, and collecting them."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-"""The step in settings that our own baseline does not have: float64, strict types, NaN checks, devices."""
+"""The step in settings that our baseline lacks: float64, strict types, NaN checks, devices."""
 
 import os
 import subprocess

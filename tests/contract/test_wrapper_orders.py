@@ -41,7 +41,7 @@ def test_every_public_wrapper_is_tried() -> None:
 
 
 def reasons_against(name: str, inside: tuple[str, ...]) -> list[str]:
-    """Return why a wrapper may not go around others, innermost first: one of these is the message."""
+    """Return the possible messages why a wrapper may not go around others, innermost first."""
     if name == "legacy":
         return ["the step inside has five values already"] * (inside[-1:] == ("legacy",))
     if name == "log":

@@ -28,7 +28,10 @@ LOAD = hidden.Outside("payload", ("airspeed",), "force", 1.5, {"string_m": 0.6})
 
 
 def flights(seed: int, law: hidden.Outside = PEAK) -> tuple[hidden.Truth, FlightLog, FlightLog]:
-    """Return a plant with a law, by default drag that peaks at an airspeed; a measured and a clean flight."""
+    """Return a plant with a law, a measured and a clean flight.
+
+    By default the law is drag that peaks at an airspeed.
+    """
     rng = np.random.default_rng(seed)
     truth = replace(hidden.draw_base(rng), outside=law, motion="fine")
     log = hidden.measure(hidden.fly(truth, SECONDS, rng), "sensors", rng)

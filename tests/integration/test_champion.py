@@ -1,4 +1,4 @@
-"""The shipped champion, near the time-optimal lap on the black box; polishing makes such a policy faster."""
+"""The shipped champion is near the time-optimal lap on the black box; polishing speeds one up."""
 
 import jax
 import jax.numpy as jnp

@@ -96,7 +96,7 @@ def test_a_cause_that_ends_in_flight_is_not_in_the_extended_model():
 
 
 def test_a_loss_of_thrust_is_told_from_a_thrust_curve_that_depends_on_voltage():
-    """The battery drains all the while, and a wandering disturbance takes what a curve leaves of the step."""
+    """The battery drains throughout; a disturbance absorbs what a curve leaves of the step."""
     truth, _, log, model, _ = make_log(Trial("onset", 0, 28, "fine", 100))
     (cause,) = diagnose(log, model).causes
     assert cause.effect == "thrust_scale"

@@ -1,4 +1,4 @@
-"""Evaluation: single flights and many agree, known lap times, drawn plants, report, and refusals."""
+"""Evaluation: single flights and many agree, lap times, drawn plants, report, and refusals."""
 
 import importlib.util
 import json

@@ -156,7 +156,7 @@ def test_the_accelerometer_feels_gusts() -> None:
 def derivative(
     own: hidden.Truth, time_s: float, x: np.ndarray, stick: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return dx/dt of position, velocity, attitude, lagged sticks, rates and their slopes; and the force."""
+    """Return dx/dt of position, velocity, attitude, lagged sticks, rates, slopes; and the force."""
     _, vel_w, quat, applied, rates, slopes = np.split(x, [3, 6, 10, 14, 17])
     change = (stick - applied) / np.array(own.tau)
     volt = START.open_v - own.drain * time_s / 60.0 - 0.8 * (0.5 + 0.5 * applied[3]) ** 2
@@ -180,7 +180,7 @@ def derivative(
 
 
 def integrated(own: hidden.Truth) -> dict[str, np.ndarray]:
-    """Return the same from DOP853, between the instants at which a command arrives or a sensor reads."""
+    """Return the same from DOP853, between the times of arriving commands and sensor readings."""
     sticks, rows = random_sticks(STEPS), np.arange(STEPS + 1) * STEP_S
     felt_s, tracked_s = rows[1:] - LATENCY_S % STEP_S, rows[1:] - MOCAP_S % STEP_S
     times = np.unique(np.round([0.0, *rows, *(rows + DELAY_S), *felt_s, *tracked_s], 9))

@@ -1,4 +1,4 @@
-"""Measured flights: after import, sensors that measure one motion agree; the diagnosis of a Crazyflie's."""
+"""Measured flights: imported sensors agree on the motion; the diagnosis of a Crazyflie."""
 
 import json
 
@@ -32,7 +32,9 @@ NANOBENCH += ("B9_trefoil_medium_rep12",)
 
 
 def check(imported: Imported, least: float, tolerance: float) -> None:
-    """Assert that gyroscope and attitude, accelerometer and velocity, velocity and position agree over 0.3 s.
+    """Assert that sensors agree on the motion over 0.3 s.
+
+    Gyroscope is compared with attitude, accelerometer with velocity, velocity with position.
 
     A rate and the change it should show are at least so correlated, and of one size but for a
     tolerance.
@@ -126,7 +128,7 @@ def test_px4():
     check(import_log(shared("px4_h520") / "3DRFlight_1.ulg", "ulog"), 0.99, 0.02)
 
 
-# --- The diagnosis of a Crazyflie ---------------------------------------------------------------------
+# --- The diagnosis of a Crazyflie -----------------------------------------------------------------
 
 AS_GOOD = 1.02  # times another model's error
 PARTS = (
@@ -140,7 +142,7 @@ NEEDS_ACCELEROMETER = {"accelerometer_bias", "accelerometer_scale", "imu_offset"
 
 @pytest.fixture(scope="module")
 def crazyflie():
-    """The diagnosis of four short flights of a Crazyflie, from the nominal model of the importer."""
+    """The diagnosis of four short Crazyflie flights, from the nominal model of the importer."""
     files = [shared(CRAZYFLIE) / f"{name}.csv.gz" for name in PARTS]
     found = import_log(files, "csv", "crazyflie_phoenix")
     return diagnose(found.log, found.nominal_model())

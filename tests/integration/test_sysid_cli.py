@@ -22,7 +22,7 @@ OTHER = AIRLESS._replace(mass=1.0, lag=TAUS, max_rate=(618.0, 618.0, 120.0), thr
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """A folder in which the command has collected, fitted and validated another plant than the shipped."""
+    """A folder in which the command collected, fitted and validated a plant of other parameters."""
     out = tmp_path_factory.mktemp("sysid")
     build(OTHER, out / "other.bin")
     run("collect", "--black-box", out / "other.bin", "--out", out / "data.npz", "--minutes", "1")

@@ -1,4 +1,4 @@
-"""Training runs: cut off and resumed, extended, damaged, diverged, watched; the bits stay the same."""
+"""Training runs: resumed, extended, damaged, diverged, watched; the bits stay the same."""
 
 import dataclasses
 import logging
@@ -210,8 +210,8 @@ def start(out, *flags):
 def test_a_run_killed_at_any_moment_ends_in_the_same_bits(tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "compiled"))
     flags = (
-        "--env-id FlyTrackRobust-v0 --num-envs 16 --num-steps 24 --num-minibatches 4 --hidden-sizes 8 "
-        f"--total-timesteps {1500 * BATCH} --seed {SEED}"
+        "--env-id FlyTrackRobust-v0 --num-envs 16 --num-steps 24 --num-minibatches 4 "
+        f"--hidden-sizes 8 --total-timesteps {1500 * BATCH} --seed {SEED}"
     ).split()
     intervals = f"--evaluate-every 0 --checkpoint-every {20 * BATCH}".split()
     rng, whole, out = random.Random(0), tmp_path / "whole", tmp_path / "killed"

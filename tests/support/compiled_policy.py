@@ -35,7 +35,8 @@ void act(int n, const float *states, const int *gates, const float *past, float 
 }
 void advance(int n, const float *before, const float *after, int *gates) {
     for (int k = 0; k < n; k++)
-        gates[k] = flytrack_next_gate(gates[k], before + k * FLYTRACK_STATE, after + k * FLYTRACK_STATE);
+        gates[k] = flytrack_next_gate(
+            gates[k], before + k * FLYTRACK_STATE, after + k * FLYTRACK_STATE);
 }
 void lag(const float *action, float *applied) { flytrack_lag(action, applied); }
 """
@@ -52,7 +53,7 @@ class CompiledPolicy:
         self.functions = ctypes.CDLL(str(library))
 
     def act(self, states: Any, gates: Any, past: Any = ()) -> np.ndarray:
-        """Return actions (N, 4) of states (N, 21), gates (N,) and, if it reads them, past actions (N, P)."""
+        """Return actions (N, 4) of states (N, 21), gates (N,) and, if read, past actions (N, P)."""
         actions = np.empty((len(states), ACTION_SIZE), np.float32)
         self._call(
             "act", len(states), np.float32(states), np.int32(gates), np.float32(past), actions
@@ -83,7 +84,7 @@ class CompiledPolicy:
 
 
 def states_in_box(policy: ExportedPolicy, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return states (count, 21) and gates whose observations fill the box, and leave it by a fifth."""
+    """Return states (count, 21) and gates; observations fill the box and a fifth beyond it."""
     rng = np.random.default_rng(seed)
     gates = rng.integers(0, len(policy.centres), count)
     reach = BEYOND * policy.limits / policy.factors

@@ -17,7 +17,7 @@ NUM_ROWS = 30
 
 
 class UlogWriter:
-    """A ULog file by PX4's specification of the format: header, definitions, subscriptions, data."""
+    """A ULog file by PX4's specification: header, definitions, subscriptions, data."""
 
     def __init__(self, parameters: dict[str, float]):
         self.definitions = self.message("B", bytes(40)) + b"".join(
@@ -42,7 +42,7 @@ class UlogWriter:
         rows: list[tuple[Any, ...]],
         instance: int = 0,
     ) -> None:
-        """Add a topic: fields are (type, name, array size or 0), rows flat with the time in us first."""
+        """Add a topic: fields are (type, name, array size or 0), rows flat, time in us first."""
         fields = [("uint64_t", "timestamp", 0), *fields]
         text = "".join(
             f"{kind}{f'[{size}]' if size else ''} {field};" for kind, field, size in fields
@@ -79,7 +79,7 @@ def constant(values: tuple[float, ...], times: np.ndarray = TIMES_US) -> list[tu
 
 
 def topics() -> dict[str, tuple[list, list]]:
-    """Return the topics of a log of a drone with its nose east, turning, pulling up; fields and rows."""
+    """Return fields and rows of the topics of a drone with its nose east, turning, pulling up."""
     slow = TIMES_US[::5]
     place = constant((1.0, 2.0, -3.0, 4.0, 5.0, -6.0), slow)
     setpoints = constant(
@@ -155,7 +155,7 @@ def blackbox_frames(num_rows: int = 200) -> np.ndarray:
 def usd_log(
     events: dict[str, tuple[dict[str, str], np.ndarray]], version: int = 2, in_order: bool = True
 ) -> bytes:
-    """Return a Crazyflie's uSD log: of each event its variables, and rows with the time in s first."""
+    """Return a Crazyflie's uSD log; each event has variables, and rows with the time in s first."""
     stamp, per_s = {1: ("I", 1e3), 2: ("Q", 1e6)}[version]
     header, records = struct.pack("<BHH", 0xBC, version, len(events)), []
     for number, (name, (variables, rows)) in enumerate(events.items()):
@@ -259,7 +259,9 @@ def dataflash(
     parameters: dict[str, float] = COPTER_PARAMETERS,
     text: str = "ArduCopter V4.5.1 (d4a1b2c3)",
 ) -> bytes:
-    """Return an ArduPilot log by its specification: each message with types, names of fields, and rows.
+    """Return an ArduPilot log by its specification.
+
+    Each message has types, names of fields, and rows.
 
     The first value of a row is the time, us; messages are written one kind after the other.
     """

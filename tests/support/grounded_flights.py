@@ -1,4 +1,4 @@
-"""Made-up logs of craft that stand, fly, descend and land: what an accelerometer and a gyroscope show."""
+"""Made-up logs of craft that stand, fly, descend and land: accelerometer and gyroscope."""
 
 import numpy as np
 from scipy.signal import lfilter
@@ -14,7 +14,10 @@ NOISE = {"w": 0.02, "f": 0.3}  # rad/s, m/s^2: idle propellers shake
 
 
 def stands_flies_and_lands(step_s: float = STEP_S, seed: int = 0) -> FlightLog:
-    """Return a log that stands until TAKE_OFF_S and from LANDING_S on; thrust is linear in throttle."""
+    """Return a log that stands until TAKE_OFF_S and from LANDING_S on.
+
+    Thrust is linear in throttle.
+    """
     time = np.arange(0.0, END_S, step_s)
     rng = np.random.default_rng(seed)
     is_flying = (time >= TAKE_OFF_S) & (time < LANDING_S)
@@ -70,7 +73,7 @@ def falls(
 
 
 def with_pose(log: FlightLog) -> FlightLog:
-    """Return the log with a velocity that integrates its force, as if it never tilted, and with attitude."""
+    """Return the log with level attitude and the velocity that its force integrates to."""
     acc = log["f"] - [0.0, 0.0, GRAVITY]
     is_flying = (log.time >= TAKE_OFF_S) & (log.time < LANDING_S)
     velocity = np.cumsum(acc * STEP_S * is_flying[:, None], axis=0) * is_flying[:, None]

@@ -1,4 +1,4 @@
-"""The handout's equations once more, in NumPy and float64: a truth that shares nothing with the simulator."""
+"""The handout's equations in NumPy and float64: a truth that shares nothing with the simulator."""
 
 from dataclasses import dataclass, replace
 

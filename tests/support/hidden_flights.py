@@ -1,4 +1,4 @@
-"""Flights of hidden plants: scripted ones as logs, and in plain floats by given commands, to compare with."""
+"""Flights of hidden plants: scripted as logs, and by given commands in plain floats."""
 
 from dataclasses import replace
 from typing import Any

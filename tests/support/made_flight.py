@@ -1,4 +1,4 @@
-"""A made-up flight of which everything is known, as sensors with clocks of their own would log it."""
+"""A made-up flight with known truth, as sensors with clocks of their own would log it."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,7 +17,7 @@ def motion(seed: int, time: np.ndarray) -> np.ndarray:
 def flight(
     time: np.ndarray, late_q_s: float = 0.0, late_v_s: float = 0.0, late_p_s: float = 0.0
 ) -> FlightLog:
-    """Return the log of a made-up flight; q, v and p may be written down late. Yaw turns, then tilts."""
+    """Return the log of a made-up flight; q, v and p may be written down late."""
     fine = np.arange(time[0] - 1.0, time[-1] + 1.0, 1e-3)
     step = Rotation.from_rotvec(motion(1, 0.5 * (fine[1:] + fine[:-1])) * 1e-3)
     quat = [Rotation.identity()]

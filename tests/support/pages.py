@@ -26,7 +26,7 @@ def run_examples(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> di
 
 
 def commands(text: str) -> list[str]:
-    """Return the commands in a page's blocks without a language, one a line, without their comments."""
+    """Return the commands in a page's shell blocks, one a line, without their comments."""
     lines = [
         line
         for language, code in BLOCK.findall(text)

@@ -50,7 +50,7 @@ class Recording:
         return np.array(value)
 
     def series(self, entity: str, component: str) -> np.ndarray:
-        """Return the one instance per row of a component, by steps; rows without any are left out."""
+        """Return the one instance per row of a component, by steps; empty rows are left out."""
         steps = [step for step, _ in self.times[entity]]
         found = zip(steps, self.rows[entity, component], strict=True)
         rows = [row for _, row in sorted(found, key=lambda pair: pair[0]) if row]

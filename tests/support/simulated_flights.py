@@ -1,4 +1,4 @@
-"""Flights of the simulator with every effect in its model: one compiled program for all tests of effects."""
+"""Simulated flights with every effect in the model: one compiled program for all tests."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ _SIMULATOR = Simulator(MOST_STEPS)
 
 @jax.jit
 def fly(drone: Drone, commands: jax.Array, model: ModelParameters, dt: float = DT) -> jax.Array:
-    """Return the packed states after each command, behind them gyro, accelerometer, pose, (num_steps, 37)."""
+    """Return state, gyro, accelerometer and pose after each command, packed, (num_steps, 37)."""
 
     def one(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
         moved = move(*state, unpack_action(action), dt, model)

@@ -1,4 +1,4 @@
-"""The step outside of plain ``jit``: flights divided among devices, which need a process of their own.
+"""The step outside plain ``jit``: flights divided among devices, in a process of their own.
 
 ``python -m tests.support.stepping ENV_ID ...``, with ``XLA_FLAGS``, flies each id in each way and
 compares.
@@ -33,7 +33,10 @@ def short_episodes(env: Any) -> Any:
 
 
 def flight(env: Any) -> Callable[..., Any]:
-    """Return a function of keys (n,), actions (n, ...) and parameters: a reset and steps through resets."""
+    """Return a function of keys (n,), actions (n, ...) and parameters: a reset, then steps.
+
+    Episodes that end are reset.
+    """
 
     def fly(keys: jax.Array, actions: jax.Array, params: Any) -> Any:
         step = jax.vmap(env.step, in_axes=(0, 0, 0, None))
@@ -88,7 +91,7 @@ WAYS = (_by_named_sharding, _by_shard_map, _by_pmap)
 
 
 def main(env_ids: list[str]) -> None:
-    """Fly each id in every way; raise AssertionError where one differs from a flight on one device."""
+    """Fly each id in every way; raise AssertionError if one differs from that on one device."""
     assert len(jax.devices()) == NUM_DEVICES
     mesh = Mesh(np.array(jax.devices()), ("batch",))
     for env_id in env_ids:

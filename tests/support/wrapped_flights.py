@@ -26,7 +26,7 @@ ALL = (DomainRandomization, ActionDelay, APPLIED, ObservationNoise, COMMANDED, E
 
 
 class Flight(NamedTuple):
-    """Random flights: what their reset gave, the actions, and what each step returned, (T, NUM_ENVS, ...)."""
+    """Random flights: the reset's results, actions, and steps' results, (T, NUM_ENVS, ...)."""
 
     first: Any
     start: Any
@@ -85,7 +85,7 @@ def fly(env: Any, params: Any = None, actions: Any = None, **wrappers: Any) -> F
 
 
 def arrays(params: Any) -> Any:
-    """Return parameters of float32 arrays, so that no other type of a number compiles a step anew."""
+    """Return parameters as float32 arrays, so that no other type compiles a step again."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)
 
 
@@ -97,7 +97,7 @@ ENDS = {
 
 
 def before_ends(env: Any, params: Any, ends: Iterable[Any], **fields: Any) -> tuple[Any, jax.Array]:
-    """Return a batch of states a step before each of some ``ENDS``, and the actions of that step."""
+    """Return a batch of states a step before some ``ENDS``, and the actions of that step."""
 
     def with_time(steps: int, path: Any, leaf: jax.Array) -> jax.Array:
         return jnp.int32(steps) if getattr(path[-1], "name", "") == "time" else leaf

@@ -134,7 +134,7 @@ def test_a_battery_beyond_the_fit_is_warned_of_or_refused() -> None:
 
 
 def test_a_hover_stick_hovers_in_the_environment() -> None:
-    """The case of four cells: a stick that hovers by the model carries the weight after a reset, too."""
+    """With four cells, a stick that hovers by the model carries the weight after a reset, too."""
     model = craft_model(4, 1.5)
     sticks = np.linspace(-1.0, 1.0, 4001)
     hover = sticks[np.argmin(abs(thrust_to_weight(model, sticks, model.battery.full_v) - 1.0))]

@@ -1,4 +1,4 @@
-"""Black boxes: any is loaded or refused and flown; the shipped one, which keeps its physics to itself."""
+"""Black boxes are loaded or refused, and flown; the shipped one keeps its physics to itself."""
 
 import os
 import subprocess
@@ -125,7 +125,7 @@ def test_environment_flies_the_black_box(black_box, fly_black_box):
         black_box.step(None, None, 0.02, None)
 
 
-# --- The shipped plant's physics, which the artifact's digest keeps as it is ---------------------------
+# --- The shipped plant's physics, which the artifact's digest keeps as it is ----------------------
 
 
 def test_airless_plant_is_the_minimal_model():

@@ -1,4 +1,4 @@
-"""Clocks of sensors and commands: offsets are found, corrected, and never made of the plant's lag."""
+"""Clocks of sensors and commands: offsets are found and corrected; the plant's lag is not one."""
 
 from dataclasses import replace
 
@@ -108,7 +108,7 @@ def test_lateness_is_found_where_there_is_one() -> None:
 
 @pytest.mark.slow
 def test_a_drone_on_time_is_no_simulator_however_little_the_model_explains() -> None:
-    """Commands that have nothing to do with the motion stand for a rate loop that the model lacks."""
+    """Commands unrelated to the motion stand for a rate loop that the model lacks."""
     log = noisy(flight(TIME_S), seed=1)
     with jax.enable_x64(True):
         assert how_it_moves(log, HandoutPlant().model(), np.ones(len(log), bool)) == Moves(

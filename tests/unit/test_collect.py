@@ -1,4 +1,4 @@
-"""Collecting flies any plant alike, within its envelope, or says why not; sensors add what they state."""
+"""Collecting flies any plant within its envelope or says why not; sensors add what they state."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def test_envelope_cuts_a_plant_of_huge_thrust():
 
 
 def broken(**parts):
-    """Return a step function of the handout's plant with something replaced after 0.3 s of flight."""
+    """Return a step function of the handout's plant with a value replaced after 0.3 s of flight."""
 
     def step(x, u):
         after = HandoutPlant()(x, u)
@@ -118,7 +118,7 @@ def test_held_out_part_has_every_kind_a_clear_step_of_each_axis_and_all_voltages
         assert jumps[same & alone].max() >= 0.3, stick
 
 
-# --- Sensors ------------------------------------------------------------------------------------------
+# --- Sensors --------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

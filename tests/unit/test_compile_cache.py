@@ -1,4 +1,4 @@
-"""Compiled programs are kept for the next process, in a folder of the user's, where the user lets us."""
+"""Compiled programs are kept for the next process in the user's folder, if the user allows it."""
 
 import os
 import subprocess
@@ -25,7 +25,7 @@ print(len(hits))
 
 @pytest.fixture
 def config(monkeypatch, tmp_path):
-    """JAX's settings as the module sees them, without a folder; the user's cache is a temporary folder."""
+    """JAX's settings as the module sees them, without a folder; the user's cache is temporary."""
     settings = SimpleNamespace(jax_compilation_cache_dir=None)
     settings.update = lambda name, value: setattr(settings, name, value)
     monkeypatch.setattr(compile_cache.jax, "config", settings)

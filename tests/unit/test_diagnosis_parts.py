@@ -1,4 +1,4 @@
-"""Parts of the diagnosis: its noise filter, its lanes, what it tells, and logs that say too little."""
+"""Parts of the diagnosis: its noise filter, lanes, messages, and logs that say too little."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -66,7 +66,7 @@ def state(flown, lanes):
 
 @pytest.fixture(scope="module")
 def disturbed(lanes):
-    """Residuals of white sensors and a disturbance that the drone feels, (rows, lanes, NUM_AXES, 2)."""
+    """Residuals of white sensors and a disturbance of the drone, (rows, lanes, NUM_AXES, 2)."""
     rng, keep = np.random.default_rng(4), np.exp(-DT_S / TAU_S)
     count = 1 + int(lanes.row.max())
     fresh = rng.standard_normal((count, NUM_AXES))
@@ -217,7 +217,7 @@ def test_logs_are_joined_by_what_they_all_have_with_a_warning(flown):
 
 @pytest.mark.slow
 def test_a_force_may_be_a_law_whose_channels_the_log_lacks():
-    """Without velocity and attitude, drag of forward flight would look like a thrust that is tilted."""
+    """Without velocity and attitude, drag of forward flight would look like a tilted thrust."""
     truth, log = scripted(4, 20.0, effects={"thrust_tilt": {"towards_x": 0.1, "towards_y": 0.0}})
     blind = diagnose(log.without("p", "v", "q"), model_of(truth))
     (cause,) = blind.causes
@@ -296,7 +296,7 @@ def test_a_value_that_no_flight_depends_on_is_not_told(state):
 
 @pytest.mark.parametrize(("effect", "is_law"), [("rate_scale", True), ("command_delay", False)])
 def test_a_law_without_memory_has_to_hold_while_commands_rest(state, effect, is_law):
-    """A scale of rates that nobody flew is contradicted there; one that was flown is not, nor a delay."""
+    """Rows at rest contradict a rate scale that the flight lacks, not a true one or a delay."""
     problem = state.problem
     vector = problem.start.copy()
     field, size = {"rate_scale": ("roll", 0.3), "command_delay": ("delay_s", 0.02)}[effect]
@@ -308,7 +308,7 @@ def test_a_law_without_memory_has_to_hold_while_commands_rest(state, effect, is_
 
 
 def test_a_long_log_is_thinned_with_a_warning_that_counts_judged_rows(state, monkeypatch):
-    """Lanes also hold rows that are not judged: those must not make up for judged rows that are lost."""
+    """Unscored rows in the lanes must not make up for scored rows that are lost."""
     lanes = state.problem.lanes
     half = lanes.counts & (np.arange(len(lanes.row)) % 2 == 0)[:, None, None, None]
     every = lanes._replace(counts=half)

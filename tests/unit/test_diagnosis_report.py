@@ -1,4 +1,4 @@
-"""The report of a diagnosis: right residuals, a plot of each cause; pages load and execute nothing."""
+"""The report of a diagnosis: residuals, a plot of each cause; pages load and execute nothing."""
 
 import re
 from dataclasses import replace
@@ -214,8 +214,10 @@ def test_page_says_all_and_loads_nothing(tmp_path, diagnosis, measured):
         "low passes",
         "ground_effect",
         "something to know",
-        "The model lacks drag in proportion to airspeed; offset of the accelerometer, and it has the wrong",
-        "flies 80 % closer after 1 s (0.1 m instead of 0.5 m on held-out flight; 0.4 m when only refitted)",
+        "The model lacks drag in proportion to airspeed; offset of the accelerometer, "
+        "and it has the wrong",
+        "flies 80 % closer after 1 s (0.1 m instead of 0.5 m on held-out flight; "
+        "0.4 m when only refitted)",
         "28.1 ± 0.5 (40)",
         "&lt;script&gt;flight",
     ):
@@ -236,8 +238,8 @@ def test_what_refitting_alone_or_a_guess_reaches_is_no_gain_of_effects(diagnosis
         diagnosis, error={**errors, "extended": Errors({}, {"1": 0.403})}, prediction=blind
     )
     assert (
-        "0.4 m when only refitted: no effect adds to that; a guess that ignores the commands, 0.27 m)"
-        in report.text_of(found)
+        "0.4 m when only refitted: no effect adds to that; "
+        "a guess that ignores the commands, 0.27 m)" in report.text_of(found)
     )
 
 
@@ -269,7 +271,7 @@ def test_page_of_a_log_of_few_channels(diagnosis, measured):
     )
 
 
-# --- Any page -----------------------------------------------------------------------------------------
+# --- Any page -------------------------------------------------------------------------------------
 
 PNG = b"\x89PNG\r\n\x1a\n and the rest"
 HOSTILE = '"><script>alert(1)</script><a href="https://example.org/x">'

@@ -1,4 +1,4 @@
-"""The simulator against the handout's equations, written a second time in NumPy, and what follows."""
+"""The simulator against the handout's equations, written again in NumPy; their consequences."""
 
 from typing import Any
 

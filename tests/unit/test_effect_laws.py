@@ -1,4 +1,4 @@
-"""What each effect does, against its equations by hand, and what the environment shows of the gyro."""
+"""Each effect against its equations by hand, and what the environment shows of the gyro."""
 
 from dataclasses import replace
 from typing import Any
@@ -37,7 +37,7 @@ FULL_STICK = np.deg2rad(618.0)
 NO_THRUST = NOMINAL._replace(thrust_coeffs=np.zeros(6, np.float32))
 YAWED = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # 90 degrees: the world's x is the body's -y
 
-# --- Laws that hidden plants have, too ----------------------------------------------------------------
+# --- Laws that hidden plants have, too ------------------------------------------------------------
 
 # Hidden plants have other laws on purpose, and an accelerometer off the centre without a mean over
 # the step.
@@ -85,7 +85,7 @@ def test_laws_are_those_of_hidden_plants_in_plain_floats(names: tuple[str, ...])
         np.testing.assert_allclose(found[5:, columns], theirs[5:], rtol=2e-4, atol=5e-4)
 
 
-# --- Forces -----------------------------------------------------------------------------------------
+# --- Forces ---------------------------------------------------------------------------------------
 
 
 def force_of(
@@ -135,7 +135,7 @@ def test_ground_effect_is_cheeseman_and_bennetts_from_two_radii_on() -> None:
         assert found == pytest.approx(expected, rel=1e-4)
 
 
-# --- Commands, lags and rates -----------------------------------------------------------------------
+# --- Commands, lags and rates ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("stick", [-1.0, -0.5, 0.25, 1.0])
@@ -159,7 +159,7 @@ def test_a_delay_of_whole_steps_shifts_each_channel_by_its_own_and_none_is_early
         np.testing.assert_allclose(found[:, channel], shifted[:, channel], rtol=1e-4, atol=1e-4)
 
 
-# --- Sensors ----------------------------------------------------------------------------------------
+# --- Sensors --------------------------------------------------------------------------------------
 
 # Forces that are not thrust, and rates that are not sticks.
 DISTURBED = (
@@ -170,7 +170,7 @@ DISTURBED = (
 
 
 class Readings:
-    """Truth and readings of rates, rad/s, and specific force, m/s^2, body, of a flight, (num_steps, 3)."""
+    """True and measured rates, rad/s, and specific force, m/s^2, body, (num_steps, 3)."""
 
     def __init__(self, *parameters: Any):
         drone = random_drone(0)
@@ -206,7 +206,7 @@ def past(truth: np.ndarray, before: np.ndarray, steps: float) -> np.ndarray:
 
 @pytest.mark.parametrize("steps", [0.0, 1.0, 2.0, 4.0, 0.3, 2.6])
 def test_late_sensors_read_the_past(steps: float) -> None:
-    """Before the flight, the rates are taken to have been those of the start, the force that of its first."""
+    """Before the flight, the rates are those of the start, and the force that of the first step."""
     flight = Readings(effects.ImuLatency(steps * DT))
     assert_reads(flight.gyro, past(flight.rates, flight.start_rates, steps))
     assert_reads(flight.accelerometer, past(flight.force, flight.force[0], steps))
@@ -225,7 +225,7 @@ def test_late_poses_are_those_of_the_past(steps: float) -> None:
     assert_reads(signs * found[:, 33:37], then[:, 6:])
 
 
-# --- What the environment shows of the gyro ---------------------------------------------------------
+# --- What the environment shows of the gyro -------------------------------------------------------
 
 SHOWN = slice(15, 18)  # where the observation has the body rates
 GYRO_SCALE = next(entry.scale for entry in OBSERVATION if entry.key == "rates")

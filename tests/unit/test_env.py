@@ -1,4 +1,4 @@
-"""The environment as a gymnax client sees it: the protocol, ends of episodes, actions, observations."""
+"""The environment as a gymnax client sees it: protocol, ends, actions and observations."""
 
 from pathlib import Path
 

@@ -36,7 +36,7 @@ CASES = {
 
 
 def acted(env, checkpoint):
-    """Return states, gates, earlier actions and what the policy does with the environment's observation."""
+    """Return states, gates, past actions, and the policy's actions given the observations."""
     params = env.default_params
     if ObservationNoise.key in params.wrappers:
         none = NoiseParams(*np.zeros(len(NoiseParams._fields)))

@@ -65,7 +65,10 @@ def test_what_the_firmware_did_not_keep_is_named():
             "set p_roll = 60\nprofile 1\nset p_roll = 70\nset rates_type = actual\nset gone = 1"
         )
     ]
-    dump = "set rates_type = ACTUAL\nprofile 0\nset p_roll = 60\nprofile 1\nset p_roll = 71\nrateprofile 0\n"
+    dump = (
+        "set rates_type = ACTUAL\nprofile 0\nset p_roll = 60\n"
+        "profile 1\nset p_roll = 71\nrateprofile 0\n"
+    )
     with pytest.raises(FirmwareError) as error:
         check_read_back(settings, dump)
     assert "p_roll (asked for 70, has 71), gone (asked for 1, has None)" in str(error.value)

@@ -80,7 +80,7 @@ def test_truth_is_found_from_fewer_channels_and_at_other_steps(exact, log_of, to
 
 @pytest.mark.parametrize("is_one_flight", [False, True])
 def test_held_out_measurements_do_not_enter(noisy, is_one_flight):
-    """Nor do they where blocks are cut from one flight: no step is judged that began in a held-out row."""
+    """Also with blocks cut from one flight: no scored step begins in a held-out row."""
     log = noisy
     if is_one_flight:
         log = replace(log, time=np.arange(len(log)) * 0.01, segment=np.zeros(len(log), int))

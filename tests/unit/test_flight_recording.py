@@ -1,4 +1,4 @@
-"""The recording of a flight log, read back: measured numbers, unexplained forces, free flight of models."""
+"""Recordings of flight logs: measured numbers, unexplained forces, free flight of models."""
 
 import importlib
 import sys
@@ -33,7 +33,7 @@ SCALED_FORCE = 0.1  # m of an arrow for 1 m/s^2
 
 @pytest.fixture(scope="module")
 def flown() -> tuple[ModelParameters, FlightLog]:
-    """A plant with drag, as a model without it, and the log of two flights, each with a clock from 0 on."""
+    """A plant with drag, as a model without it, and a log of two flights with clocks from 0 on."""
     truth, log = scripted(5, SECONDS, "none", effects={"linear_drag": DRAG._asdict()})
     segment = (np.arange(len(log)) >= SECOND).astype(int)
     return model_of(truth), replace(

@@ -36,7 +36,7 @@ class Recorded(Plant):
 
 
 def fly_recorded(states: np.ndarray, first_gate: int) -> tuple[Any, Any]:
-    """Return the races at each state and the causes after each step, as the environment has them."""
+    """Return the environment's races at each state and its causes after each step."""
     env = FlyTrack(plant=Recorded(states), missed_gate="fly_on")
     params = env.default_params
     begun = env.begin(unpack(states[0]), first_gate, params)

@@ -1,4 +1,4 @@
-"""Flying by hand: what keys and axes do, laps and gaps, the ghost, the rollout, and what is refused."""
+"""Flying by hand: keys and axes, laps and gaps, the ghost, the rollout, and refusals."""
 
 import re
 

@@ -131,7 +131,7 @@ def test_any_segment_meets_any_gate_as_in_the_gates_own_frame(
     radius: float,
     seed: int,
 ) -> None:
-    """However long, short, far away or degenerate: never two events, and a fraction in the unit interval."""
+    """Even of a far or degenerate segment: one event at most, and a fraction from 0 to 1."""
     gate = gate_of(turn, centre, direction, opening, thickness)
     rng = np.random.default_rng(seed)
     spread = (
@@ -192,7 +192,7 @@ fly_race = jax.jit(
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), num_gates=st.sampled_from([2, 3, 8]))
 def test_a_race_counts_what_its_gates_see_one_after_the_other(seed: int, num_gates: int) -> None:
-    """Passes, laps and the gate to fly next along a path at random, against a reading in float64."""
+    """Passes, laps and the next gate along a random path, against a reading in float64."""
     rng = np.random.default_rng(seed)
     gates = [
         gate_of(

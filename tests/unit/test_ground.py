@@ -78,7 +78,10 @@ def write_bag(log: FlightLog, folder: Path) -> Path:
 
 
 def frames_of(log: FlightLog) -> np.ndarray:
-    """Return Betaflight's frames of a log: setpoints and gyroscope in deg/s, accelerometer in 1/2048 g."""
+    """Return Betaflight's frames of a log.
+
+    Setpoints and gyroscope are in deg/s, the accelerometer in 1/2048 g.
+    """
     throttle = 500.0 * (log["u"][:, 3:] + 1.0)
     count = np.arange(len(log))
     columns = [count, 1e6 * log.time, 500.0 * log["u"][:, :3], throttle, 100.0 * log["v_bat"]]

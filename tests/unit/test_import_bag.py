@@ -1,4 +1,4 @@
-"""Bags written by the libraries and read back: ROS 2 bags, MCAP files of ROS 2 messages and of JSON."""
+"""Bags of the libraries are read back: ROS 2 bags, MCAP files of ROS 2 messages and of JSON."""
 
 import dataclasses
 import subprocess

@@ -336,7 +336,7 @@ def test_real_log_holds_what_another_decoder_found(tmp_path):
 
 
 def test_gecko_flies_without_a_mapping():
-    """Its first 14 frames are changes of a frame that the decoder lost; smoothing overshoots full stick."""
+    """The first 14 frames change a frame that the decoder lost; smoothing overshoots full stick."""
     found = import_log(shared("bf_gecko") / "btfl_002.bbl", "betaflight")
     log = found.log
     assert len(log) == 66000 and np.diff(log.time).max() < 0.005 and log["v_bat"].min() > 13.0

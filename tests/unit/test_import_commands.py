@@ -18,7 +18,7 @@ MAPPING = read_mapping("angle_setpoints")
 
 
 def flight() -> dict[str, np.ndarray]:
-    """Return columns of a drone whose rates follow attitude errors times 6, 5, 2 with a lag of 40 ms."""
+    """Return columns of rates that follow attitude errors times 6, 5, 2 with a lag of 40 ms."""
     rng = np.random.default_rng(0)
     wanted = np.repeat(0.25 * rng.normal(size=(NUM_ROWS // 30, 3)), 30, axis=0)
     angles, rates = np.zeros((NUM_ROWS, 3)), np.zeros((NUM_ROWS, 3))

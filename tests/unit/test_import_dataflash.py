@@ -1,4 +1,4 @@
-"""ArduPilot's DataFlash logs: a made flight, as the firmware would write it, comes back in our frames."""
+"""ArduPilot's DataFlash logs: a made-up flight comes back in our frames."""
 
 from pathlib import Path
 from typing import Any
@@ -117,7 +117,7 @@ def test_a_made_flight_comes_back(tmp_path: Path, attitude: str) -> None:
 
 
 def test_frames_agree_by_the_motion(tmp_path: Path) -> None:
-    """Rates turn the attitude, and the turned specific force less gravity is the velocity's derivative."""
+    """Rates turn the attitude; turned specific force less gravity is the velocity's derivative."""
     log = import_log(write(tmp_path / "a.bin", messages()), "dataflash", align=False).log
     attitude = Rotation.from_quat(log["q"], scalar_first=True)
     step_s = np.diff(log.time)[:, None]

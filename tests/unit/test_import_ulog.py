@@ -239,5 +239,8 @@ def test_stamps_of_samples_from_another_clock_give_way_to_those_of_publishing(
         tables[name] = ([("uint64_t", "timestamp_sample", 0), *fields], later)
     found = import_log(write(tmp_path / "a.ulg", tables), "ulog")
     assert len(found.log) == 195  # the last attitude was sampled 0.5 ms before its row
-    expected = f"timestamp_sample of vehicle_angular_velocity is {microseconds * 1e-6:.6g} s before timestamp"
+    expected = (
+        f"timestamp_sample of vehicle_angular_velocity is {microseconds * 1e-6:.6g} s "
+        "before timestamp"
+    )
     assert any(expected in note for note in found.notes)

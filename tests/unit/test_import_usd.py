@@ -86,7 +86,7 @@ def test_what_is_no_such_log_is_refused(tmp_path, message):
 
 
 def lee_log() -> tuple[bytes, np.ndarray]:
-    """Return a log whose torques follow the law, 10 s at 250 Hz, and the rates it asks for, rad/s."""
+    """Return a log whose torques follow the law, 10 s at 250 Hz, and its rate setpoints, rad/s."""
     time = 1.0 + 0.004 * np.arange(2500)
     phases = np.array([0.0, 1.0, 2.0])
     angles, wanted = (0.1 * np.sin(scale * time[:, None] + phases) for scale in (2.0, 2.3))

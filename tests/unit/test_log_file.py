@@ -1,4 +1,4 @@
-"""Files of logs: what is written comes back, a file is described, and every refusal names file and reason."""
+"""Log files are written and read back, described, or refused with file and reason."""
 
 import re
 from collections.abc import Callable
@@ -110,7 +110,7 @@ def test_gaps_are_long_steps_within_a_segment():
     assert "gaps: none" in describe(steady)
 
 
-# --- Flight log files: every refusal names file and reason, quickly and in little memory ------------
+# --- Flight log files: every refusal names file and reason, quickly and in little memory ----------
 
 
 def set_cell(column: str, row: int, value: float) -> Callable[[dict], None]:
@@ -141,7 +141,8 @@ BAD_COLUMNS = {
     r"{row 3}, column segment: found 4\.0, expected each number in one piece": segments(
         4, 4, 2, 4, 2, 2
     ),
-    r"{row 0}, column q_w, q_x, q_y, q_z: found 1\.0.*, expected a quaternion of norm 1 within 0\.01": (
+    r"{row 0}, column q_w, q_x, q_y, q_z: found 1\.0.*, "
+    r"expected a quaternion of norm 1 within 0\.01": (
         lambda columns: columns.update(
             {f"q_{axis}": columns[f"q_{axis}"] * 1.02 for axis in "wxyz"}
         )
@@ -183,8 +184,12 @@ HEADER = "t,u_roll,u_pitch,u_yaw,u_thrust,v_bat"
 BAD_TEXTS = {
     "column t: missing; found no column": "",
     "column v_bat: found 2 times, expected once": f"{HEADER},v_bat\n",
-    r"row 1 \(line 4\): found 4 cells, expected 6 as in the header": f"{HEADER}\n0,0,0,0,0,1\n\n1,0,0,0\n",
-    r"row 0 \(line 2\), column u_yaw: found 'on', expected a finite number": f"{HEADER}\n0,0,0,on,0,1\n",
+    r"row 1 \(line 4\): found 4 cells, expected 6 as in the header": (
+        f"{HEADER}\n0,0,0,0,0,1\n\n1,0,0,0\n"
+    ),
+    r"row 0 \(line 2\), column u_yaw: found 'on', expected a finite number": (
+        f"{HEADER}\n0,0,0,on,0,1\n"
+    ),
     r"row 0 \(line 2\), column v_bat: found an empty cell": f"{HEADER}\n0,0,0,0,0, \n",
     "near line 1: not a CSV file": b"\xff\xfe\x00",
 }

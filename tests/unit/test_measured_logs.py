@@ -1,4 +1,4 @@
-"""What is stated of a log, who flew it and its pack's voltages, survives, and decides how it is replayed."""
+"""What a log states (its origin, its pack's voltages) survives and decides how it is replayed."""
 
 from dataclasses import replace
 
@@ -183,11 +183,11 @@ def test_logs_of_different_origin_are_refused():
         joined([first, other])
 
 
-# --- Voltage ----------------------------------------------------------------------------------------
+# --- Voltage --------------------------------------------------------------------------------------
 
 
 def import_four_cells(folder, battery_v: float | None = None, voltage_v: tuple | None = FOUR_CELLS):
-    """Import a minute of a made 4S craft of 0.7 kg whose thrust goes with the voltage, flown at 15.4 V."""
+    """Import a minute of a made-up 4S craft, 0.7 kg, whose thrust follows voltage, at 15.4 V."""
     step_s, rng = 0.01, np.random.default_rng(3)
     time = np.arange(6000) * step_s
 

@@ -46,7 +46,7 @@ def held_commands() -> np.ndarray:
 def flown(
     model: ModelParameters, dt: float, start: Any = START
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return states (num_steps, 21), gyro and accelerometer readings (num_steps, 3) at steps of ``dt``."""
+    """Return states (num_steps, 21), gyro and accelerometer (num_steps, 3), at steps of ``dt``."""
     commands = np.repeat(held_commands(), round(COMMAND_S / dt), axis=0)
     with jax.enable_x64(True):
         rows = np.asarray(fly(unpack(jnp.asarray(start)), commands, model, dt))

@@ -1,4 +1,4 @@
-"""Races of several drones: one is the single environment, drones do not depend on their order, and meet."""
+"""Races: of one drone the single environment; drones do not depend on their order, and meet."""
 
 import pickle
 

@@ -1,4 +1,4 @@
-"""The statistics of a diagnosis on made scores: effects that begin or end within a log, and intervals."""
+"""Statistics of a diagnosis on made-up scores: onsets and ends within a log, and intervals."""
 
 from types import SimpleNamespace
 
@@ -55,7 +55,7 @@ FREE = ("given", "first", "second")
 
 
 def half_widths(scores: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """Return half widths of intervals, of scores of seconds (BLOCKS, 3) and information along parameters."""
+    """Return half widths of intervals from scores of seconds (BLOCKS, 3) and information."""
     seen = object.__new__(Linearization)
     seen.places, seen.total, seen.score_by_block = [0, 1, 2], information, scores
     seen.problem = SimpleNamespace(names=FREE)

@@ -1,4 +1,4 @@
-"""Logs of flights raise no problem; each wrong unit, sign and stuck column is named, and nothing else."""
+"""Flight logs raise no problem; each wrong unit, sign and stuck column alone is named."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -47,7 +47,7 @@ def test_names_and_steps_are_independent(normals: dict[str, np.ndarray]) -> None
         assert abs(np.corrcoef(series[lag:], series[:-lag])[0, 1]) < 0.08
 
 
-# --- Uniform draws and words ------------------------------------------------------------------------
+# --- Uniform draws and words ----------------------------------------------------------------------
 
 NAMES = (
     "kind",

@@ -1,4 +1,4 @@
-"""Refinement by prediction: what commands do not explain is told, and no horizon is predicted worse."""
+"""Refinement by prediction tells what commands do not explain and makes no horizon worse."""
 
 import jax
 import numpy as np
@@ -31,7 +31,7 @@ def problem_of(truth, log: FlightLog) -> Problem:
 
 @pytest.fixture(scope="module")
 def dragged():
-    """A plant with drag, and the refinement of a model with half of it and a bias that no flight shows."""
+    """A plant with drag, and a refined model that began with half of it and a bias nobody flew."""
     truth, log = scripted(3, SECONDS, effects={"linear_drag": TRUE_DRAG})
     values = {f"linear_drag.{name}": 0.5 * value for name, value in TRUE_DRAG.items()}
     with jax.enable_x64(True):
@@ -70,7 +70,7 @@ def test_values_are_refined_by_flights(dragged):
 
 @pytest.mark.parametrize("step_s", [0.01, 0.005])
 def test_a_late_gyro_starts_flights_at_the_rates_of_their_time(step_s):
-    """However many steps late: a rate that is corrected by a late reading is corrected until that arrives."""
+    """Rates are corrected by a late reading until it arrives, however many steps late."""
     late = {"imu_latency": {"latency_s": 3.7 * step_s}}
     truth, log = scripted(3, SECONDS, effects=late, step_s=step_s)
     with jax.enable_x64(True):

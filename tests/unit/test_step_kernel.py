@@ -1,4 +1,4 @@
-"""What is fused stays the same: ``compute_once``, ``one_kernel``, a batch's auto-reset, the whole step."""
+"""Fused code stays the same: ``compute_once``, ``one_kernel``, a batch's auto-reset, the step."""
 
 from functools import partial
 from typing import Any
@@ -40,7 +40,10 @@ VARIANTS = {
 
 
 def flown(env: Any, is_constant: bool) -> Any:
-    """Return the outcome of some steps of a batch; is_constant: with parameters that are no argument."""
+    """Return the outcome of some steps of a batch.
+
+    is_constant: the parameters are constants of the program, not its argument.
+    """
     params = env.default_params.replace(max_steps_in_episode=4)  # so that episodes end
     keys = jax.random.split(jax.random.key(0), NUM_ENVS)
     actions = jax.random.uniform(jax.random.key(1), (NUM_STEPS, NUM_ENVS, 4), minval=-1.0)

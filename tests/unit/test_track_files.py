@@ -1,4 +1,4 @@
-"""Track files: what is read and written, and that everything else is refused with file, field and reason."""
+"""Track files are read and written; all else is refused with file, field and reason."""
 
 import math
 import re

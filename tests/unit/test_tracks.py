@@ -1,4 +1,4 @@
-"""The shipped courses, random ones, and the check of a course's geometry, which finds every break of one."""
+"""The shipped courses, random ones, and the check that finds every fault of a course's geometry."""
 
 import math
 from dataclasses import replace
@@ -59,7 +59,7 @@ def yaw_of(heading_deg: float) -> tuple[float, float, float, float]:
 
 
 def ring(radius: float = RADIUS, num_gates: int = NUM_GATES) -> tracks.Track:
-    """Return gates on a circle, flown anticlockwise, gate 0 at (radius, 0); starts 5 m before it."""
+    """Return gates on a circle, anticlockwise, gate 0 at (radius, 0); starts are 5 m before it."""
     gates = []
     for i in range(num_gates):
         angle = 2.0 * math.pi * i / num_gates

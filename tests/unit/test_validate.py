@@ -29,7 +29,7 @@ TRUTH = nominal_parameters()._replace(tau=np.array([0.02, 0.03, 0.06, 0.045], np
 
 
 def scripts() -> tuple[np.ndarray, np.ndarray]:
-    """Return starts (5, 21) and commands (5, num_rows, 4): steps of each axis, thrust, fast flight."""
+    """Return starts (5, 21) and commands (5, num_rows, 4): stick steps, thrust, fast flight."""
     time = np.arange(NUM_ROWS) * DT
     commands = np.zeros((5, NUM_ROWS, 4))
     commands[..., 3] = HOVER + 0.02 * np.sin(5.0 * time)

@@ -49,7 +49,7 @@ LATE_S = 0.013
 
 
 def same_model(delay_s: float = 0.0) -> RandomizationParams:
-    """Return ranges from which the nominal model is drawn, with a delay, in the default's structure."""
+    """Return ranges that give the nominal model with a delay, in the default's structure."""
     still = Wind(0.0, 0.0, None, None, None, None)
     ends = (CommandDelay(delay_s, None, None), ThrustScale(1.0), still, LinearDrag(0.0, 0.0, 0.0))
     return RandomizationParams(1.0, 1.0, 1.0, 1.0, low=ends, high=ends)
@@ -64,7 +64,7 @@ def flight() -> Flight:
 
 @pytest.fixture(scope="module")
 def quiet_flights() -> dict[str, Flight]:
-    """Flights in all wrappers, without noise and with one model; commands are late by effect or wrapper."""
+    """Flights in all wrappers without noise, with one model; late by effect, wrapper or neither."""
     cases = {"neither": (0.0, 0.0), "effect": (LATE_S, 0.0), "wrapper": (0.0, LATE_S)}
     return {
         name: fly(
@@ -100,7 +100,7 @@ def test_the_order_of_wrapping_does_not_change_the_flight(flight: Flight) -> Non
     np.testing.assert_array_equal(other.ended, flight.ended)
 
 
-# --- Each wrapper -----------------------------------------------------------------------------------
+# --- Each wrapper ---------------------------------------------------------------------------------
 
 
 def test_statistics_are_those_of_the_episode(flight: Flight) -> None:
@@ -144,7 +144,7 @@ def test_a_model_and_the_noise_hold_for_their_episode_and_their_step(flight: Fli
 
 
 def test_noise_has_the_stated_deviations_and_is_white() -> None:
-    """In the observation's rows, at rest on the start pose, where the drone itself does not move."""
+    """In the observation's rows at rest on the start pose, where the drone does not move."""
     env = wrapped(ObservationNoise)
     noise = NoiseParams(position_m=0.1, velocity_m_per_s=0.2, attitude_deg=2.0, rates_rad_per_s=0.3)
     params = env.default_params.replace(wrappers={"observation_noise": noise})
@@ -215,7 +215,7 @@ def test_everything_that_has_a_range_fills_it_and_independently() -> None:
 
 
 def test_what_the_model_itself_has_is_drawn_around_it() -> None:
-    """An identified effect is known: scaled, within its range. What is not among the ranges stays."""
+    """Identified effects are scaled within their range; effects outside the ranges stay."""
     known = (CommandDelay(0.036), ThrustScale(0.6), LinearDrag(1.0, -0.5, 0.0), QuadraticDrag(0.1))
     models = sampled_models(nominal_parameters().with_effects(*known), 500)
     by_name = {
@@ -279,7 +279,7 @@ def test_bad_arguments_are_refused() -> None:
             ActionHistory(FlyTrack(), **{argument: value})
 
 
-# --- Nothing survives an episode --------------------------------------------------------------------
+# --- Nothing survives an episode ------------------------------------------------------------------
 
 
 def step(keys: jax.Array, states: Any, actions: Any) -> Any:
@@ -291,7 +291,7 @@ def step(keys: jax.Array, states: Any, actions: Any) -> Any:
 
 
 def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been() -> None:
-    """The state after an end is that of a reset with the same key, in every leaf of every wrapper."""
+    """After an end, the state is that of a reset with the same key, in every leaf and wrapper."""
     env = wrapped(*ALL)
     params, applied = arrays(env.default_params), Action(0.5, -0.5, 0.4, 0.3)
     ends = {name: end for name, end in ENDS.items() if end[-2] or end[-1]}
