@@ -1,17 +1,13 @@
 """Shared fixtures: an environment, its compiled functions, the trainer, the shipped black box."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import gymnax
 import jax
 import numpy as np
 import pytest
 
-from flytrack_env.blackbox import BlackBox
 from flytrack_env.blackbox import load as load_black_box
-from flytrack_env.env import EnvParams, FlyTrack
 from tests.support.black_boxes import SHIPPED
 
 MEMORY_MAPS, MOST_MEMORY_MAPS = Path("/proc/self/maps"), 25_000
@@ -30,19 +26,19 @@ def few_programs_at_a_time():
 
 
 @pytest.fixture(scope="session")
-def env() -> FlyTrack:
+def env():
     """The environment as gymnax makes it."""
     return gymnax.make("FlyTrack-v0")[0]
 
 
 @pytest.fixture(scope="session")
-def params(env: FlyTrack) -> EnvParams:
+def params(env):
     """Its default parameters."""
     return env.default_params
 
 
 @pytest.fixture(scope="module")
-def trainer() -> Any:
+def trainer():
     """The small trainer of the baseline's tests, compiled once for a process."""
     from tests.support.ppo_runs import make_trainer
 
@@ -50,9 +46,7 @@ def trainer() -> Any:
 
 
 @pytest.fixture(scope="module")
-def whole(
-    trainer: Any, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, dict[str, np.ndarray]]:
+def whole(trainer, tmp_path_factory):
     """A training run that nothing cut off: its folder and its metrics."""
     from tests.support.ppo_runs import EVERY_OTHER_UPDATE, SEED
 
@@ -61,20 +55,20 @@ def whole(
 
 
 @pytest.fixture(scope="module")
-def black_box() -> BlackBox:
+def black_box():
     """The shipped black box."""
     return load_black_box(SHIPPED)
 
 
 @pytest.fixture(scope="module")
-def fly_black_box(black_box: BlackBox) -> Callable[..., np.ndarray]:
+def fly_black_box(black_box):
     """One step of the shipped plant, compiled once for the module."""
     step = jax.jit(black_box.step_vector)
     return lambda x, u: np.asarray(step(x, u))
 
 
 @pytest.fixture(scope="session")
-def truth() -> Any:
+def truth():
     """A made-up flight of 20 s at 100 Hz, all clocks the same."""
     from tests.support.made_flight import TIME_S, flight
 

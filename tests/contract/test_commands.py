@@ -44,7 +44,7 @@ main(sys.argv[1:])
 
 
 @cache
-def help_of(*arguments: str) -> str:
+def help_of(*arguments):
     """Return what a command prints when it is asked for help, without the boxes."""
     text = io.StringIO()
     with pytest.MonkeyPatch.context() as monkeypatch, contextlib.redirect_stdout(text):
@@ -55,7 +55,7 @@ def help_of(*arguments: str) -> str:
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_a_command_of_the_docs_and_its_flags_exist(line: str) -> None:
+def test_a_command_of_the_docs_and_its_flags_exist(line):
     words = shlex.split(line)
     if words[0] == "make":
         assert re.search(
@@ -70,7 +70,7 @@ def test_a_command_of_the_docs_and_its_flags_exist(line: str) -> None:
 
 
 @pytest.mark.parametrize("name", [*COMMANDS, "", "firmware build"])
-def test_every_flag_says_what_it_does(name: str) -> None:
+def test_every_flag_says_what_it_does(name):
     entries = ENTRY.findall(help_of(*name.split()))
     bare = [
         flag
@@ -87,9 +87,7 @@ def test_every_flag_says_what_it_does(name: str) -> None:
         ["demo", "train", "collect"], [name for name, command in COMMANDS.items() if command.extra]
     ),
 )
-def test_without_its_extra_a_command_helps_and_says_what_to_install(
-    name: str, tmp_path: Path
-) -> None:
+def test_without_its_extra_a_command_helps_and_says_what_to_install(name, tmp_path):
     words = {
         "fit": ["log", "--out", "o"],
         "validate": ["m", "l", "--out", "o"],
@@ -109,7 +107,7 @@ def test_without_its_extra_a_command_helps_and_says_what_to_install(
     assert ended.stderr.startswith(f"flytrack {name}: error: ") and how in ended.stderr
 
 
-def test_the_list_of_commands_is_quick_and_the_version_that_of_the_package(capsys) -> None:
+def test_the_list_of_commands_is_quick_and_the_version_that_of_the_package(capsys):
     started = time.perf_counter()
     code = (
         "import sys; from flytrack.cli import main\n"
@@ -131,7 +129,7 @@ def test_the_list_of_commands_is_quick_and_the_version_that_of_the_package(capsy
 
 
 @pytest.mark.parametrize("shell", SHELLS)
-def test_shells_complete_commands_and_flags(shell: str, capsys) -> None:
+def test_shells_complete_commands_and_flags(shell, capsys):
     main(["--print-completion", shell])
     script = capsys.readouterr().out
     assert all(word in script for word in (*COMMANDS, "--noise", "total-timesteps")), script[:2000]

@@ -3,7 +3,6 @@
 import ast
 import importlib
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ RUN = (
 RUN = (FAST, *RUN, "diagnosis.md", "quick_start.md", "faq.md")
 
 
-def test_every_public_package_is_in_the_reference() -> None:
+def test_every_public_package_is_in_the_reference():
     files = [path for package in PACKAGES for path in (ROOT / package).rglob("__init__.py")]
     packages = {".".join(path.relative_to(ROOT).parent.parts) for path in files}
     public = {name for name in packages if hasattr(importlib.import_module(name), "__all__")}
@@ -42,7 +41,7 @@ def test_every_public_package_is_in_the_reference() -> None:
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_what_a_page_imports_is_public(path: Path) -> None:
+def test_what_a_page_imports_is_public(path):
     for node in ast.walk(ast.parse(examples(path.read_text(encoding="utf-8")))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES:
             module = importlib.import_module(node.module)
@@ -53,14 +52,12 @@ def test_what_a_page_imports_is_public(path: Path) -> None:
 
 
 @pytest.mark.parametrize("page", slow_but([FAST], RUN))
-def test_examples_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_examples_run(page, tmp_path, monkeypatch):
     run_examples((DOCS / page).read_text(encoding="utf-8"), tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("name", slow_but(["linear_drag"], [effect.name for effect in EFFECTS]))
-def test_page_of_an_effect_has_its_parameters_and_python_that_runs(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_page_of_an_effect_has_its_parameters_and_python_that_runs(name, tmp_path, monkeypatch):
     effect = next(effect for effect in EFFECTS if effect.name == name)
     text = effect_page(effect)
     assert "<math" in text and all(f"\n| `{parameter}` |" in text for parameter in effect.ranges)
@@ -69,7 +66,7 @@ def test_page_of_an_effect_has_its_parameters_and_python_that_runs(
 
 
 @pytest.mark.parametrize("name", available_tracks())
-def test_page_of_a_track_has_the_headings_of_its_gates(name: str) -> None:
+def test_page_of_a_track_has_the_headings_of_its_gates(name):
     track = load_track(name)
     forward = np.stack(build_course(track).gates.forward, axis=-1)[:, :2]
     headings = np.deg2rad([heading_deg for _, _, heading_deg, _ in gate_rows(track)])

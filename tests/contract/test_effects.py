@@ -2,12 +2,12 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from flytrack_env import effects
 from flytrack_env.dynamics import start_rates, step
@@ -16,7 +16,6 @@ from flytrack_env.effects import (
     LEARNED_LAW,
     BetaflightLoop,
     CommandDelay,
-    Effect,
     ImuLatency,
     LinearDrag,
     ThrustScale,
@@ -48,7 +47,7 @@ RACER = BetaflightLoop(
 )
 
 
-def inside_ranges(effect: Effect, fraction: float) -> Any:
+def inside_ranges(effect, fraction):
     """Return parameters that lie that far from neutral towards the upper end of their ranges."""
     neutral = effect.parameters()
     if "respond" in effect.hooks and fraction > 0.0:
@@ -67,18 +66,16 @@ GROUPS |= {f"every fifth from {first}": WITHOUT_LOOP[first::5] for first in rang
 
 
 @pytest.mark.parametrize("group", slow_but(["all"], GROUPS))
-def test_neutral_equals_absent_bit_for_bit(group: str) -> None:
+def test_neutral_equals_absent_bit_for_bit(group):
     with_neutral = NOMINAL.with_effects(*(effect.parameters() for effect in GROUPS[group]))
     assert jax.tree.structure(with_neutral) != jax.tree.structure(NOMINAL)
     for seed in range(2):
         drone, commands = random_drone(seed), random_commands(seed, NUM_STEPS)
-        np.testing.assert_array_equal(
-            fly(drone, commands, with_neutral), fly(drone, commands, NOMINAL)
-        )
+        assert_array_equal(fly(drone, commands, with_neutral), fly(drone, commands, NOMINAL))
 
 
 @OVER_EFFECTS
-def test_declaration_is_consistent(effect: Effect) -> None:
+def test_declaration_is_consistent(effect):
     neutral = effect.parameters()
     assert tuple(effect.ranges) == neutral._fields
     assert effect.stages and effect.equation and effect.source
@@ -97,7 +94,7 @@ def test_declaration_is_consistent(effect: Effect) -> None:
         assert effect.stages != (stage,) or channel in effect.search.needs
 
 
-def test_every_file_of_the_folder_is_in_the_list() -> None:
+def test_every_file_of_the_folder_is_in_the_list():
     files = {path.stem for path in Path(effects.__path__[0]).glob("*.py")}
     files -= {"__init__", "base", "grammar"}
     every = (*EFFECTS, LEARNED_LAW)
@@ -106,7 +103,7 @@ def test_every_file_of_the_folder_is_in_the_list() -> None:
 
 
 @OVER_EFFECTS
-def test_probes_show_the_effect(effect: Effect) -> None:
+def test_probes_show_the_effect(effect):
     full_stick, drone = np.ones((20, 4)), random_drone(0)
     plain = flown((), full_stick, drone)
     for name, values in effect.search.probes.items():
@@ -133,7 +130,7 @@ CHANGES |= {"gyro": GYRO, "accelerometer": ACCELEROMETER, "pose": POSE}
 
 
 @OVER_EFFECTS
-def test_changes_what_its_stages_may_and_nothing_else(effect: Effect) -> None:
+def test_changes_what_its_stages_may_and_nothing_else(effect):
     drone = random_drone(0)._replace(applied=Action(0.3, -0.2, 0.1, 0.5))
     # What sensors read never changes the flight; other effects change more in later steps.
     falling = held(
@@ -147,19 +144,17 @@ def test_changes_what_its_stages_may_and_nothing_else(effect: Effect) -> None:
 
 
 @jax.jit
-def final_and_slope(
-    effects: tuple[Any, ...], change: tuple[Any, ...]
-) -> tuple[jax.Array, jax.Array]:
+def final_and_slope(effects, change):
     """Return a short flight's last row, (37,), and its derivative along a parameter change."""
     drone, commands = random_drone(1), 0.9 * random_commands(1, 14)
 
-    def final(effects: tuple[Any, ...]) -> jax.Array:
+    def final(effects):
         return fly(drone, commands, NOMINAL._replace(effects=effects))[-1]
 
     return jax.jvp(final, (effects,), (change,))
 
 
-def only(effect: Effect, name: str) -> tuple[Any, ...]:
+def only(effect, name):
     """Return a change of one parameter by 1, all others by 0."""
     zeros = [type(neutral)(*[0.0] * len(neutral)) for neutral in ALL_NEUTRAL.effects]
     place = EFFECTS.index(effect)
@@ -169,7 +164,7 @@ def only(effect: Effect, name: str) -> tuple[Any, ...]:
 
 @OVER_EFFECTS
 @pytest.mark.parametrize("fraction", [0.0, 0.8])
-def test_gradients_are_finite_and_right(effect: Effect, fraction: float) -> None:
+def test_gradients_are_finite_and_right(effect, fraction):
     # With some drag: without any, moving air does nothing.
     model = ALL_NEUTRAL.with_effects(LinearDrag(0.1, 0.1, 0.1), inside_ranges(effect, fraction))
     parameters = jax.tree.map(jnp.float32, model.effects)
@@ -188,7 +183,7 @@ def test_gradients_are_finite_and_right(effect: Effect, fraction: float) -> None
         moved = jax.tree.map(jnp.add, parameters, shift)
         measured = (np.asarray(final_and_slope(moved, tangent)[0]) - here) / change
         assert np.abs(slope).max() > 0.0
-        np.testing.assert_allclose(slope, measured, atol=0.03 * np.abs(slope).max() + 1e-4 / change)
+        assert_allclose(slope, measured, atol=0.03 * np.abs(slope).max() + 1e-4 / change)
 
 
 @pytest.mark.parametrize(
@@ -196,12 +191,12 @@ def test_gradients_are_finite_and_right(effect: Effect, fraction: float) -> None
     [effect for effect in EFFECTS if "rates" in effect.hooks],
     ids=lambda effect: effect.name,
 )
-def test_rates_of_a_start_stay_while_its_sticks_are_held(effect: Effect) -> None:
+def test_rates_of_a_start_stay_while_its_sticks_are_held(effect):
     drone, parameters = random_drone(5), inside_ranges(effect, 0.5)
     drone = drone._replace(rates_b=steady_rates(drone, ALL_NEUTRAL.with_effects(parameters)))
     assert np.abs(drone.rates_b).max() > 0.1 and np.isfinite(drone.rates_b).all()
     found = flown(parameters, np.tile(drone.applied, (3, 1)), drone)[:, RATES]
-    np.testing.assert_allclose(found, np.tile(drone.rates_b, (3, 1)), rtol=2e-3, atol=1e-5)
+    assert_allclose(found, np.tile(drone.rates_b, (3, 1)), rtol=2e-3, atol=1e-5)
 
 
 steady_rates = jax.jit(start_rates)
@@ -226,13 +221,13 @@ steady_rates = jax.jit(start_rates)
         ),
     ],
 )
-def test_parameters_out_of_range_are_refused(parameters: Any, dt: float, expected: str) -> None:
+def test_parameters_out_of_range_are_refused(parameters, dt, expected):
     check_parameters(type(parameters)(0.02), dt)
     with pytest.raises(ValueError, match=expected):
         check_parameters(parameters, dt)
 
 
-def test_effects_stand_in_the_order_of_the_list_and_replace_their_like() -> None:
+def test_effects_stand_in_the_order_of_the_list_and_replace_their_like():
     model = NOMINAL.with_effects(LinearDrag(0.1), CommandDelay(0.01)).with_effects(
         Wind(1.0), LinearDrag(0.2)
     )
@@ -242,14 +237,14 @@ def test_effects_stand_in_the_order_of_the_list_and_replace_their_like() -> None
     assert NOMINAL.effects == ()
 
 
-def test_what_is_no_effect_is_refused() -> None:
+def test_what_is_no_effect_is_refused():
     with pytest.raises(TypeError, match="effect: found float, expected one of CommandDelay, "):
         NOMINAL.with_effects(0.3)
     with pytest.raises(KeyError, match="drag"):
         NOMINAL.effect("drag")
 
 
-def test_the_packed_step_refuses_a_memory() -> None:
+def test_the_packed_step_refuses_a_memory():
     with pytest.raises(
         ValueError, match=r"params\.effects: found one with a memory, expected none"
     ):

@@ -7,7 +7,6 @@ import sys
 import warnings
 from functools import partial
 from itertools import product
-from typing import Any
 
 import gymnasium
 import jax
@@ -18,10 +17,10 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 from gymnasium.wrappers import vector as wrappers
+from numpy.testing import assert_allclose, assert_array_equal
 
 import flytrack_env
 from flytrack_env.effects import CommandDelay
-from flytrack_env.env import EnvParams, FlyTrack
 from flytrack_env.gymnasium_adapter import simulation
 from flytrack_env.registration import ENVIRONMENTS
 from tests.support.coasting import track_of_row
@@ -38,7 +37,7 @@ CHECKED = [*product((BASE, "FlyTrackRobust-v0"), ((), ("pygame",), ("pygame", "P
 CRASH = np.full(4, np.nan, np.float32)  # an action that ends the episode
 
 
-def make_vector(env_id: str = BASE, num_envs: int = 3, **arguments: Any) -> Any:
+def make_vector(env_id=BASE, num_envs=3, **arguments):
     """Return the vector environment of an id."""
     return gymnasium.make_vec(
         env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **arguments
@@ -46,7 +45,7 @@ def make_vector(env_id: str = BASE, num_envs: int = 3, **arguments: Any) -> Any:
 
 
 @pytest.fixture(scope="module")
-def still(params: EnvParams) -> EnvParams:
+def still(params):
     """Parameters of which every episode begins in the same way, and lasts 12 steps at most."""
     names = ("position_noise", "height_noise", "yaw_noise_deg", "tilt_noise_deg")
     reset = params.reset._replace(course_fraction=0.0, start_charge_low=1.0)
@@ -60,7 +59,7 @@ def still(params: EnvParams) -> EnvParams:
 @pytest.mark.parametrize(
     "case", slow_but(CHECKED, sorted({*CHECKED, *((one, ()) for one in IDS)})), ids=str
 )
-def test_checker_of_gymnasium_gives_no_warning(case: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checker_of_gymnasium_gives_no_warning(case, monkeypatch):
     env_id, missing = case
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     for package in missing:
@@ -72,7 +71,7 @@ def test_checker_of_gymnasium_gives_no_warning(case: Any, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_ids_are_registered_once_and_without_a_second_time_limit(env_id: str) -> None:
+def test_ids_are_registered_once_and_without_a_second_time_limit(env_id):
     before = gymnasium.spec(env_id)
     importlib.reload(flytrack_env)
     assert gymnasium.spec(env_id) is before and before.max_episode_steps is None
@@ -86,7 +85,7 @@ def test_ids_are_registered_once_and_without_a_second_time_limit(env_id: str) ->
     )
 
 
-def test_single_environment_agrees_with_gymnax(env: FlyTrack, still: EnvParams) -> None:
+def test_single_environment_agrees_with_gymnax(env, still):
     key, (_, state) = jax.random.key(0), env.reset(jax.random.key(0), still)
     single = gymnasium.make(BASE, params=still)
     single.reset()
@@ -97,14 +96,14 @@ def test_single_environment_agrees_with_gymnax(env: FlyTrack, still: EnvParams) 
             key, state, jnp.asarray(action), still
         )
         observation, *outcome, own_info = single.step(action)
-        np.testing.assert_allclose(observation, info["final_observation"], atol=2e-5)
-        np.testing.assert_allclose(outcome[0], reward, atol=2e-5)
+        assert_allclose(observation, info["final_observation"], atol=2e-5)
+        assert_allclose(outcome[0], reward, atol=2e-5)
         assert outcome[1:] == [terminated, truncated] == [False, index == 11]
         for name, value in own_info.items():
-            np.testing.assert_allclose(value, info[name], atol=2e-5)
+            assert_allclose(value, info[name], atol=2e-5)
 
 
-def assert_same(a: Any, b: Any) -> None:
+def assert_same(a, b):
     """Compare nested infos, except elapsed time: keys, types, and values to rounding."""
     if isinstance(a, dict):
         assert set(a) == set(b)
@@ -118,7 +117,7 @@ def assert_same(a: Any, b: Any) -> None:
     else:
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
         assert a.flags.writeable
-        np.testing.assert_allclose(a, b, atol=2e-5)
+        assert_allclose(a, b, atol=2e-5)
 
 
 NEXT_STEP, SAME_STEP = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP
@@ -147,9 +146,7 @@ NEXT_STEP, SAME_STEP = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP
 @pytest.mark.filterwarnings(
     "ignore:overflow encountered in cast"
 )  # of the limits, in DtypeObservation
-def test_vector_environment_returns_what_gymnasiums_own_does(
-    mode: AutoresetMode, wrapper: Any, still: EnvParams
-) -> None:
+def test_vector_environment_returns_what_gymnasiums_own_does(mode, wrapper, still):
     make = partial(gymnasium.make, BASE, params=still)
     plain = (
         make_vector(params=still, autoreset_mode=mode),
@@ -175,21 +172,19 @@ def test_vector_environment_returns_what_gymnasiums_own_does(
 # --- Seeding ------------------------------------------------------------------------------------
 
 
-def test_vector_seeds() -> None:
+def test_vector_seeds():
     env, single = make_vector(autoreset_mode="SameStep"), gymnasium.make(BASE)
     seeds, crash = [20, 21, 22], np.tile(CRASH, (3, 1))
     observations, _ = env.reset(seed=20)
-    np.testing.assert_array_equal(observations, env.reset(seed=seeds)[0])
-    np.testing.assert_allclose(
-        observations, [single.reset(seed=seed)[0] for seed in seeds], atol=1e-6
-    )
+    assert_array_equal(observations, env.reset(seed=seeds)[0])
+    assert_allclose(observations, [single.reset(seed=seed)[0] for seed in seeds], atol=1e-6)
     env.reset(seed=20)
     after = env.step(crash)[0]
     env.reset(seed=20)
-    np.testing.assert_array_equal(env.step(crash)[0], after)
+    assert_array_equal(env.step(crash)[0], after)
     assert len(np.unique(np.concatenate([observations, after, env.step(crash)[0]]), axis=0)) == 9
     partly = env.reset(seed=[20, None, 22])[0]
-    np.testing.assert_array_equal(partly[[0, 2]], observations[[0, 2]])
+    assert_array_equal(partly[[0, 2]], observations[[0, 2]])
     assert (partly[1] != observations[1]).any()
     assert (env.reset()[0] != env.reset()[0]).any(axis=1).all()
     with pytest.raises(ValueError, match="seed: found 2 seeds, expected one per environment, 3"):
@@ -200,7 +195,7 @@ def test_vector_seeds() -> None:
 
 
 @pytest.mark.parametrize("is_vector", [False, True])
-def test_copies_fly_on_alike_and_apart(is_vector: bool) -> None:
+def test_copies_fly_on_alike_and_apart(is_vector):
     env = make_vector() if is_vector else gymnasium.make(BASE).unwrapped
     env.reset(seed=8)
     action = np.full(env.action_space.shape, 0.2, np.float32)
@@ -209,7 +204,7 @@ def test_copies_fly_on_alike_and_apart(is_vector: bool) -> None:
     flown = np.stack([*(env.step(action)[0] for _ in range(3)), env.reset()[0]])
     for other in copies:
         again = np.stack([*(other.step(action)[0] for _ in range(3)), other.reset()[0]])
-        np.testing.assert_array_equal(again, flown)
+        assert_array_equal(again, flown)
 
 
 # --- Options of reset ---------------------------------------------------------------------------
@@ -223,7 +218,7 @@ POSE = {
 
 
 @pytest.mark.parametrize("is_vector", [False, True])
-def test_options_set_the_start_of_one_episode(is_vector: bool) -> None:
+def test_options_set_the_start_of_one_episode(is_vector):
     env = make_vector() if is_vector else gymnasium.make(BASE)
     observation = np.atleast_2d(env.reset(seed=0, options=POSE)[0])
     # Gate 0 at (12.5, 2, 1.35) is flown towards -x.
@@ -239,13 +234,13 @@ def test_options_set_the_start_of_one_episode(is_vector: bool) -> None:
         -1.0,
         -0.5,
     ]
-    np.testing.assert_allclose(observation[:, :23], [expected] * len(observation), atol=1e-5)
+    assert_allclose(observation[:, :23], [expected] * len(observation), atol=1e-5)
     following = np.atleast_2d(env.reset()[0])
     assert (abs(following[:, 22] + 0.5) > 1e-3).all()
 
 
 @pytest.mark.parametrize(("options", "message"), table("reset_options")["refused"])
-def test_bad_options_are_refused_and_change_nothing(options: Any, message: str) -> None:
+def test_bad_options_are_refused_and_change_nothing(options, message):
     env, vector = gymnasium.make(BASE), make_vector()
     for each in (env, vector):
         each.reset(seed=1)
@@ -253,13 +248,13 @@ def test_bad_options_are_refused_and_change_nothing(options: Any, message: str) 
             each.reset(seed=2, options=options)
     following = env.reset()[0]
     env.reset(seed=1)
-    np.testing.assert_array_equal(following, env.reset()[0])
+    assert_array_equal(following, env.reset()[0])
 
 
 # --- Arguments and misuse -------------------------------------------------------------------------
 
 
-def test_arguments_reach_the_environment(params: EnvParams) -> None:
+def test_arguments_reach_the_environment(params):
     beside = {
         "position": (-0.05, 4.0, 2.0),
         "velocity": (10.0, 0.0, 0.0),
@@ -277,7 +272,7 @@ def test_arguments_reach_the_environment(params: EnvParams) -> None:
         gymnasium.make(BASE, params=params.replace(model=params.model._replace(m=np.ones(3))))
 
 
-def test_wrong_use_is_refused() -> None:
+def test_wrong_use_is_refused():
     env, vector = gymnasium.make(BASE).unwrapped, make_vector()
     for each in (env, vector):
         with pytest.raises(gymnasium.error.ResetNeeded, match="expected a reset"):
@@ -296,7 +291,7 @@ def test_wrong_use_is_refused() -> None:
         make_vector(autoreset_mode=AutoresetMode.DISABLED)
 
 
-def test_integers_and_numbers_of_numpy_are_as_good_as_pythons(params: EnvParams) -> None:
+def test_integers_and_numbers_of_numpy_are_as_good_as_pythons(params):
     assert make_vector(num_envs=np.int64(4)).reset()[0].shape[0] == 4
     with pytest.raises(ValueError, match=r"num_envs: found 2\.0, expected an integer"):
         make_vector(num_envs=2.0)
@@ -309,7 +304,7 @@ def test_integers_and_numbers_of_numpy_are_as_good_as_pythons(params: EnvParams)
     assert len(set(compiled)) == 1
 
 
-def test_models_with_other_delays_are_flown_with_their_own() -> None:
+def test_models_with_other_delays_are_flown_with_their_own():
     steps = {}
     for delay_s in (0.04, 0.06, 0.04):
         model = flytrack_env.nominal_parameters().with_effects(CommandDelay(delay_s))

@@ -2,7 +2,6 @@
 
 import ast
 from graphlib import CycleError, TopologicalSorter
-from pathlib import Path
 
 import pytest
 
@@ -17,13 +16,13 @@ CONSUMERS, ONLY_IN = LAYERED["consumers"], LAYERED["only_in"]
 WINDOWS = ("pygame", "flytrack_fly")  # of all consumers, only that package opens windows
 
 
-def files_of(name: str) -> list[Path]:
+def files_of(name):
     """Return the Python files of a package or script at the root of the repository."""
     path = ROOT / name
     return sorted(path.rglob("*.py")) if path.is_dir() else [*ROOT.glob(f"{name}.py")]
 
 
-def imports_of(path: Path) -> list[tuple[str, int]]:
+def imports_of(path):
     """Return every dotted name that a file imports, anywhere in it, with its line."""
     found = []
     package = path.relative_to(ROOT).parent.parts
@@ -41,7 +40,7 @@ MODULES = files_of(PACKAGE)
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_no_arrow_points_up_or_to_a_consumer_or_a_foreign_viewer(path: Path) -> None:
+def test_no_arrow_points_up_or_to_a_consumer_or_a_foreign_viewer(path):
     module = path.relative_to(ROOT / PACKAGE).with_suffix("").parts[0]
     assert module in RANKS, f"{module}: not in tests/support/tables/layers.toml; give it a place"
     for name, line in imports_of(path):
@@ -60,7 +59,7 @@ CONSUMER_FILES = [path for name in CONSUMERS for path in files_of(name)]
 
 
 @pytest.mark.parametrize("path", CONSUMER_FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_consumers_use_public_names_of_the_package(path: Path) -> None:
+def test_consumers_use_public_names_of_the_package(path):
     for name, line in imports_of(path):
         parts = name.split(".")
         assert parts[0] != WINDOWS[0] or path.parts[len(ROOT.parts)] == WINDOWS[1], (path, line)
@@ -71,14 +70,14 @@ def test_consumers_use_public_names_of_the_package(path: Path) -> None:
 REPOSITORY = (PACKAGE, *CONSUMERS)
 
 
-def import_graph() -> dict[str, set[str]]:
+def import_graph():
     """Return the modules of the repository with those that each imports anywhere in it."""
     paths = [path for name in REPOSITORY for path in files_of(name)]
     names = {path: ".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths}
     modules = {path: name.removesuffix(".__init__") for path, name in names.items()}
     known = set(modules.values())
 
-    def imported(name: str) -> str | None:
+    def imported(name):
         return next((found for found in (name, name.rpartition(".")[0]) if found in known), None)
 
     return {
@@ -87,14 +86,14 @@ def import_graph() -> dict[str, set[str]]:
     }
 
 
-def test_no_modules_import_each_other_in_a_circle() -> None:
+def test_no_modules_import_each_other_in_a_circle():
     try:
         TopologicalSorter(import_graph()).prepare()
     except CycleError as error:
         pytest.fail(" -> ".join(reversed(error.args[1])))
 
 
-def test_the_black_boxs_plant_is_reached_only_through_its_artifact() -> None:
+def test_the_black_boxs_plant_is_reached_only_through_its_artifact():
     for name in (*REPOSITORY, "docs", "noxfile"):
         for path in files_of(name):
             packages = {imported.split(".")[0] for imported, _ in imports_of(path)}
@@ -104,7 +103,7 @@ def test_the_black_boxs_plant_is_reached_only_through_its_artifact() -> None:
                 assert "blackbox" not in packages, path
 
 
-def test_this_test_sees_imports() -> None:
+def test_this_test_sees_imports():
     seen = {name for path in MODULES for name, _ in imports_of(path)}
     assert "flytrack_env.dynamics.ModelParameters" in seen and "gymnax" in seen
     assert len(CONSUMER_FILES) > 0

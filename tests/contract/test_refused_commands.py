@@ -37,7 +37,7 @@ def broken(x, u):
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """Policies, rollouts, logs and models, some of which cannot be used, and the repository."""
     folder = tmp_path_factory.mktemp("refused")
     (folder / "repository").symlink_to(ROOT)
@@ -65,16 +65,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def written(folder: Path) -> dict[Path, int]:
+def written(folder):
     """Return the files in a folder, and when each was written."""
     paths = [Path(parent, name) for parent, _, names in os.walk(folder) for name in names]
     return {path: path.stat().st_mtime_ns for path in paths if path.suffix != ".pyc"}
 
 
 @pytest.mark.parametrize("command", CASES)
-def test_what_cannot_be_run_is_told_before_any_work(
-    command: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_run_is_told_before_any_work(command, folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     monkeypatch.setattr(evaluate, "can_record", lambda: True)
     monkeypatch.setattr(evaluate.Report, "fly", lambda _: pytest.fail("it flew"))

@@ -4,7 +4,6 @@ import hashlib
 import importlib
 import subprocess
 import sys
-from collections.abc import Callable
 
 import gymnasium
 import gymnax
@@ -13,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnax.registration import registered_envs
+from numpy.testing import assert_allclose
 
 import flytrack_env
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import ThrustScale
-from flytrack_env.env import EnvParams, EnvState, FlyTrack
 from flytrack_env.extras import check_gymnax
 from flytrack_env.registration import ENVIRONMENTS, make, register_all
 from flytrack_env.state import Action
@@ -32,7 +31,7 @@ OVER_IDS = pytest.mark.parametrize("env_id", ENVIRONMENTS)
 
 
 @OVER_IDS
-def test_every_id_follows_gymnaxs_protocol(env_id: str) -> None:
+def test_every_id_follows_gymnaxs_protocol(env_id):
     first, first_params = gymnax.make(env_id)
     importlib.reload(flytrack_env)
     register_all()
@@ -57,7 +56,7 @@ def test_every_id_follows_gymnaxs_protocol(env_id: str) -> None:
 
 
 @OVER_IDS
-def test_every_id_takes_a_plant_with_its_parameters_baked_in(env_id: str) -> None:
+def test_every_id_takes_a_plant_with_its_parameters_baked_in(env_id):
     class Baked(Coasting):
         dt = 0.01
 
@@ -67,7 +66,7 @@ def test_every_id_takes_a_plant_with_its_parameters_baked_in(env_id: str) -> Non
     assert not any(isinstance(layer, DomainRandomization) for layer in layers_of(env))
 
 
-def test_overrides_reach_the_environment_which_says_what_it_is() -> None:
+def test_overrides_reach_the_environment_which_says_what_it_is():
     env = gymnax.make("FlyTrackNoisy-v0", missed_gate="fly_on", track="split_s")[0]
     assert env.missed_gate == "fly_on"
     assert repr(env) == (
@@ -101,12 +100,12 @@ WRONG_CALLS = {
 
 
 @pytest.mark.parametrize("message", WRONG_CALLS)
-def test_wrong_calls_are_refused_in_a_sentence_that_says_what_to_do(message: str) -> None:
+def test_wrong_calls_are_refused_in_a_sentence_that_says_what_to_do(message):
     with pytest.raises((ValueError, TypeError, ImportError), match=message):
         WRONG_CALLS[message]()
 
 
-def digest(env_id: str) -> str:
+def digest(env_id):
     """Return a digest of every bit of a seeded flight through several episodes."""
     env, params = gymnax.make(env_id)
     params = params.replace(max_steps_in_episode=3)
@@ -120,7 +119,7 @@ def digest(env_id: str) -> str:
 # The plain one runs every time: wrappers have fast tests of their own, and each id takes seconds to
 # compile.
 @pytest.mark.parametrize("env_ids", slow_but([BASE], [BASE, tuple(ENVIRONMENTS)[1:]]))
-def test_identical_seeds_fly_identically_in_another_process(env_ids: tuple[str, ...]) -> None:
+def test_identical_seeds_fly_identically_in_another_process(env_ids):
     code = f"from tests.contract.test_registration import digest; print(*map(digest, {env_ids!r}))"
     here = [digest(env_id) for env_id in env_ids]
     other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -132,7 +131,7 @@ def test_identical_seeds_fly_identically_in_another_process(env_ids: tuple[str, 
 
 @pytest.mark.slow
 @OVER_IDS
-def test_gradients_are_those_of_finite_differences(env_id: str) -> None:
+def test_gradients_are_those_of_finite_differences(env_id):
     """In every action of the first of three steps in free flight, away from every gate."""
     env, params = gymnax.make(env_id)
     attached = env.with_transition_gradients()
@@ -142,7 +141,7 @@ def test_gradients_are_those_of_finite_differences(env_id: str) -> None:
     weights = jax.random.normal(jax.random.key(2), env.observation_space(params).shape)
 
     @jax.jit
-    def value(action: jax.Array) -> jax.Array:
+    def value(action):
         flown = state
         for command in (action, jnp.full(4, 0.2), jnp.full(4, -0.1)):
             observation, flown, *_ = attached.step_env(None, flown, command, params)
@@ -153,16 +152,14 @@ def test_gradients_are_those_of_finite_differences(env_id: str) -> None:
     shifts = 0.05 * np.eye(4, dtype=np.float32)
     expected = [float(value(action + shift) - value(action - shift)) / 0.1 for shift in shifts]
     assert np.abs(expected).max() > 0.05
-    np.testing.assert_allclose(found, expected, rtol=0.02, atol=2e-3)
+    assert_allclose(found, expected, rtol=0.02, atol=2e-3)
 
 
-def test_transition_gradients_are_detached_unless_asked_for(
-    env: FlyTrack, params: EnvParams
-) -> None:
+def test_transition_gradients_are_detached_unless_asked_for(env, params):
     """In float64, of a smooth scalar of observation, reward and next state, in action and speed."""
 
-    def differentiable(env: FlyTrack, state: EnvState) -> Callable[..., jax.Array]:
-        def scalar(action: jax.Array, speed: jax.Array) -> jax.Array:
+    def differentiable(env, state):
+        def scalar(action, speed):
             drone = env.drone(state)
             plant = state.plant._replace(drone=drone._replace(vel_w=drone.vel_w._replace(y=speed)))
             observation, after, reward, *_ = env.step_env(
@@ -188,6 +185,6 @@ def test_transition_gradients_are_detached_unless_asked_for(
         numeric = [(scalar(action + s, speed) - scalar(action - s, speed)) / 2e-6 for s in shifts]
         slope = (scalar(action, speed + 1e-6) - scalar(action, speed - 1e-6)) / 2e-6
     assert not np.asarray(detached[0]).any() and not np.asarray(detached[1]).any()
-    np.testing.assert_allclose(gradient[0], numeric, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(gradient[1], slope, rtol=1e-4, atol=1e-5)
+    assert_allclose(gradient[0], numeric, rtol=1e-4, atol=1e-5)
+    assert_allclose(gradient[1], slope, rtol=1e-4, atol=1e-5)
     assert np.abs(numeric).min() > 1e-6

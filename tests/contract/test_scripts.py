@@ -2,10 +2,10 @@
 
 import io
 import json
-from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from flytrack.cli import main
 from flytrack_env.dynamics import nominal_parameters
@@ -15,7 +15,6 @@ from flytrack_sysid.diagnosis.lanes import LANE_S
 from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, HEIGHTS
 from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights_of, hover_action
 from flytrack_sysid.script_file import (
-    Script,
     ScriptError,
     check_script,
     load_script,
@@ -28,7 +27,7 @@ from tests.support.handout_plant import HandoutPlant
 HOVER = hover_action(HandoutPlant().model())
 
 
-def made(*names: str) -> Script:
+def made(*names):
     return script_of(flights_of(names or MANOEUVRES, HOVER))
 
 
@@ -57,14 +56,14 @@ def test_a_script_comes_back_the_same(tmp_path):
     save_script(tmp_path / "flight.npz", script)
     found = load_script(tmp_path / "flight.npz")
     assert found.kinds == script.kinds
-    np.testing.assert_array_equal(found.starts, script.starts)
-    np.testing.assert_array_equal(found.commands, script.commands)
+    assert_array_equal(found.starts, script.starts)
+    assert_array_equal(found.commands, script.commands)
     again = tmp_path / "again.npz"
     save_script(again, script)
     assert again.read_bytes() == (tmp_path / "flight.npz").read_bytes()
 
 
-def changed(name: str, place: Any, value: float) -> dict[str, Any]:
+def changed(name, place, value):
     values = getattr(made("headings"), name).copy()
     values[place] = value
     return {name: values}
@@ -96,7 +95,7 @@ def test_bad_scripts_are_refused(tmp_path, message):
         load_script(path)
 
 
-def asked(*pairs: tuple[str, str]) -> dict[str, Any]:
+def asked(*pairs):
     return {
         "schema": 1,
         "not_identifiable": [{"effect": effect, "fly": fly} for effect, fly in pairs],

@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 from functools import partial
-from typing import Any
 
 import gymnax
 import jax
@@ -25,7 +24,7 @@ OVER_KINDS = pytest.mark.parametrize(
 
 
 @OVER_IDS
-def test_with_x64_a_step_keeps_the_types_of_the_state(env_id: str) -> None:
+def test_with_x64_a_step_keeps_the_types_of_the_state(env_id):
     env = gymnax.make(env_id)[0]
     with jax.enable_x64(True):
         keys, actions, params = inputs(env)
@@ -40,14 +39,14 @@ def test_with_x64_a_step_keeps_the_types_of_the_state(env_id: str) -> None:
         assert jax.eval_shape(flight(env), keys, doubles, params)[0] == begun
 
 
-def as_type(dtype: Any, leaf: Any) -> jax.ShapeDtypeStruct:
+def as_type(dtype, leaf):
     """Return the shape of a leaf, with another type if it is a float."""
     is_float = np.issubdtype(leaf.dtype, np.floating)
     return jax.ShapeDtypeStruct(leaf.shape, dtype if is_float else leaf.dtype)
 
 
 @OVER_KINDS
-def test_with_x64_a_flight_is_the_same(env_id: str) -> None:
+def test_with_x64_a_flight_is_the_same(env_id):
     env = gymnax.make(env_id)[0]
     keys, actions, params = inputs(env)
     expected = jax.jit(flight(env))(keys, actions, params)
@@ -58,7 +57,7 @@ def test_with_x64_a_flight_is_the_same(env_id: str) -> None:
 
 
 @OVER_IDS
-def test_with_strict_promotion_reset_and_step_compile(env_id: str) -> None:
+def test_with_strict_promotion_reset_and_step_compile(env_id):
     env = gymnax.make(env_id)[0]
     with jax.numpy_dtype_promotion("strict"):
         arguments = inputs(env)
@@ -66,14 +65,14 @@ def test_with_strict_promotion_reset_and_step_compile(env_id: str) -> None:
 
 
 @OVER_KINDS
-def test_a_flight_has_no_nan(env_id: str) -> None:
+def test_a_flight_has_no_nan(env_id):
     env = gymnax.make(env_id)[0]
     with jax.debug_nans(True):
         jax.block_until_ready(jax.jit(flight(env))(*inputs(env)))
 
 
 @OVER_KINDS
-def test_flights_on_four_devices_are_those_on_one(env_id: str) -> None:
+def test_flights_on_four_devices_are_those_on_one(env_id):
     environment = {**os.environ, "XLA_FLAGS": XLA_FLAGS}
     command = [sys.executable, "-m", "tests.support.stepping", env_id]
     result = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)

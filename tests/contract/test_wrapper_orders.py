@@ -5,7 +5,6 @@ import pickle
 import re
 from functools import partial
 from itertools import product
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +17,7 @@ from flytrack_env.plants import Simulator
 from tests.support.wrapped_flights import ALL, wrapped
 
 # Every public wrapper, both kinds of history among them, and one of gymnax's.
-MAKERS: dict[str, Any] = {
+MAKERS = {
     "noise": wrappers.ObservationNoise,
     "commanded": partial(wrappers.ActionHistory, length=2),
     "applied": partial(wrappers.ActionHistory, length=1, kind="applied"),
@@ -32,7 +31,7 @@ OTHER_STEP = ("legacy", "log")
 ROWS = {"commanded": 8, "applied": 4}
 
 
-def test_every_public_wrapper_is_tried() -> None:
+def test_every_public_wrapper_is_tried():
     exported = [getattr(wrappers, name) for name in wrappers.__all__]
     public = {
         one for one in exported if isinstance(one, type) and issubclass(one, wrappers.Wrapper)
@@ -40,7 +39,7 @@ def test_every_public_wrapper_is_tried() -> None:
     assert public - {wrappers.Wrapper} < {type(make(FlyTrack())) for make in MAKERS.values()}
 
 
-def reasons_against(name: str, inside: tuple[str, ...]) -> list[str]:
+def reasons_against(name, inside):
     """Return the possible messages why a wrapper may not go around others, innermost first."""
     if name == "legacy":
         return ["the step inside has five values already"] * (inside[-1:] == ("legacy",))
@@ -56,10 +55,10 @@ def reasons_against(name: str, inside: tuple[str, ...]) -> list[str]:
     ] * is_late
 
 
-def test_any_three_compose_or_are_refused_with_the_reason() -> None:
+def test_any_three_compose_or_are_refused_with_the_reason():
     base = FlyTrack()
     for order in product(MAKERS, repeat=3):
-        env: Any = base
+        env = base
         for index, name in enumerate(order):
             reasons = reasons_against(name, order[:index])
             if reasons:
@@ -78,7 +77,7 @@ def test_any_three_compose_or_are_refused_with_the_reason() -> None:
                 env.check_params(env.default_params)
 
 
-def test_randomising_what_is_baked_in_is_refused() -> None:
+def test_randomising_what_is_baked_in_is_refused():
     class Baked(Simulator):
         dt = 0.01
 
@@ -89,7 +88,7 @@ def test_randomising_what_is_baked_in_is_refused() -> None:
 @pytest.mark.parametrize(
     "wrapper", [wrappers.DomainRandomization, wrappers.ActionDelay, wrappers.ObservationNoise]
 )
-def test_parameters_of_another_environment_are_refused(wrapper: Any) -> None:
+def test_parameters_of_another_environment_are_refused(wrapper):
     env, others = wrapped(wrapper), FlyTrack().default_params
     with pytest.raises(
         ValueError, match=rf"params\.wrappers: found \[\], expected \['{env.key}'\]"
@@ -104,7 +103,7 @@ def test_parameters_of_another_environment_are_refused(wrapper: Any) -> None:
         env.reset(jax.random.key(0), unknown)
 
 
-def test_resets_and_steps_can_be_traced_and_gymnaxs_wrappers_go_around() -> None:
+def test_resets_and_steps_can_be_traced_and_gymnaxs_wrappers_go_around():
     env, key = wrapped(*ALL), jax.random.key(0)
     params = jax.tree.map(jnp.asarray, env.default_params)
     observation, state = jax.eval_shape(lambda key: env.reset(key, params), key)
@@ -120,14 +119,14 @@ class SixValues:
 
     name = "six"
 
-    def step(self, key: Any, state: Any, action: Any, params: Any) -> tuple[Any, ...]:
+    def step(self, key, state, action, params):
         return action, state, state, action > 0.0, action > 1.0, {"truncated": action > 1.0}
 
 
 @pytest.mark.parametrize(
     "clone", [copy.copy, copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))]
 )
-def test_legacy_step_joins_the_flags_and_survives_copies(clone: Any) -> None:
+def test_legacy_step_joins_the_flags_and_survives_copies(clone):
     env = clone(wrappers.LegacyStep(SixValues()))
     _, _, reward, done, info = env.step(None, 3.0, jnp.array([-1.0, 0.5, 2.0]))
     assert float(reward) == 3.0 and env.name == "six"

@@ -1,12 +1,12 @@
 """The benchmark protocol: frozen tasks, results that repeat, and what is refused."""
 
 import json
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from baselines.purejaxrl_ppo import load_checkpoint
 from benchmarks import suite as drawn
@@ -27,7 +27,7 @@ def hover(observation):
 
 
 @pytest.fixture
-def small(tmp_path) -> Path:
+def small(tmp_path):
     """The file of a suite of two tasks with two starts each."""
     content = json.loads((FOLDER / "v1.json").read_text())
     content |= {"starts": 2, "steps": 60, "tasks": [content["tasks"][0], content["tasks"][-1]]}
@@ -42,7 +42,7 @@ def test_the_suite_is_what_its_seed_draws(tmp_path):
     drawn.draw_suite(tmp_path)
     for name in drawn.TRACK_SEEDS:
         rows = [load_track(folder / "v1" / f"{name}.toml").rows() for folder in (tmp_path, FOLDER)]
-        np.testing.assert_allclose(*rows, rtol=1e-12, atol=1e-12)
+        assert_allclose(*rows, rtol=1e-12, atol=1e-12)
     suites = [
         json.loads((folder / "v1.json").read_text())["tasks"] for folder in (tmp_path, FOLDER)
     ]
@@ -50,7 +50,7 @@ def test_the_suite_is_what_its_seed_draws(tmp_path):
         assert all(again[name] == task[name] for name in ("id", "track", "optimal_lap_s"))
         assert jax.tree.structure(again["craft"]) == jax.tree.structure(task["craft"])
         crafts = [np.array(jax.tree.leaves(one["craft"]), float) for one in (again, task)]
-        np.testing.assert_allclose(*crafts, rtol=1e-14)
+        assert_allclose(*crafts, rtol=1e-14)
     suite = load_suite("v1")
     assert sum(task.craft is not None for task in suite.tasks) == 8 and len(suite.tasks) == 12
 
@@ -123,4 +123,4 @@ def test_a_policy_is_trained_again_on_the_model_of_the_plant_that_was_diagnosed(
     found = retrain.diagnose_and_retrain(data, champion)
     assert data.seconds_left == 0.0 and found.checkpoint is not None
     (model,) = trained
-    np.testing.assert_allclose(model.tau[:3], task.craft.tau[:3], atol=0.005)
+    assert_allclose(model.tau[:3], task.craft.tau[:3], atol=0.005)

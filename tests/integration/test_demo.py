@@ -3,11 +3,9 @@
 import contextlib
 import io
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from baselines.purejaxrl_ppo import monitor
 from flytrack.cli import main
@@ -15,7 +13,7 @@ from flytrack_env import load_model, load_track
 
 
 @pytest.mark.slow
-def test_demo_writes_everything(tmp_path: Path) -> None:
+def test_demo_writes_everything(tmp_path):
     pytest.importorskip("rerun")
     out, text = tmp_path / "demo", io.StringIO()
     arguments = ["demo", "--quick", "--out", str(out)]
@@ -32,10 +30,8 @@ def test_demo_writes_everything(tmp_path: Path) -> None:
         main(arguments)  # it does not overwrite a run
 
 
-def test_density_is_time_per_flight_in_bins(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    figures: list[Figure] = []
+def test_density_is_time_per_flight_in_bins(tmp_path, monkeypatch):
+    figures = []
     monkeypatch.setattr(monitor, "png_of", lambda figure, dpi: figures.append(figure) or b"png")
     positions = np.array([[10.02, 10.03, 1.0]] * 40 + [[10.02, 10.13, 2.0]] * 8 + [[1e3, 0.0, 1.0]])
     monitor.draw_position_density(tmp_path / "density.png", positions, load_track("flytrack"), 4)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from baselines.purejaxrl_ppo import checkpoint_env, evaluate
 from baselines.purejaxrl_ppo import flights as flights_module
@@ -68,13 +69,13 @@ def test_lap_times_are_those_of_the_rails(flights, raced):
     )  # 0 where a flight falls
     is_good = paces > 0.0
     assert 0 < is_good.sum() < NUM_FLIGHTS  # else this test would see one kind only
-    np.testing.assert_array_equal(raced.is_complete(), is_good)
-    np.testing.assert_array_equal(raced.ends()["ground"], ~is_good)
+    assert_array_equal(raced.is_complete(), is_good)
+    assert_array_equal(raced.ends()["ground"], ~is_good)
     standing, flying = (shipped_reference("flytrack", kind) for kind in ("standing", "flying"))
     expected = paces[is_good, None] * np.array([[standing.time_s, flying.time_s, flying.time_s]])
-    np.testing.assert_allclose(raced.lap_times_s[is_good], expected, atol=TOLERANCE_S)
+    assert_allclose(raced.lap_times_s[is_good], expected, atol=TOLERANCE_S)
     gates_s = paces[is_good, None] * standing.gate_times_s
-    np.testing.assert_allclose(raced.gate_times_s[is_good, :8], gates_s, atol=TOLERANCE_S)
+    assert_allclose(raced.gate_times_s[is_good, :8], gates_s, atol=TOLERANCE_S)
     assert np.isnan(raced.lap_times_s[~is_good]).all() and (raced.steps[~is_good] < 210).all()
     assert score(raced).success == is_good.mean()
 
@@ -152,11 +153,9 @@ def test_a_single_flight_as_json_and_docs_name_every_key(
         found = Recording(recording)
         for drone in ("/world/drone", "/world/flights/simulator/drone"):
             place = found.series(drone, "Transform3D:translation")
-            np.testing.assert_allclose(place, load_rollout(out)[0][:, POSITION])
+            assert_allclose(place, load_rollout(out)[0][:, POSITION])
     assert "interval" not in text and report["success"] is None and report["ghost"] is None
-    np.testing.assert_allclose(
-        report["first_flight"]["lap_times_s"], raced.lap_times_s[index], atol=1e-5
-    )
+    assert_allclose(report["first_flight"]["lap_times_s"], raced.lap_times_s[index], atol=1e-5)
     assert [line.split(":")[0] for line in text.splitlines()][:4] == [
         "flown",
         "gates",
@@ -187,19 +186,17 @@ def test_plants_are_drawn_from_the_ranges_around_the_model():
             and np.ptp(drawn) > 0.5 * np.ptp(bounds)
         )
     found = plants.models
-    np.testing.assert_allclose(
-        found.effect("thrust_scale").factor, 0.9 * plants.drawn["thrust_scale"], 1e-6
-    )
-    np.testing.assert_allclose(found.effect("linear_drag").d_x, np.float32(0.4))
-    np.testing.assert_allclose(
+    assert_allclose(found.effect("thrust_scale").factor, 0.9 * plants.drawn["thrust_scale"], 1e-6)
+    assert_allclose(found.effect("linear_drag").d_x, np.float32(0.4))
+    assert_allclose(
         found.effect("command_delay").delay_s, 0.03 + plants.drawn["command_delay_s"], 1e-6
     )
     quadratic, wind = found.effect("quadratic_drag"), found.effect("wind")
     assert quadratic.k_x.min() >= 0.01 and (quadratic.shared == 0.0).all()
-    np.testing.assert_allclose(np.hypot(wind.v_x, wind.v_y), plants.drawn["wind_m_s"], atol=1e-6)
+    assert_allclose(np.hypot(wind.v_x, wind.v_y), plants.drawn["wind_m_s"], atol=1e-6)
     assert (wind.v_x < 0).any() and (wind.v_y < 0).any() and not np.any(wind.v_z)
     fewer = checkpoint_env.draw_plants(3, 5, model)
-    np.testing.assert_array_equal(fewer.models.effect("wind").v_x, wind.v_x[:5])
+    assert_array_equal(fewer.models.effect("wind").v_x, wind.v_x[:5])
     assert not np.array_equal(
         checkpoint_env.draw_plants(4, 5, model).drawn["wind_m_s"], fewer.drawn["wind_m_s"]
     )

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint_env import plant_env
@@ -36,8 +37,8 @@ def test_the_log_is_what_the_plant_did(log, fly_black_box):
     row = 200
     state = np.concatenate([log[name][row] for name in ("p", "v", "a", "q", "w", "uprev", "v_bat")])
     after = fly_black_box(state.astype(np.float32), log["u"][row].astype(np.float32))
-    np.testing.assert_allclose(log["p"][row + 1], after[:3], atol=1e-5)
-    np.testing.assert_allclose(log["w"][row + 1], after[13:16], atol=1e-4)
+    assert_allclose(log["p"][row + 1], after[:3], atol=1e-5)
+    assert_allclose(log["w"][row + 1], after[13:16], atol=1e-4)
 
 
 def test_the_log_has_a_segment_per_flight_and_is_noisy_on_request(log, flights):

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import flytrack_env
 from baselines.purejaxrl_ppo import load_checkpoint
@@ -29,9 +30,7 @@ def test_a_widened_policy_gives_new_rows_no_weight():
     wide = widen_params(START.params, 36)
     seen = np.asarray(jax.random.normal(jax.random.key(0), (5, 36)))
     action = START.network.act(wide, (), seen)[1]
-    np.testing.assert_allclose(
-        action, START.network.act(START.params, (), seen[:, :29])[1], atol=1e-6
-    )
+    assert_allclose(action, START.network.act(START.params, (), seen[:, :29])[1], atol=1e-6)
 
 
 def test_each_member_of_a_pool_flies_its_share_of_the_races():
@@ -41,7 +40,7 @@ def test_each_member_of_a_pool_flies_its_share_of_the_races():
     actions = make_pool_opponent(START.network, pool).act(pool, seen)
     for share, params in ((slice(0, 3), START.params), (slice(3, 6), other)):
         expected = START.network.act(params, (), seen[share])[1]
-        np.testing.assert_allclose(actions[share], expected, atol=1e-6)
+        assert_allclose(actions[share], expected, atol=1e-6)
 
 
 def test_who_finishes_first_wins():

@@ -1,12 +1,11 @@
 """Time-optimal references: the shipped files, their replays, the loader, and the search."""
 
 import json
-from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from benchmarks import time_optimal
 from benchmarks.time_optimal import replay
@@ -20,7 +19,7 @@ SHIPPED = sorted(references.FOLDER.glob("*.npz"))
 EXACT = 1e-6  # of the simulator in float64
 
 
-def test_the_symbolic_step_is_the_simulators() -> None:
+def test_the_symbolic_step_is_the_simulators():
     symbolic = pytest.importorskip("benchmarks.optimal", exc_type=ImportError)
     rng, model = np.random.default_rng(0), nominal_parameters()
     for effect in EFFECTS:
@@ -43,12 +42,12 @@ def test_the_symbolic_step_is_the_simulators() -> None:
             )
             x[QUATERNION] /= np.linalg.norm(x[QUATERNION])
             x[16:20], x[BATTERY] = rng.uniform(-1.0, 1.0, 4), rng.uniform(22.0, 24.0)
-            np.testing.assert_allclose(
+            assert_allclose(
                 traced(x, u, dt).full()[:, 0], simulated(x, u, dt), rtol=0.0, atol=EXACT
             )
 
 
-def test_every_track_has_its_references() -> None:
+def test_every_track_has_its_references():
     wanted = {
         references.shipped_path(track, kind, "nominal")
         for track in available_tracks()
@@ -67,7 +66,7 @@ FAST = [path for path in SHIPPED if path.stem.startswith("flytrack_nominal")]
 
 
 @pytest.mark.parametrize("path", slow_but(FAST, SHIPPED), ids=lambda path: path.stem)
-def test_its_commands_fly_in_the_simulator(path: Path) -> None:
+def test_its_commands_fly_in_the_simulator(path):
     found = references.load_reference(path)
     track = load_track(found.track)
     assert path.stem == f"{found.track}_{found.model_name}_{found.kind}"
@@ -83,11 +82,11 @@ def test_its_commands_fly_in_the_simulator(path: Path) -> None:
     end = before + (found.time_s / found.dt_s % 1.0) * (behind - before)
     start = time_optimal.start_state(track, found.found["battery_v"])
     first, wanted = (end, found.states[0]) if found.kind == "flying" else (found.states[0], start)
-    np.testing.assert_allclose(first[POSITION], wanted[POSITION], atol=5e-3)
-    np.testing.assert_allclose(first[VELOCITY], wanted[VELOCITY], atol=5e-3)
+    assert_allclose(first[POSITION], wanted[POSITION], atol=5e-3)
+    assert_allclose(first[VELOCITY], wanted[VELOCITY], atol=5e-3)
 
 
-def rewritten(path: Path, **changes: Any) -> Path:
+def rewritten(path, **changes):
     """Write the flying lap of the FlyTrack course with arrays or notes replaced."""
     with np.load(references.shipped_path("flytrack", "flying", "nominal")) as file:
         data = dict(file)
@@ -112,24 +111,24 @@ def rewritten(path: Path, **changes: Any) -> Path:
         ({"time_s": -1.0}, "time_s: found -1.0, expected seconds above 0"),
     ],
 )
-def test_a_damaged_file_is_refused(changes: dict[str, Any], reason: str, tmp_path: Path) -> None:
+def test_a_damaged_file_is_refused(changes, reason, tmp_path):
     path = rewritten(tmp_path / "lap.npz", **changes)
     with pytest.raises(references.ReferenceFileError, match=f"lap.npz.*{reason}"):
         references.load_reference(path)
 
 
-def test_a_saved_reference_comes_back(tmp_path: Path) -> None:
+def test_a_saved_reference_comes_back(tmp_path):
     found, path = references.shipped_reference("flytrack", "flying"), tmp_path / "lap.npz"
     references.save_reference(path, found)
     again = references.load_reference(path)
-    np.testing.assert_array_equal(again.states, found.states)
-    np.testing.assert_array_equal(again.commands, found.commands)
+    assert_array_equal(again.states, found.states)
+    assert_array_equal(again.commands, found.commands)
     assert (again.time_s, again.found) == (found.time_s, found.found)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", references.KINDS)
-def test_the_solver_finds_the_shipped_time_again(kind: str) -> None:
+def test_the_solver_finds_the_shipped_time_again(kind):
     pytest.importorskip("casadi")
     shipped = references.shipped_reference("flytrack", kind)
     again = time_optimal.optimise(load_track("flytrack"), kind, shipped.model, "nominal")

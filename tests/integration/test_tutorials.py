@@ -14,18 +14,18 @@ from tests.support.pages import DOCS, examples, run_examples
 pytestmark = pytest.mark.slow
 
 
-def tutorial(name: str) -> str:
+def tutorial(name):
     """Return a tutorial's text."""
     return (DOCS / "tutorials" / f"{name}.md").read_text(encoding="utf-8")
 
 
-def test_algorithm_improves_its_return(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_algorithm_improves_its_return(tmp_path, monkeypatch):
     names = run_examples(tutorial("algorithm"), tmp_path, monkeypatch)
     assert names["after"] > names["before"] + 0.3
     assert len([line for line in examples(tutorial("algorithm")).splitlines() if line.strip()]) < 80
 
 
-def test_track_is_corrected_and_flown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_track_is_corrected_and_flown(tmp_path, monkeypatch):
     names = run_examples(tutorial("track"), tmp_path, monkeypatch)
     assert [problem.demand for problem in names["problems"]] == ["bounds"]
     assert not find_problems(load_track(tmp_path / "square.toml"))
@@ -34,14 +34,14 @@ def test_track_is_corrected_and_flown(tmp_path: Path, monkeypatch: pytest.Monkey
     assert (tmp_path / "square_top.png").stat().st_size > 10_000
 
 
-def test_black_box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_black_box(tmp_path, monkeypatch):
     names = run_examples(tutorial("black_box"), tmp_path, monkeypatch)
     with pytest.raises(names["blackbox"].BlackBoxError, match="signature: found"):
         names["blackbox"].load("wrong.bin")
     assert names["rewards"].shape == (8,) and len(names["log"]) > 4000
 
 
-def test_flight_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flight_log(tmp_path, monkeypatch):
     names = run_examples(tutorial("flight_log"), tmp_path, monkeypatch)
     assert len(names["log"]) > 2500 and set(names["log"].channels) == {
         "u",
@@ -58,7 +58,7 @@ def test_flight_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert drag == pytest.approx((0.4, 0.4, 0.2), rel=0.05)
 
 
-def test_better_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_better_policy(tmp_path, monkeypatch):
     names = run_examples(tutorial("better_policy"), tmp_path, monkeypatch)
     loop, errors = (
         names["loop"],
@@ -70,8 +70,8 @@ def test_better_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert {"loop.json", "comparison_top.png", "after_plant.npy", "race.npz", "history"} <= files
 
 
-def test_notebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def shown(path: str = "", filename: str = "") -> int:
+def test_notebook(tmp_path, monkeypatch):
+    def shown(path="", filename=""):
         return Path(path or filename).stat().st_size
 
     display = SimpleNamespace(Image=shown, HTML=shown)  # of Jupyter, which the tests do without

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import flytrack_env
 from blackbox import acro_step_runtime, plant
@@ -56,13 +57,13 @@ def test_vmap_nested_vmap_and_scan_agree_with_a_loop(black_box, fly_black_box):
     one_by_one = np.stack([fly_black_box(x, u) for x, u in zip(states, actions, strict=True)])
     close = {"rtol": 1e-5, "atol": 1e-5}
     batched = jax.jit(jax.vmap(black_box.step_vector))(states, actions)
-    np.testing.assert_allclose(batched, one_by_one, **close)
+    assert_allclose(batched, one_by_one, **close)
     grid = (states.reshape(3, 4, 21), actions.reshape(3, 4, 4))
     nested = jax.jit(jax.vmap(jax.vmap(black_box.step_vector)))(*grid)
-    np.testing.assert_allclose(nested.reshape(12, 21), one_by_one, **close)
+    assert_allclose(nested.reshape(12, 21), one_by_one, **close)
     one_state = jax.vmap(black_box.step_vector, in_axes=(None, 0))(states[0], actions)
     expected = np.stack([fly_black_box(states[0], u) for u in actions])
-    np.testing.assert_allclose(one_state, expected, **close)
+    assert_allclose(one_state, expected, **close)
 
     def body(x, u):
         x = jax.vmap(black_box.step_vector, in_axes=(0, None))(x, u)
@@ -72,7 +73,7 @@ def test_vmap_nested_vmap_and_scan_agree_with_a_loop(black_box, fly_black_box):
     x = states[1]
     for u, row in zip(actions, path[:, 1], strict=True):
         x = fly_black_box(x, u)
-        np.testing.assert_allclose(row, x, rtol=1e-4, atol=1e-4)
+        assert_allclose(row, x, rtol=1e-4, atol=1e-4)
 
 
 def test_many_drones_fly_in_one_loop(black_box):
@@ -88,7 +89,7 @@ def test_another_backend_is_a_clear_error(black_box):
 
 
 def test_artifact_of_18_components(tmp_path):
-    def reduced_step(x: jax.Array, u: jax.Array) -> jax.Array:
+    def reduced_step(x, u):
         # Position, velocity, acceleration and quaternion stay; the rest is made recognisable.
         rates = jnp.deg2rad(jnp.array([618.0, 618.0, 120.0])) * u[:3]
         return jnp.concatenate([x[:13], rates, u[3:] * x[16], x[17:] - 1.0])
@@ -98,12 +99,12 @@ def test_artifact_of_18_components(tmp_path):
     assert box.state_size == 18
     states, actions = random_inputs(5)
     after = np.asarray(jax.jit(jax.vmap(box.step_vector))(states, actions))
-    np.testing.assert_array_equal(after[:, :13], states[:, :13])
-    np.testing.assert_allclose(after[:, 16:19], actions[:, :3], rtol=1e-5)
-    np.testing.assert_allclose(after[:, 19], actions[:, 3] * states[:, 19], rtol=1e-6)
-    np.testing.assert_allclose(after[:, BATTERY], states[:, BATTERY] - 1.0, rtol=1e-6)
+    assert_array_equal(after[:, :13], states[:, :13])
+    assert_allclose(after[:, 16:19], actions[:, :3], rtol=1e-5)
+    assert_allclose(after[:, 19], actions[:, 3] * states[:, 19], rtol=1e-6)
+    assert_allclose(after[:, BATTERY], states[:, BATTERY] - 1.0, rtol=1e-6)
     slower = load(path, max_rate=(309.0, 618.0, 120.0)).step_vector(states[0], actions[0])
-    np.testing.assert_allclose(slower[16], 2.0 * actions[0, 0], rtol=1e-5)
+    assert_allclose(slower[16], 2.0 * actions[0, 0], rtol=1e-5)
 
 
 def test_environment_flies_the_black_box(black_box, fly_black_box):
@@ -119,7 +120,7 @@ def test_environment_flies_the_black_box(black_box, fly_black_box):
         _, states, reward, *_ = step(keys[0], states, actions, params)
         after = np.stack(jax.tree.leaves(jax.vmap(env.drone)(states)), axis=-1)
         expected = [fly_black_box(x, u) for x, u in zip(before, actions, strict=True)]
-        np.testing.assert_allclose(after, expected, rtol=1e-5, atol=1e-4)
+        assert_allclose(after, expected, rtol=1e-5, atol=1e-4)
         assert np.isfinite(reward).all()
     with pytest.raises(ValueError, match=r"dt: found 0\.02 s, expected 0\.01 s"):
         black_box.step(None, None, 0.02, None)
@@ -138,14 +139,14 @@ def test_airless_plant_is_the_minimal_model():
     states, actions = random_inputs(64)
     found = jax.vmap(lambda x, u: plant.step(x, u, AIRLESS))(states, actions)
     expected = jax.vmap(lambda x, u: model_step(x, u, 0.01, model))(states, actions)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2e-5)
+    assert_allclose(found, expected, rtol=1e-5, atol=2e-5)
 
 
 def test_lags_and_full_stick_rates(fly_black_box):
     x = start()
     for _ in range(100):
         x = fly_black_box(x, [1.0, -1.0, 1.0, 0.0])
-    np.testing.assert_allclose(np.rad2deg(x[RATES]), [618.0, -618.0, 120.0], rtol=1e-4)
+    assert_allclose(np.rad2deg(x[RATES]), [618.0, -618.0, 120.0], rtol=1e-4)
     first = fly_black_box(start(applied=np.zeros(4)), np.ones(4))[APPLIED_ACTION]
     lags = -0.01 / np.log1p(-first)
     assert (lags > 0.019).all() and (lags < 0.061).all()
@@ -167,20 +168,18 @@ def test_rebuilt_artifact_is_the_committed_one_that_tells_nothing_about_its_sour
         jax.jit(jax.vmap(box.step_vector))(states, actions) for box in (load(SHIPPED), rebuilt)
     )
     assert np.isfinite(shipped).all()
-    np.testing.assert_array_equal(shipped, again)
+    assert_array_equal(shipped, again)
     for word in (b".py", b"lift", b"drag", b"ground", b"jit("):
         assert word not in SHIPPED.read_bytes()
 
 
 def test_runtime_interface(tmp_path, fly_black_box):
     x, u = (rows[0] for rows in random_inputs(1))
-    np.testing.assert_allclose(
-        acro_step_runtime.step(x, u), fly_black_box(x, u), rtol=1e-6, atol=1e-6
-    )
+    assert_allclose(acro_step_runtime.step(x, u), fly_black_box(x, u), rtol=1e-6, atol=1e-6)
     path = build(AIRLESS, tmp_path / "airless.bin")
     elsewhere = acro_step_runtime.step(x, u, bin_path=str(path))
     expected = plant.step(x, jnp.asarray(u), AIRLESS)
-    np.testing.assert_allclose(elsewhere, expected, rtol=1e-5, atol=1e-5)
+    assert_allclose(elsewhere, expected, rtol=1e-5, atol=1e-5)
     assert not np.allclose(fly_black_box(x, u), expected, rtol=1e-3, atol=1e-3)
     with pytest.raises(OSError):
         acro_step_runtime.step(x, u, bin_path=tmp_path / "missing.bin")

@@ -1,12 +1,11 @@
 """The simulator against the handout's equations, written again in NumPy; their consequences."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from numpy.testing import assert_allclose
 
 from flytrack_env.battery import Battery
 from flytrack_env.dynamics import ModelParameters, collective_thrust, step
@@ -27,7 +26,7 @@ UNEVEN = ModelParameters(
 step_all = jax.jit(jax.vmap(step, in_axes=(0, 0, None, None)))
 
 
-def test_nominal_drone_has_no_thrust_at_minus_one_and_the_stated_maximum() -> None:
+def test_nominal_drone_has_no_thrust_at_minus_one_and_the_stated_maximum():
     weight = NOMINAL.m * NOMINAL.g
     for volt, ratio in ((24.0, 3.5), (22.0, 3.1)):
         assert collective_thrust(-1.0, volt, NOMINAL.thrust_coeffs) == pytest.approx(0.0, abs=1e-4)
@@ -36,7 +35,7 @@ def test_nominal_drone_has_no_thrust_at_minus_one_and_the_stated_maximum() -> No
 
 
 @pytest.mark.parametrize("dt", [0.0005, 0.002, 0.01, 0.05])
-def test_agrees_with_the_handouts_equations(dt: float) -> None:
+def test_agrees_with_the_handouts_equations(dt):
     x, u = (rows.astype(float) for rows in random_inputs(64))
     x[:, 9:13] /= np.linalg.norm(x[:, 9:13], axis=1, keepdims=True)
     coeffs = UNEVEN.thrust_coeffs / UNEVEN.m
@@ -44,19 +43,19 @@ def test_agrees_with_the_handouts_equations(dt: float) -> None:
     plant = HandoutPlant(UNEVEN.tau, coeffs, UNEVEN.max_rate, drain, gravity=UNEVEN.g)
     expected = plant(x, u, dt)
     with jax.enable_x64(True):
-        np.testing.assert_allclose(step_all(x, u, dt, UNEVEN), expected, rtol=1e-12, atol=1e-12)
+        assert_allclose(step_all(x, u, dt, UNEVEN), expected, rtol=1e-12, atol=1e-12)
     single = step_all(jnp.asarray(x), jnp.asarray(u), dt, UNEVEN)
     assert single.dtype == jnp.float32
-    np.testing.assert_allclose(single, expected, rtol=2e-5, atol=2e-5)
+    assert_allclose(single, expected, rtol=2e-5, atol=2e-5)
 
 
 @pytest.mark.parametrize("differentiate", [jax.jacfwd, jax.jacrev])
-def test_gradients_equal_finite_differences(differentiate: Any) -> None:
+def test_gradients_equal_finite_differences(differentiate):
     with jax.enable_x64(True):
         flat, unravel = ravel_pytree(UNEVEN)
 
         @jax.jit
-        def packed(vector: jax.Array) -> jax.Array:
+        def packed(vector):
             x, u, rest = jnp.split(vector, [21, 25])
             return step(x, u, rest[0], unravel(rest[1:]))
 
@@ -67,7 +66,7 @@ def test_gradients_equal_finite_differences(differentiate: Any) -> None:
             numeric = np.stack(
                 [(packed(vector + s) - packed(vector - s)) / 2e-6 for s in shifts], -1
             )
-            np.testing.assert_allclose(jacobian(vector), numeric, rtol=1e-5, atol=1e-5)
+            assert_allclose(jacobian(vector), numeric, rtol=1e-5, atol=1e-5)
     # Everything matters but the old acceleration and rates, and the ends of the battery.
     unused = {*range(6, 9), *range(13, 16), *range(vector.size - len(Battery()), vector.size)}
     assert set(np.flatnonzero(~np.abs(numeric).any(axis=0)).tolist()) == unused
@@ -76,8 +75,6 @@ def test_gradients_equal_finite_differences(differentiate: Any) -> None:
 @pytest.mark.parametrize(
     ("x_shape", "u_shape", "name"), [((20,), (4,), "x"), ((21,), (3,), "action")]
 )
-def test_wrong_shapes_are_refused(
-    x_shape: tuple[int, ...], u_shape: tuple[int, ...], name: str
-) -> None:
+def test_wrong_shapes_are_refused(x_shape, u_shape, name):
     with pytest.raises(ValueError, match=rf"^{name}: found shape .* expected"):
         step(np.zeros(x_shape), np.zeros(u_shape), 0.01, NOMINAL)

@@ -1,12 +1,12 @@
 """Each effect against its equations by hand, and what the environment shows of the gyro."""
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from benchmarks import hidden
@@ -63,7 +63,7 @@ CHOSEN = {
         pytest.param(TOGETHER, id="together"),
     ],
 )
-def test_laws_are_those_of_hidden_plants_in_plain_floats(names: tuple[str, ...]) -> None:
+def test_laws_are_those_of_hidden_plants_in_plain_floats(names):
     """Alone and together, by equations that were written twice."""
     rng = np.random.default_rng(8)
     drawn = {name: hidden.draw_effect(name, rng, hidden.EFFECTS[name].high) for name in names}
@@ -82,15 +82,13 @@ def test_laws_are_those_of_hidden_plants_in_plain_floats(names: tuple[str, ...])
         (slice(21, 24), rates_b),
         (slice(24, 27), force_b),
     ):
-        np.testing.assert_allclose(found[5:, columns], theirs[5:], rtol=2e-4, atol=5e-4)
+        assert_allclose(found[5:, columns], theirs[5:], rtol=2e-4, atol=5e-4)
 
 
 # --- Forces ---------------------------------------------------------------------------------------
 
 
-def force_of(
-    parameters: Any, thrust: float = -1.0, model: Any = NOMINAL, **fields: Any
-) -> np.ndarray:
+def force_of(parameters, thrust=-1.0, model=NOMINAL, **fields):
     """Return the acceleration without gravity of one step, world, m/s^2."""
     drone = drone_with(applied=(0.0, 0.0, 0.0, thrust), **fields)
     return flown(parameters, held(thrust=thrust), drone, model)[0, ACCELERATION] + GRAVITY_W
@@ -103,28 +101,24 @@ def force_of(
         ((5.0, 0.0, 0.0), YAWED, (-5.0, 0.0, 0.0)),
     ],
 )
-def test_quadratic_drag_multiplies_each_axis_by_the_whole_speed(
-    vel_w: Any, quat: Any, expected: Any
-) -> None:
+def test_quadratic_drag_multiplies_each_axis_by_the_whole_speed(vel_w, quat, expected):
     found = force_of(effects.QuadraticDrag(0.1, 0.2, 0.3), model=NO_THRUST, vel_w=vel_w, quat=quat)
-    np.testing.assert_allclose(found, expected, atol=2e-5)
+    assert_allclose(found, expected, atol=2e-5)
 
 
-def lift_ratio(parameters: Any, **fields: Any) -> float:
+def lift_ratio(parameters, **fields):
     """Return the vertical specific force with an effect over that without."""
     return float(force_of(parameters, 0.0, **fields)[2] / force_of((), 0.0, **fields)[2])
 
 
 @pytest.mark.parametrize(("speed", "share"), [(0.0, 0.0), (HALF_SPEED, 0.5), (3 * HALF_SPEED, 0.9)])
-def test_translational_lift_grows_with_airspeed_in_the_rotors_plane(
-    speed: float, share: float
-) -> None:
+def test_translational_lift_grows_with_airspeed_in_the_rotors_plane(speed, share):
     lift, expected = effects.TranslationalLift(0.2), pytest.approx(1.0 + 0.2 * share, rel=1e-5)
     assert lift_ratio(lift, vel_w=(speed, 0.0, 5.0)) == expected
     assert lift_ratio((lift, effects.Wind(v_y=-speed))) == expected
 
 
-def test_ground_effect_is_cheeseman_and_bennetts_from_two_radii_on() -> None:
+def test_ground_effect_is_cheeseman_and_bennetts_from_two_radii_on():
     radius = 0.2
     for height in (2 * radius, 4 * radius, 20 * radius):
         theirs = 1.0 / (1.0 - (radius / (4 * height)) ** 2)
@@ -139,7 +133,7 @@ def test_ground_effect_is_cheeseman_and_bennetts_from_two_radii_on() -> None:
 
 
 @pytest.mark.parametrize("stick", [-1.0, -0.5, 0.25, 1.0])
-def test_a_hard_saturation_cuts_the_sticks_off(stick: float) -> None:
+def test_a_hard_saturation_cuts_the_sticks_off(stick):
     at_stick = held(120, roll=stick), drone_with(applied=(stick, 0.0, 0.0, 0.0))
     saturated = flown(effects.RateSaturation(0.4, 0.0, 0.0, softness=0.0), *at_stick)[-1, 13]
     assert saturated == pytest.approx(FULL_STICK * np.clip(stick, -0.6, 0.6), rel=1e-5)
@@ -147,8 +141,8 @@ def test_a_hard_saturation_cuts_the_sticks_off(stick: float) -> None:
 
 @pytest.mark.parametrize("steps", [0, 2, LONGEST_STEPS])
 def test_a_delay_of_whole_steps_shifts_each_channel_by_its_own_and_none_is_early(
-    steps: int,
-) -> None:
+    steps,
+):
     drone, commands = random_drone(3), random_commands(3, 20)
     found = flown(effects.CommandDelay(steps * DT, 3 * DT, -3 * DT), commands, drone)[
         :, APPLIED_ACTION
@@ -156,7 +150,7 @@ def test_a_delay_of_whole_steps_shifts_each_channel_by_its_own_and_none_is_early
     for channel, own in enumerate((steps, steps, steps + 3, max(steps - 3, 0))):
         before = np.tile(np.stack(drone.applied), (own, 1))  # what was commanded before the flight
         shifted = flown((), np.concatenate([before, commands])[:20], drone)[:, APPLIED_ACTION]
-        np.testing.assert_allclose(found[:, channel], shifted[:, channel], rtol=1e-4, atol=1e-4)
+        assert_allclose(found[:, channel], shifted[:, channel], rtol=1e-4, atol=1e-4)
 
 
 # --- Sensors --------------------------------------------------------------------------------------
@@ -172,7 +166,7 @@ DISTURBED = (
 class Readings:
     """True and measured rates, rad/s, and specific force, m/s^2, body, (num_steps, 3)."""
 
-    def __init__(self, *parameters: Any):
+    def __init__(self, *parameters):
         drone = random_drone(0)
         rows = flown((*DISTURBED, *parameters), random_commands(0, 20), drone)
         self.start_rates, self.rates = np.stack(drone.rates_b), rows[:, RATES]
@@ -182,11 +176,11 @@ class Readings:
         self.gyro, self.accelerometer = rows[:, 21:24], rows[:, 24:27]
 
 
-def assert_reads(found: np.ndarray, expected: np.ndarray) -> None:
-    np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-4)
+def assert_reads(found, expected):
+    assert_allclose(found, expected, rtol=2e-5, atol=2e-4)
 
 
-def test_an_arm_in_any_direction_follows_the_rigid_body() -> None:
+def test_an_arm_in_any_direction_follows_the_rigid_body():
     arm = 0.05, -0.08, 0.03
     flight = Readings(effects.ImuOffset(*arm))
     before = np.concatenate([flight.start_rates[None], flight.rates[:-1]])
@@ -195,7 +189,7 @@ def test_an_arm_in_any_direction_follows_the_rigid_body() -> None:
     assert_reads(flight.accelerometer, flight.force + felt)
 
 
-def past(truth: np.ndarray, before: np.ndarray, steps: float) -> np.ndarray:
+def past(truth, before, steps):
     """Return the rows of so many steps ago; before the flight, there was one that stayed."""
     known = np.concatenate([np.tile(before, (USUAL_STEPS, 1)), truth])
     rows = np.arange(len(known))
@@ -205,7 +199,7 @@ def past(truth: np.ndarray, before: np.ndarray, steps: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("steps", [0.0, 1.0, 2.0, 4.0, 0.3, 2.6])
-def test_late_sensors_read_the_past(steps: float) -> None:
+def test_late_sensors_read_the_past(steps):
     """Before the flight, the rates are those of the start, and the force that of the first step."""
     flight = Readings(effects.ImuLatency(steps * DT))
     assert_reads(flight.gyro, past(flight.rates, flight.start_rates, steps))
@@ -213,7 +207,7 @@ def test_late_sensors_read_the_past(steps: float) -> None:
 
 
 @pytest.mark.parametrize("steps", [1.0, 3.0, 0.3, 2.6])
-def test_late_poses_are_those_of_the_past(steps: float) -> None:
+def test_late_poses_are_those_of_the_past(steps):
     """Before the flight the drone is taken to have been where it starts."""
     drone, commands = random_drone(3), random_commands(3, 20)
     found = flown(effects.MocapLatency(steps * DT), commands, drone)
@@ -250,9 +244,7 @@ class WithoutGyro(Plant):
         ((effects.GyroBias(0.5),), WithoutGyro(), 0, (0.0, 0.0, 0.0)),
     ],
 )
-def test_the_observation_shows_the_gyro_of_the_plant(
-    parameters: tuple[Any, ...], plant: Plant | None, lateness: int, bias: tuple[float, ...]
-) -> None:
+def test_the_observation_shows_the_gyro_of_the_plant(parameters, plant, lateness, bias):
     env = FlyTrack(model=nominal_parameters().with_effects(*parameters), plant=plant)
     params, step = env.default_params, jax.jit(env.step_env)
     state = env.begin(drone_with(rates_b=(0.5, -0.3, 0.2)), 0, params, jnp.uint32(0))
@@ -265,5 +257,5 @@ def test_the_observation_shows_the_gyro_of_the_plant(
         shown.append(observation[SHOWN])
         true.append(np.stack(env.drone(state).rates_b))
     expected = np.stack(true)[np.maximum(np.arange(4) - lateness, 0)] + bias
-    np.testing.assert_allclose(np.stack(shown) * GYRO_SCALE, expected, atol=1e-5)
+    assert_allclose(np.stack(shown) * GYRO_SCALE, expected, atol=1e-5)
     assert np.abs(np.diff(true, axis=0)).min() > 1e-3

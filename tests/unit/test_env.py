@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.env import FlyTrack
@@ -64,16 +65,14 @@ def test_spaces_contain_every_observation_of_flights_that_end_in_many_ways(env, 
 def test_info_belongs_to_the_step_not_to_the_reset(env, flight):
     done, states, info = flight.ended, flight.states, flight.info
     assert set(info) == {*CAUSES, *RACE, "terminated", "truncated", "final_observation"}
-    np.testing.assert_array_equal(
-        np.stack([info[cause] for cause in CAUSES]).any(axis=0), flight.terminated
-    )
-    np.testing.assert_array_equal(info["terminated"], flight.terminated)
-    np.testing.assert_array_equal(info["truncated"], flight.truncated)
+    assert_array_equal(np.stack([info[cause] for cause in CAUSES]).any(axis=0), flight.terminated)
+    assert_array_equal(info["terminated"], flight.terminated)
+    assert_array_equal(info["truncated"], flight.truncated)
     # An ended episode still shows its own count.
     assert (info["gates_passed"][1:] >= states.race.gates_passed[:-1]).all()
     offset = np.stack(env.drone(states).pos_w) - np.stack(states.race.gate.centre)
     distance = np.linalg.norm(offset, axis=0)
-    np.testing.assert_allclose(info["gate_distance_m"][~done], distance[~done], atol=1e-4)
+    assert_allclose(info["gate_distance_m"][~done], distance[~done], atol=1e-4)
 
 
 def test_parameters_can_differ_between_environments(env, params):
@@ -86,7 +85,7 @@ def test_parameters_can_differ_between_environments(env, params):
     step = jax.jit(jax.vmap(env.step_env, in_axes=(None, None, None, axes)))
     acc_w = env.drone(step(None, state, jnp.zeros(4), batched)[1]).acc_w
     weightless = np.stack([np.asarray(acc_w.x), np.asarray(acc_w.y)])
-    np.testing.assert_allclose(weightless * masses, weightless[:, 1:2].repeat(3, 1), rtol=1e-4)
+    assert_allclose(weightless * masses, weightless[:, 1:2].repeat(3, 1), rtol=1e-4)
 
 
 # --- Ends of episodes ---------------------------------------------------------------------------
@@ -122,7 +121,7 @@ def test_batch_step_resets_episodes_apart(env, params, ends):
     expected = jax.jit(jax.vmap(env.observe, in_axes=(None, 0, None, None)))(
         None, state, None, params
     )
-    np.testing.assert_allclose(observation, expected, atol=1e-6)
+    assert_allclose(observation, expected, atol=1e-6)
 
 
 # --- Actions ------------------------------------------------------------------------------------
@@ -216,7 +215,7 @@ def test_observation_index_by_index(flight):
     x = np.asarray(jax.vmap(pack)(drones), float)
     assert set(gates) == set(range(8))
     expected = np.stack([expected_observation(*row) for row in zip(x, gates, strict=True)])
-    np.testing.assert_allclose(observed, expected, atol=2e-5)
+    assert_allclose(observed, expected, atol=2e-5)
 
 
 def test_observation_is_clipped_to_its_range(env, params):
@@ -227,4 +226,4 @@ def test_observation_is_clipped_to_its_range(env, params):
     assert env.observation_space(params).contains(observation)
     limits = np.asarray(env.observation_space(params).high)
     rows, signs = np.array([0, 1, 3, 18, 19, 22]), np.array([-1, 1, -1, 1, -1, 1])
-    np.testing.assert_allclose(observation[rows], signs * limits[rows])
+    assert_allclose(observation[rows], signs * limits[rows])

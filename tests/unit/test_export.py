@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from baselines.purejaxrl_ppo import export, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint_env import plant_env
@@ -79,16 +80,14 @@ def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
     assert f"{header}: {header.stat().st_size} bytes" in capsys.readouterr().out
     if shutil.which("gcc") is not None:
         compiled = CompiledPolicy(header)
-        np.testing.assert_allclose(
-            compiled.act(states, gates, past), actions, rtol=0.0, atol=LARGEST
-        )
+        assert_allclose(compiled.act(states, gates, past), actions, rtol=0.0, atol=LARGEST)
         assert np.isnan(compiled.act(states * np.nan, gates, past)).all()
 
     flags = ["--float64"] * is_float64
     found = act_by_onnx(
         tmp_path / "a.safetensors", flags, {"state": states, "gate": gates, "past": past}
     )
-    np.testing.assert_allclose(found, actions, rtol=0.0, atol=LARGEST)
+    assert_allclose(found, actions, rtol=0.0, atol=LARGEST)
 
 
 def act_by_onnx(checkpoint, flags, inputs):
@@ -121,7 +120,7 @@ def test_a_float64_file_acts_as_the_policy_in_float64(tmp_path):
 
         actions = np.asarray(act(states.astype(np.float64), gates))
     found = act_by_onnx(path, ["--float64"], {"state": states, "gate": gates})
-    np.testing.assert_allclose(found, actions, rtol=0.0, atol=LARGEST_FLOAT64)
+    assert_allclose(found, actions, rtol=0.0, atol=LARGEST_FLOAT64)
 
 
 @needs_gcc
@@ -169,12 +168,10 @@ def test_a_header_counts_gates_and_lags_as_the_environment_does(tmp_path):
         ends = [np.zeros((len(count), 21)) for _ in range(2)]
         for end, sign in zip(ends, (-ahead, ahead), strict=True):
             end[:, :3] = centres + sign * forward + aside * up
-        np.testing.assert_array_equal(
-            compiled.next_gates(*ends, count), (count + is_pass) % len(count)
-        )
+        assert_array_equal(compiled.next_gates(*ends, count), (count + is_pass) % len(count))
     action, applied = np.array([1.0, -1.0, 0.5, 0.2]), np.array([0.0, 0.3, -0.5, 1.0])
     wanted = lag(unpack_action(applied), Action(*action), 0.01, params.model.tau)
-    np.testing.assert_allclose(compiled.lag(action, applied), wanted, atol=LARGEST_LAG)
+    assert_allclose(compiled.lag(action, applied), wanted, atol=LARGEST_LAG)
 
 
 def test_observations_that_cannot_be_exported_are_told(tmp_path, monkeypatch, capsys):

@@ -1,12 +1,12 @@
 """The race that a recorded flight flew: the environment's own counts, times, laps and end."""
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from flytrack_env import FlyTrack, load_track
 from flytrack_env.flown_race import follow_race, why_ended
@@ -22,26 +22,26 @@ REFERENCES = shipped_references(TRACK, ("nominal",))
 class Recorded(Plant):
     """A plant that moves the drone along recorded states (T, 21), whatever is commanded."""
 
-    def __init__(self, states: np.ndarray):
+    def __init__(self, states):
         self.states = jnp.asarray(states, jnp.float32)
 
-    def reset(self, drone: Any, model: Any) -> Any:
+    def reset(self, drone, model):
         return jnp.int32(0)
 
-    def step(self, state: Any, command: Any, dt: Any, model: Any) -> Any:
+    def step(self, state, command, dt, model):
         return state + 1
 
-    def drone(self, state: Any) -> Any:
+    def drone(self, state):
         return unpack(self.states[state])
 
 
-def fly_recorded(states: np.ndarray, first_gate: int) -> tuple[Any, Any]:
+def fly_recorded(states, first_gate):
     """Return the environment's races at each state and its causes after each step."""
     env = FlyTrack(plant=Recorded(states), missed_gate="fly_on")
     params = env.default_params
     begun = env.begin(unpack(states[0]), first_gate, params)
 
-    def one(state: Any, _: Any) -> tuple[Any, Any]:
+    def one(state, _):
         after, _, causes, events = env.transition(state, Action(0.0, 0.0, 0.0, 0.0), params)
         return after, (after.race, causes._replace(missed_gate=events.is_miss))
 
@@ -56,13 +56,13 @@ def test_race_is_the_environments_number_by_number(shift):
     states[:, POSITION] += np.linspace(0.0, 1.0, 900)[:, None] * (0.0, shift, 0.0)
     found = follow_race(states[:, POSITION], TRACK, first_gate=0)
     races, _ = fly_recorded(states, 0)
-    np.testing.assert_array_equal(found.gate, races.gate_index)
-    np.testing.assert_array_equal(found.laps, races.laps)
-    np.testing.assert_allclose(found.lap_time_s, races.lap_time_s, atol=1e-5)
-    np.testing.assert_allclose(found.lap_start_s, races.lap_start_s, atol=1e-5)
+    assert_array_equal(found.gate, races.gate_index)
+    assert_array_equal(found.laps, races.laps)
+    assert_allclose(found.lap_time_s, races.lap_time_s, atol=1e-5)
+    assert_allclose(found.lap_start_s, races.lap_start_s, atol=1e-5)
     centres = np.stack(races.gate.centre, axis=-1)
     distance = np.linalg.norm(states[:, POSITION] - centres, axis=1)
-    np.testing.assert_allclose(found.gate_distance_m, distance, rtol=1e-5)
+    assert_allclose(found.gate_distance_m, distance, rtol=1e-5)
     assert len(found.passes) == races.gates_passed[-1]
     assert shift < 2.0 or len(found.passes) < 17  # the ghost's, which flies on
 
@@ -79,7 +79,7 @@ def test_step_after_the_last_state_is_extrapolated():
     assert found.passes[7].row == len(cut) and found.passes[7].lap == 1
     assert found.passes[7].lap_time_s == pytest.approx(REFERENCES["standing"].time_s, abs=2e-4)
     for one, other in zip(found[:5], without[:5], strict=True):
-        np.testing.assert_array_equal(one, other)
+        assert_array_equal(one, other)
 
 
 ENDS = {  # the first gate, at (12.5, 2, 1.35), is flown towards -x
@@ -136,10 +136,8 @@ def test_two_gates_in_one_step_each_have_their_time_and_end(shift_m, end):
     race = follow_race(states[:, POSITION], track, last_vel_w=states[-1, VELOCITY])
     assert why_ended(states, track, race) == end
     times_s = [one.time_s for one in race.passes]
-    np.testing.assert_allclose(times_s, [0.0925, 0.0975][: 1 + (shift_m == 0.0)], atol=1e-5)
-    np.testing.assert_allclose(
-        [one.pos_w[0] for one in race.passes], [2.0, 2.1][: len(times_s)], atol=1e-5
-    )
+    assert_allclose(times_s, [0.0925, 0.0975][: 1 + (shift_m == 0.0)], atol=1e-5)
+    assert_allclose([one.pos_w[0] for one in race.passes], [2.0, 2.1][: len(times_s)], atol=1e-5)
 
 
 def test_flight_that_goes_on_ended_when_its_steps_did():

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 pytest.importorskip("pygame", reason="the extra [fly] is not installed")
 pytest.importorskip("PIL", reason="the extra [fly] is not installed")
@@ -87,7 +88,7 @@ def test_a_gamepad_that_replays_the_optimum_times_its_lap(session, display, pad,
         def draw(self, log, ghost, follows_nose, notes):
             seen.append(notes)
             if session.now.num_gates < 8:
-                np.testing.assert_allclose(ghost[POSITION], log.rows[-1, POSITION], atol=1e-3)
+                assert_allclose(ghost[POSITION], log.rows[-1, POSITION], atol=1e-3)
 
     def tick():
         command = next(commands)
@@ -118,7 +119,7 @@ def test_a_gamepad_that_replays_the_optimum_times_its_lap(session, display, pad,
             re.search(rf"gate {gate.id}: .0.00 s to the time-optimal", notes) for notes in seen
         )
     (lap,) = cut_laps(np.asarray(flight.rollout()[0], float), TRACK)
-    np.testing.assert_allclose(lap.gate_times_s, GHOST.first.gate_times_s, atol=1e-3)
+    assert_allclose(lap.gate_times_s, GHOST.first.gate_times_s, atol=1e-3)
 
 
 def test_a_crash_goes_back_to_the_start_where_the_throttle_must_come_down(session):
@@ -136,18 +137,14 @@ def test_in_a_race_the_opponent_goes_its_own_way_and_is_hit(session):
     early = GHOST.first._replace(state_at=lambda time_s: GHOST.first.state_at(time_s + 0.5))
     race = Session(TRACK, MODEL, GHOST._replace(first=early), is_race=True)
     start_w = race.now.log.rows[-1, POSITION]
-    np.testing.assert_allclose(
-        start_w, GHOST.state_at(0, 0.0)[POSITION] + (0.5, 0.5, 0.0), atol=1e-5
-    )
+    assert_allclose(start_w, GHOST.state_at(0, 0.0)[POSITION] + (0.5, 0.5, 0.0), atol=1e-5)
     session.restart()
     race.state = session.state  # on the optimum itself, half a second behind the opponent
     for command in STANDING.commands:
         race.fly(command)
     flight = race.now
     assert flight.num_gates == 8 and flight.gap == (7, pytest.approx(0.0, abs=1e-3))
-    np.testing.assert_allclose(
-        race.ghost_state(), GHOST.flying.state_at(flight.log.time_s - STANDING.time_s)
-    )
+    assert_allclose(race.ghost_state(), GHOST.flying.state_at(flight.log.time_s - STANDING.time_s))
     assert "to the time-optimal opponent" in race.notes()
     assert GHOST.lap_begin_s(2) == STANDING.time_s + GHOST.flying.gate_times_s[-1]
     still = GHOST.first._replace(state_at=lambda time_s: np.r_[start_w, np.zeros(18)])
@@ -165,7 +162,7 @@ def test_the_picture_shows_the_ghost_and_looks_where_the_nose_points(session):
         for part in (is_ghost[:, :TOP_VIEW_WIDTH], is_ghost[:, TOP_VIEW_WIDTH:]):
             assert part.any() == (ghost is not None)
     forward_w = renderer.chase_view.camera(log.rows, follows_nose=True).forward_w
-    np.testing.assert_allclose(forward_w[:2], (-1.0, 0.0), atol=0.02)
+    assert_allclose(forward_w[:2], (-1.0, 0.0), atol=0.02)
 
 
 def test_sticks_steps_and_ghosts():
@@ -178,19 +175,17 @@ def test_sticks_steps_and_ghosts():
         for _ in range(50):
             before, sticks = sticks, move_by_keys(sticks, pulled, bool(is_full), 0.01)
             assert np.abs(sticks - before).max() < 0.07
-        np.testing.assert_allclose(sticks, expected, atol=1e-9)
+        assert_allclose(sticks, expected, atol=1e-9)
     values = [
         Gamepad(expo=0.5, deadzone=0.1).sticks(np.full(4, value)) for value in (0.1, -0.55, 1.0)
     ]
-    np.testing.assert_allclose(
-        values, [[0.0] * 4, [-0.3125, 0.3125, 0.3125, 0.5], [1.0, -1.0, -1.0, -1.0]]
-    )
+    assert_allclose(values, [[0.0] * 4, [-0.3125, 0.3125, 0.3125, 0.5], [1.0, -1.0, -1.0, -1.0]])
     assert steps_due(0.004, 0.017, 0.01) == (2, pytest.approx(0.001))
     assert steps_due(0.0, 5.0, 0.01)[0] == 10, "a late picture is not made up for"
-    np.testing.assert_allclose(GHOST.state_at(0, 1.0), STANDING.states[100], atol=1e-6)
+    assert_allclose(GHOST.state_at(0, 1.0), STANDING.states[100], atol=1e-6)
     later_s = 2.0 * GHOST.flying.gate_times_s[-1] + 0.5
     for laps, time_s in ((0, STANDING.time_s + 0.5), (1, later_s)):
-        np.testing.assert_allclose(GHOST.state_at(laps, time_s), GHOST.state_at(1, 0.5), atol=1e-6)
+        assert_allclose(GHOST.state_at(laps, time_s), GHOST.state_at(1, 0.5), atol=1e-6)
 
 
 @pytest.mark.parametrize(

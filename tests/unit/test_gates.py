@@ -1,7 +1,6 @@
 """Gates: meeting them, and racing through them at any step size."""
 
 from itertools import pairwise
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.quaternion import Vec3
 from flytrack_env.race import advance_race, start_race
-from flytrack_env.tracks import Course, Crossing, Gate, GateFrame, Track, build_course, cross_gate
+from flytrack_env.tracks import Gate, Track, build_course, cross_gate
 from tests.support.coasting import coasting_env, drone_at
 
 RADIUS = 0.15
@@ -22,18 +22,18 @@ EVENTS = ("pass", "frame", "miss", "none")
 cross = jax.jit(jax.vmap(cross_gate, in_axes=(None, 0, 0, None)))
 
 
-def course_of(*gates: Gate) -> Course:
+def course_of(*gates):
     """Return the course of some gates, with bounds that do not matter."""
     bounds = ((-1e3, -1e3, -1e3), (1e3, 1e3, 1e3))
     return build_course(Track("test", gates, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), *bounds))
 
 
-def frame_of(gate: Gate) -> GateFrame:
+def frame_of(gate):
     """Return the gate's flight frame as scalars."""
     return jax.tree.map(lambda table: jnp.asarray(table[0]), course_of(gate, gate).gates)
 
 
-def to_world(gate: Gate, points: np.ndarray) -> Vec3:
+def to_world(gate, points):
     """Return points (N, 3) of the flight frame in the world, computed from the gate's data."""
     matrix = Rotation.from_quat(gate.quaternion, scalar_first=True).as_matrix()
     forward, up = gate.direction * matrix[:, 1], matrix[:, 2]
@@ -41,7 +41,7 @@ def to_world(gate: Gate, points: np.ndarray) -> Vec3:
     return Vec3(*jnp.asarray((points @ axes + gate.position).astype(np.float32)).T)
 
 
-def names(crossing: Crossing) -> list[str]:
+def names(crossing):
     """Return the event of each crossing by name; two at once would be a bug."""
     flags = np.stack([crossing.is_pass, crossing.is_frame, crossing.is_miss])
     assert (flags.sum(axis=0) <= 1).all()
@@ -50,7 +50,7 @@ def names(crossing: Crossing) -> list[str]:
 
 @pytest.mark.parametrize(("y", "event"), [(0.0, "pass"), (1.0, "frame"), (2.0, "miss")])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_point_on_the_plane_is_counted_once(y: float, event: str, sign: float) -> None:
+def test_a_point_on_the_plane_is_counted_once(y, event, sign):
     gate = gate_of(Rotation.from_euler("z", -90, degrees=True), (0.0, 0.0, 0.0), 1.0, 1.5, 0.6)
     points = sign * np.array([[-0.2, 0.0, 0.0], [0.0, 0.0, 0.0], [0.3, 0.0, 0.0]])
     points[:, 1] = y
@@ -75,22 +75,18 @@ openings = st.floats(0.4, 5.0)
 thicknesses = st.floats(0.01, 3.0)
 
 
-def vectors(rows: np.ndarray) -> Vec3:
+def vectors(rows):
     """Return rows (N, 3) as a vector of columns, float32."""
     return Vec3(*jnp.asarray(np.asarray(rows, np.float32).T))
 
 
-def gate_of(
-    turn: Rotation, centre: Any, direction: float, opening: float, thickness: float
-) -> Gate:
+def gate_of(turn, centre, direction, opening, thickness):
     """Return a gate; thickness: of its frame, m."""
     quat = tuple(turn.as_quat(scalar_first=True).tolist())
     return Gate(0, tuple(centre), quat, direction, opening, opening + 2.0 * thickness)
 
 
-def events_in_float64(
-    gate: Gate, start: np.ndarray, end: np.ndarray, radius: float
-) -> tuple[str, float]:
+def events_in_float64(gate, start, end, radius):
     """Return what a segment (world, m) does to a gate, and how near float32 may get it wrong, m.
 
     By rotating the segment into the gate's own frame, where it is flown along +-y and stands in x
@@ -123,14 +119,14 @@ def events_in_float64(
     seed=st.integers(0, 2**32 - 1),
 )
 def test_any_segment_meets_any_gate_as_in_the_gates_own_frame(
-    turn: Rotation,
-    centre: Any,
-    direction: float,
-    opening: float,
-    thickness: float,
-    radius: float,
-    seed: int,
-) -> None:
+    turn,
+    centre,
+    direction,
+    opening,
+    thickness,
+    radius,
+    seed,
+):
     """Even of a far or degenerate segment: one event at most, and a fraction from 0 to 1."""
     gate = gate_of(turn, centre, direction, opening, thickness)
     rng = np.random.default_rng(seed)
@@ -158,7 +154,7 @@ ROW = (2.0, 4.0, 6.0, 8.0)
 
 
 @pytest.mark.parametrize("dt", [0.002, 0.01, 0.05])
-def test_coasting_through_the_gates_does_not_depend_on_the_time_step(dt: float) -> None:
+def test_coasting_through_the_gates_does_not_depend_on_the_time_step(dt):
     env = coasting_env(*ROW)
     params = env.default_params.replace(dt=dt)
     step = jax.jit(jax.vmap(env.transition, in_axes=(0, None, None)))
@@ -171,10 +167,10 @@ def test_coasting_through_the_gates_does_not_depend_on_the_time_step(dt: float) 
         assert not causes.any().any()
         passed.append(np.asarray(state.race.gates_passed))
         num_laps += np.asarray(events.is_lap)
-    np.testing.assert_array_equal(passed[-1], 4)
-    np.testing.assert_array_equal(num_laps, 1)
-    np.testing.assert_array_equal(state.race.laps, 1)
-    np.testing.assert_allclose(state.race.lap_time_s, [8.5 / 9.7, 8.0 / 5.0], atol=1e-3)
+    assert_array_equal(passed[-1], 4)
+    assert_array_equal(num_laps, 1)
+    assert_array_equal(state.race.laps, 1)
+    assert_allclose(state.race.lap_time_s, [8.5 / 9.7, 8.0 / 5.0], atol=1e-3)
     # Each gate is counted in the step that takes the drone across it.
     third = dt * (1 + np.argmax(np.array(passed) >= 3, axis=0))
     crossing = np.array([6.5 / 9.7, 6.0 / 5.0])
@@ -191,7 +187,7 @@ fly_race = jax.jit(
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), num_gates=st.sampled_from([2, 3, 8]))
-def test_a_race_counts_what_its_gates_see_one_after_the_other(seed: int, num_gates: int) -> None:
+def test_a_race_counts_what_its_gates_see_one_after_the_other(seed, num_gates):
     """Passes, laps and the next gate along a random path, against a reading in float64."""
     rng = np.random.default_rng(seed)
     gates = [

@@ -2,8 +2,6 @@
 
 import json
 import re
-from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -25,7 +23,7 @@ FIELDS |= {"m": 1, "g": 9.80665, "battery_drain_v_per_min": 1.0, "battery": {}}
 MINIMAL = json.dumps(FIELDS)
 
 
-def assert_same_model(a: ModelParameters, b: ModelParameters) -> None:
+def assert_same_model(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
@@ -41,7 +39,7 @@ def assert_same_model(a: ModelParameters, b: ModelParameters) -> None:
         nominal_parameters()._replace(thrust_coeffs=np.float32([0.1, -0.2, 1 / 3, 1e-7, 1e5, 0])),
     ],
 )
-def test_round_trip(model: ModelParameters, tmp_path: Path) -> None:
+def test_round_trip(model, tmp_path):
     path = tmp_path / "model.json"
     provenance = {"source": "a test", "seed": 3, "files": ["a.npy"]}
     save_model(path, model, provenance)
@@ -55,7 +53,7 @@ def test_round_trip(model: ModelParameters, tmp_path: Path) -> None:
     assert set(document["units"]) == set(document["parameters"]) | set(document["effects"])
 
 
-def test_minimal_file_by_hand(tmp_path: Path) -> None:
+def test_minimal_file_by_hand(tmp_path):
     path = tmp_path / "model.json"
     path.write_text(MINIMAL, encoding="utf-8")
     model = load_model(path)
@@ -68,7 +66,7 @@ def test_minimal_file_by_hand(tmp_path: Path) -> None:
     assert_same_model(load_model(nested), model)
 
 
-def test_effects_by_hand_beside_or_among_the_parameters(tmp_path: Path) -> None:
+def test_effects_by_hand_beside_or_among_the_parameters(tmp_path):
     path = tmp_path / "model.json"
     some = {"quadratic_drag": {"k_x": 0.1}, "command_delay": {"delay_s": 0.02}}
     for document in ({**FIELDS, "effects": some}, {"parameters": FIELDS, "effects": some}):
@@ -107,7 +105,7 @@ BAD_FILES = [
 
 
 @pytest.mark.parametrize(("document", "reason"), BAD_FILES)
-def test_bad_files_are_refused(document: dict[str, Any], reason: str, tmp_path: Path) -> None:
+def test_bad_files_are_refused(document, reason, tmp_path):
     path = tmp_path / "model.json"
     path.write_text(json.dumps(document), encoding="utf-8")
     with pytest.raises(ModelFileError, match=rf"^{re.escape(str(path))}: {reason}"):

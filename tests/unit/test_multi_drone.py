@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 import flytrack_env
 from flytrack_env.multi_drone import MultiDroneRace, Opponent, RaceRules, Versus, idle
@@ -55,7 +56,7 @@ def test_one_drone_flies_bit_for_bit_as_in_the_single_environment():
     keys = jax.random.split(jax.random.key(0), 32)
     alone, alone_states = jax.vmap(env.reset, (0, None))(keys, params)
     found, states = jax.vmap(race.reset, (0, None))(keys, race.default_params)
-    np.testing.assert_array_equal(found[:, 0], alone)
+    assert_array_equal(found[:, 0], alone)
     num_ended = 0
     for step in range(80):
         actions, key = sticks(step, 32), jax.random.key(step)
@@ -63,10 +64,8 @@ def test_one_drone_flies_bit_for_bit_as_in_the_single_environment():
         flown = race.step_batch(key, states, actions[:, None], race.default_params)
         alone_states, states = expected[1], flown[1]
         for one, other in zip((flown[0], *flown[2:5]), (expected[0], *expected[2:5]), strict=True):
-            np.testing.assert_array_equal(one[:, 0], other)
-        np.testing.assert_array_equal(
-            flown[5]["final_observation"][:, 0], expected[5]["final_observation"]
-        )
+            assert_array_equal(one[:, 0], other)
+        assert_array_equal(flown[5]["final_observation"][:, 0], expected[5]["final_observation"])
         num_ended += int(flown[5]["race_over"].sum())
     assert num_ended > 5
 
@@ -82,7 +81,7 @@ def test_the_order_of_drones_does_not_matter(order, seed):
         flown = step_all(states, actions, PARAMS)
         found = step_all(moved, actions[:, order], PARAMS)
         states, moved = flown[1], found[1]
-        jax.tree.map(np.testing.assert_array_equal, places_moved(flown, order), found)
+        jax.tree.map(assert_array_equal, places_moved(flown, order), found)
 
 
 def test_drones_far_apart_fly_as_alone():
@@ -96,8 +95,8 @@ def test_drones_far_apart_fly_as_alone():
         actions = sticks(n, RACES, DRONES)
         together, apart = step_all(states, actions, PARAMS), step_all(alone, actions, PARAMS)
         states, alone = together[1], apart[1]
-        np.testing.assert_array_equal(together[0][:, 0, :size], apart[0][:, 0, :size])
-        np.testing.assert_array_equal(together[2][:, 0], apart[2][:, 0])
+        assert_array_equal(together[0][:, 0, :size], apart[0][:, 0, :size])
+        assert_array_equal(together[2][:, 0], apart[2][:, 0])
 
 
 @settings(max_examples=200, deadline=None)
@@ -142,16 +141,16 @@ def test_a_collision_puts_out_and_costs_what_a_crash_costs():
     )
     flown = step_all(states, idle, params)
     hit = np.array([True, True, False])
-    np.testing.assert_array_equal(flown[5]["collision"], np.tile(hit, (RACES, 1)))
+    assert_array_equal(flown[5]["collision"], np.tile(hit, (RACES, 1)))
     assert not missed[3][:, :2].any() and flown[3][:, :2].all()
     cost = np.where(hit, params.flight.reward.termination, 0.0)
-    np.testing.assert_allclose(flown[2] - missed[2], np.tile(cost, (RACES, 1)), atol=1e-5)
+    assert_allclose(flown[2] - missed[2], np.tile(cost, (RACES, 1)), atol=1e-5)
     after = step_all(flown[1], jnp.ones((RACES, DRONES, 4)), params)
     assert (
         (after[2][:, :2] == 0.0).all() and after[3][:, :2].all() and not after[5]["collision"].any()
     )
     x, x_after = (one[1].inner.plant.drone.pos_w.x for one in (flown, after))
-    np.testing.assert_array_equal(x[:, :2], x_after[:, :2])
+    assert_array_equal(x[:, :2], x_after[:, :2])
 
 
 def standing(x, progress=0.0, is_out=False):
@@ -168,10 +167,10 @@ def test_opponents_are_seen_nearest_first_in_the_gate_frame():
     others = [standing(9.0), standing(-3.0, 2.0), standing(0.5, is_out=True), standing(6.0)]
     rows = np.array(observe_opponents(standing(0.0, 1.0), others, to_left)).reshape(3, 7)
     # World x is to the right of a gate that is flown through along y.
-    np.testing.assert_allclose(rows[:, 1] * 3.0, [3.0, -6.0, -9.0], atol=1e-6)
-    np.testing.assert_allclose(rows[:, 6], [1.0, -1.0, -1.0])
+    assert_allclose(rows[:, 1] * 3.0, [3.0, -6.0, -9.0], atol=1e-6)
+    assert_allclose(rows[:, 6], [1.0, -1.0, -1.0])
     (out,) = np.array(observe_opponents(standing(0.0), others[2:3], to_left)).reshape(1, 7)
-    np.testing.assert_allclose(out, [-10.0, 0, 0, 0, 0, 0, -10.0])
+    assert_allclose(out, [-10.0, 0, 0, 0, 0, 0, -10.0])
 
 
 def test_ranks_are_by_progress_and_those_that_are_out_come_last():
@@ -209,16 +208,16 @@ def test_a_ghost_flies_its_line_and_stops_for_nobody():
     frame = state.entrants.inner.race.gate
     gate = jax.tree.map(lambda leaf: leaf[0], frame)
     apart = Vec3(*(states[60, axis] - drone.pos_w[axis][0] for axis in range(3)))
-    np.testing.assert_allclose(observation[29:32] * 3.0, np.array(gate.to_frame(apart)), atol=1e-3)
+    assert_allclose(observation[29:32] * 3.0, np.array(gate.to_frame(apart)), atol=1e-3)
     seen = env.race.observe(state.entrants, env.race.default_params)[0]
-    np.testing.assert_allclose(seen, observation, atol=1e-5)
+    assert_allclose(seen, observation, atol=1e-5)
 
 
 def test_a_duel_can_be_pickled():
     env = gymnax.make("FlyTrackDuel-v0")[0]
     copy = pickle.loads(pickle.dumps(env))
     start, observation = env.reset(jax.random.key(0)), copy.reset(jax.random.key(0))
-    jax.tree.map(np.testing.assert_array_equal, start, observation)
+    jax.tree.map(assert_array_equal, start, observation)
 
 
 def test_drones_that_would_have_flown_on_are_truncated_when_the_race_is_over():
@@ -267,10 +266,10 @@ def test_a_learner_meets_its_opponents_alone_and_in_a_batch():
     single = jax.vmap(env.step, (None, 0, 0, None))(jax.random.key(1), states, actions, None)
     is_going = ~np.asarray(batch[5]["race_over"])
     for one, other in zip((batch[0], *batch[2:5]), (single[0], *single[2:5]), strict=True):
-        np.testing.assert_allclose(one[is_going], other[is_going], atol=2e-5)
+        assert_allclose(one[is_going], other[is_going], atol=2e-5)
     both = jnp.stack([actions, act(0.1, states.observations[:, 0])], axis=1)
     by_hand = race.step_batch(jax.random.key(1), states.entrants, both, race.default_params)
-    np.testing.assert_allclose(batch[0], by_hand[0][:, 0], atol=2e-5)
+    assert_allclose(batch[0], by_hand[0][:, 0], atol=2e-5)
 
 
 @pytest.mark.filterwarnings(
@@ -296,14 +295,14 @@ def test_a_race_begins_on_the_grid_and_is_over_for_all_at_once():
     _, states = starts(3, params)
     x, y, _ = (np.asarray(one) for one in states.inner.plant.drone.pos_w)
     second, third = (np.hypot(x[:, n] - x[:, 0], y[:, n] - y[:, 0]) for n in (1, 2))
-    np.testing.assert_allclose(second, np.hypot(1.0, 0.5), atol=1e-4)
-    np.testing.assert_allclose(third, 1.0, atol=1e-4)
+    assert_allclose(second, np.hypot(1.0, 0.5), atol=1e-4)
+    assert_allclose(third, 1.0, atol=1e-4)
     num_over = 0
     for step in range(150):  # without thrust none stays in the air for longer
         thrust = jnp.full((RACES, DRONES, 4), -1.0)
         flown = RACE.step_batch(jax.random.key(step), states, thrust, params)
         over = np.asarray(flown[5]["race_over"])
-        np.testing.assert_array_equal(over.all(axis=1), over.any(axis=1))
+        assert_array_equal(over.all(axis=1), over.any(axis=1))
         assert flown[3][over].all() and not flown[1].is_out[over].any()
         states = flown[1]
         num_over += over[:, 0].sum()
@@ -313,7 +312,7 @@ def test_a_race_begins_on_the_grid_and_is_over_for_all_at_once():
 def test_observations_at_the_start_are_those_of_the_drones_that_begin():
     observations, states = RACE.reset(jax.random.key(8))
     drones, gates = states.inner.plant.drone, states.inner.race.gate_index
-    np.testing.assert_allclose(observations, RACE.begin(drones, gates, PARAMS)[0], atol=2e-5)
+    assert_allclose(observations, RACE.begin(drones, gates, PARAMS)[0], atol=2e-5)
     assert observations.shape == (DRONES, *RACE.observation_space().shape)
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 import re
 from operator import attrgetter
-from typing import Any
 
 import jax
 import numpy as np
@@ -26,7 +25,7 @@ def test_reset_refuses_another_step_than_the_plant_has():
     env.reset(jax.random.key(0), PARAMS.replace(dt=0.02))
 
 
-def with_value(name: str, value: Any) -> EnvParams:
+def with_value(name, value):
     """Return the default parameters with another value of a field of RANGES."""
     part, _, field = name.rpartition(".")
     if not part:
@@ -35,7 +34,7 @@ def with_value(name: str, value: Any) -> EnvParams:
 
 
 @pytest.mark.parametrize("name", RANGES)
-def test_ends_of_ranges_pass_and_what_lies_beyond_is_refused(name: str) -> None:
+def test_ends_of_ranges_pass_and_what_lies_beyond_is_refused(name):
     bounds, shape = RANGES[name], np.shape(attrgetter(name)(PARAMS))
     for end in (bounds.low, bounds.high):
         try:
@@ -52,14 +51,14 @@ def test_ends_of_ranges_pass_and_what_lies_beyond_is_refused(name: str) -> None:
             with_value(name, wrong).check()
 
 
-def test_every_number_of_the_parameters_has_a_range() -> None:
+def test_every_number_of_the_parameters_has_a_range():
     parts = ("model", "reset", "reward")
     fields = {f"{part}.{name}" for part in parts for name in getattr(PARAMS, part)._fields}
     own = {field.name for field in dataclasses.fields(EnvParams)} - {*parts, "course", "wrappers"}
     assert set(RANGES) == (fields | own) - {"model.battery", "model.effects", "model.motion"}
 
 
-def test_courses_that_cannot_be_flown() -> None:
+def test_courses_that_cannot_be_flown():
     course = PARAMS.course
     one = course._replace(gates=jax.tree.map(lambda leaf: leaf[:1], course.gates))
     far = course._replace(bounds_high=course.bounds_high._replace(y=np.float32(np.inf)))

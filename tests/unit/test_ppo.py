@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from flax import struct
 from gymnax.environments import environment, spaces
+from numpy.testing import assert_allclose, assert_array_equal
 
 from baselines.purejaxrl_ppo import Config, make_train, ppo
 from baselines.purejaxrl_ppo.metrics import summarize_episodes
@@ -54,7 +55,7 @@ class Probe(environment.Environment):
         )
 
 
-def tiny(**changes) -> Config:
+def tiny(**changes):
     settings = {
         "total_timesteps": 64 * 16 * 60,
         "num_envs": 64,
@@ -106,10 +107,10 @@ def test_memory_tells_what_no_observation_shows():
     unseen, first = jnp.zeros((1, 6, 2)), network.first_memory((1, 6))
     done = jnp.array([[False, False, True] * 2])
     values = network.apply(params, first, unseen, done, method="unroll")[1][0]
-    np.testing.assert_allclose(values, [0.81, 0.9, 1.0] * 2, atol=0.04)
+    assert_allclose(values, [0.81, 0.9, 1.0] * 2, atol=0.04)
     memory = network.first_memory()
     for value in values[:3]:
-        np.testing.assert_allclose(
+        assert_allclose(
             network.apply(params, memory, unseen[0, 0], method="value_of"), value, atol=1e-5
         )
         memory, _ = network.act(params, memory, unseen[0, 0])
@@ -158,7 +159,7 @@ def test_gae_equals_the_definition():
 @pytest.mark.parametrize("size", [64, 4096, 96])
 def test_affine_permutation_is_a_permutation(size):
     first = ppo.affine_permutation(jax.random.key(0), size)
-    np.testing.assert_array_equal(np.sort(first), np.arange(size))
+    assert_array_equal(np.sort(first), np.arange(size))
     assert not np.array_equal(first, ppo.affine_permutation(jax.random.key(1), size))
 
 

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.quaternion import Quaternion, Vec3
@@ -31,14 +32,14 @@ def columns(array):
 def test_axes_turned_vectors_and_products_are_those_of_rotations(quats):
     own, others = Quaternion(*columns(quats)), np.roll(quats, 7, axis=0)
     axes = np.stack([np.stack(axis, -1) for axis in own.axes()], axis=-1)
-    np.testing.assert_allclose(axes, rotations(quats).as_matrix(), atol=1e-6)
+    assert_allclose(axes, rotations(quats).as_matrix(), atol=1e-6)
     vectors = np.random.default_rng(1).normal(size=(NUM_CASES, 3))
     rotated = np.stack(own.rotate(Vec3(*columns(vectors))), -1)
-    np.testing.assert_allclose(rotated, rotations(quats).apply(vectors), atol=5e-6)
+    assert_allclose(rotated, rotations(quats).apply(vectors), atol=5e-6)
     product = np.stack(own.multiply(Quaternion(*columns(others))), -1)
     expected = (rotations(quats) * rotations(others)).as_quat(scalar_first=True)
     sign = np.sign(np.sum(product * expected, axis=1, keepdims=True))
-    np.testing.assert_allclose(product, sign * expected, atol=1e-6)
+    assert_allclose(product, sign * expected, atol=1e-6)
 
 
 def test_from_yaw_tilt_leans_the_thrust_axis_towards_the_heading():
@@ -49,4 +50,4 @@ def test_from_yaw_tilt_leans_the_thrust_axis_towards_the_heading():
     expected = Rotation.from_euler("z", yaw[:, None]) * Rotation.from_rotvec(lean)
     result = Quaternion.from_yaw_tilt(*map(jnp.asarray, (yaw, tilt, heading)))
     matrix = np.stack([np.stack(axis, -1) for axis in result.axes()], axis=-1)
-    np.testing.assert_allclose(matrix, expected.as_matrix(), atol=1e-5)
+    assert_allclose(matrix, expected.as_matrix(), atol=1e-5)

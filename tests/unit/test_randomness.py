@@ -12,7 +12,7 @@ NUM_DRAWS = 1_000_000
 
 
 @pytest.fixture(scope="module")
-def normals() -> dict[str, np.ndarray]:
+def normals():
     """Draws under two names from a million words."""
     words = jax.random.bits(jax.random.key(0), (NUM_DRAWS,))
     draw = jax.jit(
@@ -22,7 +22,7 @@ def normals() -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", ["position_0", "rates_2"])
-def test_draws_are_standard_normal(normals: dict[str, np.ndarray], name: str) -> None:
+def test_draws_are_standard_normal(normals, name):
     found = normals[name]
     assert abs(found.mean()) < 5e-3 and found.std() == pytest.approx(1.0, abs=5e-3)
     assert abs(stats.skew(found)) < 0.02 and abs(stats.kurtosis(found)) < 0.03
@@ -30,7 +30,7 @@ def test_draws_are_standard_normal(normals: dict[str, np.ndarray], name: str) ->
     assert stats.kstest(found, "norm").statistic < 4e-3
 
 
-def test_names_and_steps_are_independent(normals: dict[str, np.ndarray]) -> None:
+def test_names_and_steps_are_independent(normals):
     first, second = normals.values()
     assert abs(np.corrcoef(first, second)[0, 1]) < 5e-3
     assert abs(np.corrcoef(first**2, second**2)[0, 1]) < 5e-3
@@ -73,7 +73,7 @@ WORDS = {
 
 
 @pytest.mark.parametrize("source", WORDS)
-def test_draws_are_uniform_and_uncorrelated(source: str) -> None:
+def test_draws_are_uniform_and_uncorrelated(source):
     words = WORDS[source]()
     assert words.dtype == jnp.uint32
     draw_all = jax.vmap(
@@ -89,6 +89,6 @@ def test_draws_are_uniform_and_uncorrelated(source: str) -> None:
     assert np.abs(lagged).max() < 4.5 / np.sqrt(NUM_WORDS)
 
 
-def test_legacy_keys_are_as_good_as_typed_ones() -> None:
+def test_legacy_keys_are_as_good_as_typed_ones():
     for seed in range(16):
         assert int(seed_of(jax.random.key(seed))) == int(seed_of(jax.random.PRNGKey(seed)))

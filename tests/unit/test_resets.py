@@ -8,21 +8,20 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.env import EnvParams, FlyTrack
 from flytrack_env.resets import LAST_SEGMENT_FRACTION, SIDEWAYS_FRACTION, ResetParams
 from flytrack_env.state import pack
-from flytrack_env.tracks import Track, load_track
+from flytrack_env.tracks import load_track
 
 NUM_STARTS = 4096
 
 
 @pytest.fixture(scope="module")
-def sample(env: FlyTrack, params: EnvParams):
+def sample(env, params):
     """A function from fields of ``ResetParams`` to states (N, 21) and gate indices (N,)."""
 
     reset_many = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))
 
-    def draw(**fields: float) -> tuple[np.ndarray, np.ndarray]:
+    def draw(**fields):
         keys = jax.random.split(jax.random.key(0), NUM_STARTS)
         _, state = reset_many(keys, params.replace(reset=ResetParams(**fields)))
         assert not np.asarray(state.time).any()
@@ -33,13 +32,13 @@ def sample(env: FlyTrack, params: EnvParams):
     return draw
 
 
-def assert_uniform(values: np.ndarray, low: float, high: float) -> None:
+def assert_uniform(values, low, high):
     """Check a uniform distribution by Kolmogorov and Smirnov's test."""
     assert low - 1e-5 <= values.min() and values.max() <= high + 1e-5
     assert stats.kstest((values - low) / (high - low), "uniform").pvalue > 1e-4
 
 
-def test_start_pose_is_at_rest_before_gate_zero(sample) -> None:
+def test_start_pose_is_at_rest_before_gate_zero(sample):
     x, gate_index = sample(course_fraction=0.0)
     noise = ResetParams()
     assert not gate_index.any()
@@ -52,7 +51,7 @@ def test_start_pose_is_at_rest_before_gate_zero(sample) -> None:
     assert_uniform(x[:, 20], 23.5, 24.0)
 
 
-def course_curves(track: Track) -> list[CubicHermiteSpline]:
+def course_curves(track):
     """Return, per gate, the documented way to it: a curve over [0, 1] from the gate before.
 
     It leaves and meets the gates along their directions of flight, with tangents as long as the
@@ -69,7 +68,7 @@ def course_curves(track: Track) -> list[CubicHermiteSpline]:
     return curves
 
 
-def test_course_starts_lie_along_the_curves_between_the_gates(sample) -> None:
+def test_course_starts_lie_along_the_curves_between_the_gates(sample):
     x, gate_index = sample(course_fraction=1.0, course_offset=0.0)
     counts = np.bincount(gate_index, minlength=8)
     assert stats.chisquare(counts).pvalue > 1e-4
@@ -89,7 +88,7 @@ def test_course_starts_lie_along_the_curves_between_the_gates(sample) -> None:
     assert_uniform(fractions / (LAST_SEGMENT_FRACTION + 1e-3), 0.0, 1.0)
 
 
-def test_course_starts_have_the_stated_tilt_towards_any_side(sample) -> None:
+def test_course_starts_have_the_stated_tilt_towards_any_side(sample):
     x, _ = sample(course_fraction=1.0)
     up = Rotation.from_quat(x[:, 9:13], scalar_first=True).apply([0.0, 0.0, 1.0])
     tilt_deg = np.degrees(np.arccos(np.clip(up[:, 2], -1.0, 1.0)))
@@ -98,7 +97,7 @@ def test_course_starts_have_the_stated_tilt_towards_any_side(sample) -> None:
     np.testing.assert_allclose(np.linalg.norm(x[:, 9:13], axis=1), 1.0, atol=1e-5)
 
 
-def test_share_of_course_starts(sample) -> None:
+def test_share_of_course_starts(sample):
     share = 0.2
     x, _ = sample(course_fraction=share)
     is_on_course = np.linalg.norm(x[:, 3:6], axis=1) > 0.0

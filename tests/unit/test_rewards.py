@@ -1,21 +1,19 @@
 """Every reward term by hand, and their weighted sum."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from flytrack_env import rewards
-from flytrack_env.env import EnvParams, FlyTrack
+from flytrack_env.env import FlyTrack
 from flytrack_env.quaternion import Vec3
 from flytrack_env.rewards import TERMS, RewardWeights, Transition, total_reward
 from flytrack_env.state import Action
 from tests.support.coasting import coasting_env, drone_at
 
 
-def make_transition(before: Any = None, after: Any = None, **fields: Any) -> Transition:
+def make_transition(before=None, after=None, **fields):
     """Return a still transition 5 m before a gate, with some parts replaced."""
     still = {
         "gate_centre_w": Vec3(*map(jnp.float32, (1.0, 2.0, 3.0))),
@@ -48,28 +46,28 @@ STILL = [(name, {}, 0.0) for name in RewardWeights._fields]
 
 
 @pytest.mark.parametrize(("name", "parts", "expected"), [*STILL, *CASES])
-def test_term(name: str, parts: dict[str, Any], expected: float) -> None:
+def test_term(name, parts, expected):
     value = getattr(rewards, name)(make_transition(**parts))
     assert float(value) == pytest.approx(expected, abs=1e-5)
 
 
-def test_every_weight_is_named_after_a_term_and_every_term_is_tested() -> None:
+def test_every_weight_is_named_after_a_term_and_every_term_is_tested():
     names = [term.__name__ for term in TERMS]
     assert len(set(names)) == len(names)
     assert set(RewardWeights._fields) == set(names) == {case[0] for case in CASES}
     assert set(RewardWeights._field_defaults) == set(names)
 
 
-def test_weights_that_are_given_replace_the_defaults() -> None:
+def test_weights_that_are_given_replace_the_defaults():
     weights = FlyTrack(reward={"off_centre": -0.5, "gate_pass": 2}).default_params.reward
     assert weights == RewardWeights(off_centre=-0.5, gate_pass=2.0)
     assert FlyTrack(reward={}).default_params.reward == RewardWeights()
 
 
-def test_gradient_is_finite_at_the_gates_centre() -> None:
+def test_gradient_is_finite_at_the_gates_centre():
     at_centre = {"position": (1.0, 2.0, 3.0)}
 
-    def reward(x: jax.Array) -> jax.Array:
+    def reward(x):
         transition = make_transition(before=at_centre, after=at_centre)
         after = transition.after._replace(pos_w=transition.after.pos_w._replace(x=x))
         return total_reward(transition._replace(after=after), RewardWeights())
@@ -86,12 +84,12 @@ def test_gradient_is_finite_at_the_gates_centre() -> None:
         (2.0, {"gate_pass": 0, "off_centre": 0.0, "termination": 1}),
     ],
 )
-def test_environment_hands_its_transition_to_the_terms(y: float, expected: dict[str, Any]) -> None:
+def test_environment_hands_its_transition_to_the_terms(y, expected):
     env = coasting_env(0.0, 10.0)
     transition = jax.jit(env.transition)
     for name, value in expected.items():
         only = RewardWeights(**{field: float(field == name) for field in RewardWeights._fields})
-        params: EnvParams = env.default_params.replace(reward=only)
+        params = env.default_params.replace(reward=only)
         state = env.begin(drone_at((-0.9, y, 2.0), (100.0, 0.0, 0.0)), 0, params)
         reward = float(transition(state, jnp.zeros(4), params)[1])
         if name == "progress":  # towards the gate that was flown to, 0.9 m before and 0.1 m behind

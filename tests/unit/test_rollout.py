@@ -5,17 +5,18 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from flytrack_env.rollout import RolloutError, load_rollout, save_rollout
 from tests.support.recordings import make_sequence
 
 
-def make_flight(steps: int) -> tuple[np.ndarray, np.ndarray]:
+def make_flight(steps):
     """Return random states (T, 21) and actions (T, 4), float32."""
     return tuple(map(np.stack, zip(*make_sequence(steps), strict=True)))
 
 
-def without_rate_actions(states: np.ndarray) -> np.ndarray:
+def without_rate_actions(states):
     return np.delete(states, (16, 17, 18), axis=1)
 
 
@@ -25,25 +26,25 @@ def test_round_trip_is_exact(tmp_path, steps):
     save_rollout(tmp_path / "flight", states, actions)
     assert [path.name for path in tmp_path.iterdir()] == ["flight"]
     for found, expected in zip(load_rollout(tmp_path / "flight"), (states, actions), strict=True):
-        np.testing.assert_array_equal(found, expected)
+        assert_array_equal(found, expected)
         assert found.dtype == np.float32
     rows = np.load(tmp_path / "flight", allow_pickle=False)
-    np.testing.assert_array_equal(rows, np.hstack([states, actions]))
+    assert_array_equal(rows, np.hstack([states, actions]))
 
 
-def npy_bytes(array: np.ndarray) -> bytes:
+def npy_bytes(array):
     content = io.BytesIO()
     np.save(content, array)
     return content.getvalue()
 
 
-def rows_with(value: float) -> bytes:
+def rows_with(value):
     rows = np.zeros((3, 25))
     rows[1, 9] = value
     return npy_bytes(rows)
 
 
-def pairs_of(*pairs: object) -> np.ndarray:
+def pairs_of(*pairs):
     array = np.empty(len(pairs), object)
     array[:] = pairs
     return array
@@ -101,8 +102,8 @@ def test_short_rows_lack_the_applied_rate_actions(tmp_path):
     np.save(tmp_path / "flight.npy", np.hstack([without_rate_actions(states), actions]))
     found = load_rollout(tmp_path / "flight.npy")
     states[:, 16:19] = np.nan
-    np.testing.assert_array_equal(found[0], states)
-    np.testing.assert_array_equal(found[1], actions)
+    assert_array_equal(found[0], states)
+    assert_array_equal(found[1], actions)
 
 
 @pytest.mark.parametrize("is_short", [False, True])
@@ -119,5 +120,5 @@ def test_pickled_pairs_are_read_only_if_allowed(tmp_path, columns, is_short):
     if is_short:
         states[:, 16:19] = np.nan
     found = load_rollout(path, allow_pickle=True)
-    np.testing.assert_array_equal(found[0], states)
-    np.testing.assert_array_equal(found[1], actions)
+    assert_array_equal(found[0], states)
+    assert_array_equal(found[1], actions)

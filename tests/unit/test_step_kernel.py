@@ -1,12 +1,12 @@
 """Fused code stays the same: ``compute_once``, ``one_kernel``, a batch's auto-reset, the step."""
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import flytrack_env
 from flytrack_env import nominal_parameters
@@ -21,7 +21,7 @@ from tests.support.slow import slow_but
 NUM_ENVS, NUM_STEPS = 40, 6
 
 
-def with_effects(*names: str, motion: Motion = Motion.HANDOUT) -> Any:
+def with_effects(*names, motion=Motion.HANDOUT):
     """Return an environment whose model has these effects, a third into their ranges."""
     effects = [inside_ranges(effect, 0.3) for effect in EFFECTS if effect.name in names]
     model = nominal_parameters()._replace(motion=motion).with_effects(*effects)
@@ -39,7 +39,7 @@ VARIANTS = {
 }
 
 
-def flown(env: Any, is_constant: bool) -> Any:
+def flown(env, is_constant):
     """Return the outcome of some steps of a batch.
 
     is_constant: the parameters are constants of the program, not its argument.
@@ -48,7 +48,7 @@ def flown(env: Any, is_constant: bool) -> Any:
     keys = jax.random.split(jax.random.key(0), NUM_ENVS)
     actions = jax.random.uniform(jax.random.key(1), (NUM_STEPS, NUM_ENVS, 4), minval=-1.0)
 
-    def fly(params: Any) -> Any:
+    def fly(params):
         _, states = jax.vmap(env.reset, in_axes=(0, None))(keys, params)
         step = jax.vmap(env.step, in_axes=(0, 0, 0, None))
         return jax.lax.scan(
@@ -60,7 +60,7 @@ def flown(env: Any, is_constant: bool) -> Any:
 
 
 @pytest.mark.parametrize("name", slow_but(["plain"], VARIANTS))
-def test_the_kernel_is_the_same_step(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_the_kernel_is_the_same_step(monkeypatch, name):
     with_kernel = flown(VARIANTS[name](), is_constant=True)
     monkeypatch.setenv(SWITCH, "0")
     without = flown(VARIANTS[name](), is_constant=False)
@@ -71,11 +71,11 @@ def test_the_kernel_is_the_same_step(monkeypatch: pytest.MonkeyPatch, name: str)
     for found, (path, expected) in zip(jax.tree.leaves(with_kernel), leaves, strict=True):
         # A bend is a second difference of forces, and rounds as they do.
         size = sizes[jax.tree_util.keystr(path).replace("force_bends_b", "forces_b")]
-        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * size)
+        assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * size)
 
 
 @pytest.mark.parametrize("name", ["plain", "all wrappers", "all effects, continuous"])
-def test_a_step_is_a_kernel_unless_switched_off(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_a_step_is_a_kernel_unless_switched_off(monkeypatch, name):
     for switch in ("1", "0"):
         monkeypatch.setenv(SWITCH, switch)
         env = VARIANTS[name]()
@@ -112,16 +112,16 @@ TRANSFORMS = {
 
 @pytest.mark.parametrize("leaf", LEAVES)
 @pytest.mark.parametrize("transform", TRANSFORMS)
-def test_identity(leaf: str, transform: str) -> None:
+def test_identity(leaf, transform):
     value = jnp.asarray(LEAVES[leaf])
     result = TRANSFORMS[transform](compute_once)(value)
     assert (result.dtype, result.shape) == (value.dtype, value.shape)
-    np.testing.assert_array_equal(result, value)
+    assert_array_equal(result, value)
     if np.issubdtype(value.dtype, np.floating):
-        np.testing.assert_array_equal(np.signbit(result), np.signbit(value))
+        assert_array_equal(np.signbit(result), np.signbit(value))
 
 
-def swung(x: jax.Array, steps: jax.Array, unread: jax.Array) -> tuple[jax.Array, jax.Array]:
+def swung(x, steps, unread):
     """Return what a loop of simple operations makes of numbers; the last one is not read."""
     return jax.lax.fori_loop(
         0, 3, lambda _, y: jnp.where(y > 0.3, jnp.sin(y), y * steps), x
@@ -129,7 +129,7 @@ def swung(x: jax.Array, steps: jax.Array, unread: jax.Array) -> tuple[jax.Array,
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_one_kernel_is_the_same_function_and_prunes_what_it_does_not_read(dtype: Any) -> None:
+def test_one_kernel_is_the_same_function_and_prunes_what_it_does_not_read(dtype):
     with jax.enable_x64(dtype is np.float64):
         given = (np.linspace(-2.0, 2.0, 12, dtype=dtype), dtype(1.5), np.zeros(3, dtype))
         tangents = (np.ones(12, dtype), dtype(0.5), np.ones(3, dtype))
@@ -140,36 +140,34 @@ def test_one_kernel_is_the_same_function_and_prunes_what_it_does_not_read(dtype:
             lambda f: jax.grad(lambda *args: f(*args)[0].sum(), argnums=(0, 1)),
         ):
             found, expected = (jax.jit(transform(f))(*given) for f in (one_kernel(swung), swung))
-            jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), found, expected)
+            jax.tree.map(partial(assert_allclose, rtol=1e-6), found, expected)
             assert jax.tree.leaves(found)[0].dtype == dtype
 
 
-def test_what_is_no_simple_operation_stays_outside_of_one_kernel() -> None:
-    def product(x: jax.Array) -> jax.Array:
+def test_what_is_no_simple_operation_stays_outside_of_one_kernel():
+    def product(x):
         return x @ x
 
     matrix = jnp.eye(3)
     text = jax.jit(one_kernel(product)).lower(matrix).as_text()
     assert "xla_cpu_small_call" not in text
     assert "xla_cpu_small_call" in jax.jit(one_kernel(jnp.sin)).lower(matrix).as_text()
-    np.testing.assert_array_equal(jax.jit(one_kernel(product))(matrix), matrix)
+    assert_array_equal(jax.jit(one_kernel(product))(matrix), matrix)
 
 
-def test_what_only_xla_finds_unread_and_constants_abort_no_process() -> None:
-    def found(x: jax.Array, unread: jax.Array, *parameters: jax.Array) -> jax.Array:
+def test_what_only_xla_finds_unread_and_constants_abort_no_process():
+    def found(x, unread, *parameters):
         chosen = jnp.where(jnp.zeros((), bool), unread, parameters[0])
         return jax.lax.fori_loop(0, 3, lambda _, y: jnp.sin(y) * parameters[1] + chosen, x)
 
     x, one, two = np.linspace(0.0, 1.0, 1000, dtype=np.float32), np.float32(1.0), np.float32(2.0)
     for own, unread in ((x, x), (x[:3], one)):
         expected = jax.jit(found)(own, unread, one, two, two)
-        np.testing.assert_allclose(
-            jax.jit(one_kernel(found))(own, unread, one, two, two), expected, rtol=1e-5
-        )
+        assert_allclose(jax.jit(one_kernel(found))(own, unread, one, two, two), expected, rtol=1e-5)
         constant = jax.jit(
             lambda own=own, unread=unread: one_kernel(found)(own, unread, one, two, two)
         )()
-        np.testing.assert_allclose(constant, expected, rtol=1e-5)
+        assert_allclose(constant, expected, rtol=1e-5)
 
 
 def begin(seed, offset):
@@ -203,7 +201,7 @@ def test_only_ended_environments_change(monkeypatch, switch, size, share):
     batch = steps(size, share)
     reset = partial(reset_if_ended, begin)
     found = jax.jit(jax.vmap(one_kernel(reset), in_axes=(0, None)))(batch, 1000.0)
-    jax.tree.map(np.testing.assert_array_equal, found, expected(batch, 1000.0))
+    jax.tree.map(assert_array_equal, found, expected(batch, 1000.0))
 
 
 def test_a_batch_of_batches_and_parameters_of_each():
@@ -211,10 +209,10 @@ def test_a_batch_of_batches_and_parameters_of_each():
     nested = jax.tree.map(lambda leaf: leaf.reshape(4, 6, *leaf.shape[1:]), batch)
     found = jax.jit(jax.vmap(jax.vmap(reset, in_axes=(0, None)), in_axes=(0, None)))(nested, 5.0)
     flat = jax.tree.map(lambda leaf: leaf.reshape(24, *leaf.shape[2:]), found)
-    jax.tree.map(np.testing.assert_array_equal, flat, expected(batch, 5.0))
+    jax.tree.map(assert_array_equal, flat, expected(batch, 5.0))
     found = jax.jit(jax.vmap(reset))(batch, jnp.arange(24) * 1.0)
     fresh = np.asarray(batch.seed, np.float32) + np.arange(24)
-    np.testing.assert_array_equal(found[0][0], np.where(batch.done, fresh, np.arange(24)))
+    assert_array_equal(found[0][0], np.where(batch.done, fresh, np.arange(24)))
 
 
 def test_gradient_flows_through_what_did_not_end():
@@ -224,4 +222,4 @@ def test_gradient_flows_through_what_did_not_end():
         (found,), _ = jax.vmap(one_kernel(reset), in_axes=(0, None))(batch, None)
         return (found**2).sum()
 
-    np.testing.assert_allclose(jax.grad(total)(jnp.array([3.0, 4.0, 5.0])), [0.0, 8.0, 0.0])
+    assert_allclose(jax.grad(total)(jnp.array([3.0, 4.0, 5.0])), [0.0, 8.0, 0.0])

@@ -2,12 +2,12 @@
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from flytrack_env import tracks
 from flytrack_env.params import EnvParams
@@ -19,15 +19,15 @@ HANDOUT = np.genfromtxt(FOLDER / "handout_gates.csv", delimiter=",", skip_header
 HANDOUT_ROWS, HANDOUT_YAWS_DEG = HANDOUT[:, :8], HANDOUT[:, 8]
 
 
-def test_shipped_course_is_the_handouts_table_with_its_flight_frames() -> None:
+def test_shipped_course_is_the_handouts_table_with_its_flight_frames():
     track = tracks.load_track("flytrack")
-    np.testing.assert_allclose(track.rows(), HANDOUT_ROWS, atol=1e-6)
+    assert_allclose(track.rows(), HANDOUT_ROWS, atol=1e-6)
     assert all(gate.opening == 1.5 and gate.frame == 2.7 for gate in track.gates)
     assert track.start_position == (18.6, 2.0, 0.1)
     assert [gate.direction for gate in track.gates] == [-1.0] * 4 + [1.0] * 4
     centres = HANDOUT_ROWS[:, 1:4]
-    np.testing.assert_allclose(track.bounds_low[:2], centres.min(axis=0)[:2] - 5.0)
-    np.testing.assert_allclose(track.bounds_high, centres.max(axis=0) + 5.0)
+    assert_allclose(track.bounds_low[:2], centres.min(axis=0)[:2] - 5.0)
+    assert_allclose(track.bounds_high, centres.max(axis=0) + 5.0)
     assert track.bounds_low[2] == 0.0
     yaw = 2.0 * math.atan2(track.start_quaternion[3], track.start_quaternion[0])
     to_gate = centres[0] - track.start_position
@@ -37,14 +37,14 @@ def test_shipped_course_is_the_handouts_table_with_its_flight_frames() -> None:
     psi = np.radians(HANDOUT_YAWS_DEG)
     signs = np.repeat([-1.0, 1.0], 4)
     forward = np.stack([-signs * np.sin(psi), signs * np.cos(psi), 0.0 * psi])
-    np.testing.assert_allclose(np.stack(course.gates.forward), forward, atol=1e-5)
-    np.testing.assert_allclose(np.stack(course.gates.up).T, [[0.0, 0.0, 1.0]] * 8)
-    np.testing.assert_allclose(np.stack(course.gates.centre).T, HANDOUT_ROWS[:, 1:4], rtol=1e-6)
+    assert_allclose(np.stack(course.gates.forward), forward, atol=1e-5)
+    assert_allclose(np.stack(course.gates.up).T, [[0.0, 0.0, 1.0]] * 8)
+    assert_allclose(np.stack(course.gates.centre).T, HANDOUT_ROWS[:, 1:4], rtol=1e-6)
     left = np.stack([-forward[1], forward[0], forward[2]])
-    np.testing.assert_allclose(np.stack(course.gates.left()), left, atol=1e-5)
+    assert_allclose(np.stack(course.gates.left()), left, atol=1e-5)
 
 
-def test_shipped_tracks_are_the_promised_ones_under_their_own_names() -> None:
+def test_shipped_tracks_are_the_promised_ones_under_their_own_names():
     assert tracks.available_tracks() == ("figure_eight", "flytrack", "speedway", "split_s")
     assert all(tracks.load_track(name).name == name for name in tracks.available_tracks())
 
@@ -52,13 +52,13 @@ def test_shipped_tracks_are_the_promised_ones_under_their_own_names() -> None:
 NUM_GATES, RADIUS, HEIGHT = 6, 10.0, 2.0
 
 
-def yaw_of(heading_deg: float) -> tuple[float, float, float, float]:
+def yaw_of(heading_deg):
     """Return the attitude of a gate that is flown along a heading with direction +1."""
     half = math.radians(heading_deg - 90.0) / 2.0
     return (math.cos(half), 0.0, 0.0, math.sin(half))
 
 
-def ring(radius: float = RADIUS, num_gates: int = NUM_GATES) -> tracks.Track:
+def ring(radius=RADIUS, num_gates=NUM_GATES):
     """Return gates on a circle, anticlockwise, gate 0 at (radius, 0); starts are 5 m before it."""
     gates = []
     for i in range(num_gates):
@@ -76,7 +76,7 @@ def ring(radius: float = RADIUS, num_gates: int = NUM_GATES) -> tracks.Track:
     )
 
 
-def changed(index: int, **fields: Any) -> tracks.Track:
+def changed(index, **fields):
     """Return the ring with other fields of one gate."""
     gates = list(RING.gates)
     gates[index] = replace(gates[index], **fields)
@@ -128,23 +128,23 @@ BREAKS = {
 
 
 @pytest.mark.parametrize("text", BREAKS)
-def test_every_break_is_found_and_named(text: str) -> None:
+def test_every_break_is_found_and_named(text):
     track, demand = BREAKS[text]
     problems = tracks.find_problems(track)
     assert [p for p in problems if p.demand == demand and p.text.startswith(text)], problems
 
 
-def test_every_demand_has_a_break() -> None:
+def test_every_demand_has_a_break():
     assert {demand for _, demand in BREAKS.values()} == set(tracks.DEMANDS)
 
 
-def test_the_unbroken_ring_is_feasible_but_by_limits_of_ones_own() -> None:
+def test_the_unbroken_ring_is_feasible_but_by_limits_of_ones_own():
     assert tracks.find_problems(RING) == ()
     found = tracks.find_problems(RING, tracks.Limits(min_opening=1.51))
     assert len(found) == NUM_GATES and {problem.demand for problem in found} == {"opening"}
 
 
-def test_default_clearances_are_what_starts_need() -> None:
+def test_default_clearances_are_what_starts_need():
     radius, starts = EnvParams.drone_radius, ResetParams()
     limits = tracks.Limits()
     assert limits.drone_radius == radius
@@ -159,7 +159,7 @@ BEYOND = 3  # samples of the next way: enough to be through the gate at the end 
 
 
 @pytest.fixture(scope="module")
-def drawn() -> list[tracks.Track]:
+def drawn():
     """Courses of the first seeds."""
     return [tracks.random_track(seed) for seed in range(NUM_SEEDS)]
 
@@ -167,7 +167,7 @@ def drawn() -> list[tracks.Track]:
 CROSS = jax.jit(tracks.cross_gate)
 
 
-def assert_flies_through(track: tracks.Track) -> None:
+def assert_flies_through(track):
     """Check that the way passes its next gate once, misses it never, and touches no gate at all."""
     course = tracks.build_course(track)
     way = tracks.sample_way(course, NUM_SAMPLES).astype(np.float32)
@@ -181,17 +181,17 @@ def assert_flies_through(track: tracks.Track) -> None:
     events = (crossing.is_pass, crossing.is_frame, crossing.is_miss)
     passes, frames, misses = (np.asarray(event).sum(axis=1) for event in events)
     next_gate = np.roll(np.eye(len(track.gates), dtype=int), 1, axis=1)
-    np.testing.assert_array_equal(passes, next_gate, err_msg=track.name)
+    assert_array_equal(passes, next_gate, err_msg=track.name)
     assert not frames.any() and not (misses * next_gate).any(), track.name
 
 
 @pytest.mark.parametrize("name", tracks.available_tracks())
-def test_shipped_tracks_are_feasible_and_their_ways_pass_every_gate_in_turn(name: str) -> None:
+def test_shipped_tracks_are_feasible_and_their_ways_pass_every_gate_in_turn(name):
     assert tracks.find_problems(tracks.load_track(name)) == ()
     assert_flies_through(tracks.load_track(name))
 
 
-def test_only_such_courses_are_drawn_and_all_differ(drawn: list[tracks.Track]) -> None:
+def test_only_such_courses_are_drawn_and_all_differ(drawn):
     for track in drawn:
         assert tracks.find_problems(track) == ()
         assert_flies_through(track)
@@ -200,7 +200,7 @@ def test_only_such_courses_are_drawn_and_all_differ(drawn: list[tracks.Track]) -
     )
 
 
-def test_course_is_a_function_of_the_key(drawn: list[tracks.Track]) -> None:
+def test_course_is_a_function_of_the_key(drawn):
     for seed in range(10):
         for key in (seed, jax.random.key(seed), jax.random.PRNGKey(seed)):
             assert tracks.random_track(key) == drawn[seed]
@@ -212,7 +212,7 @@ def test_course_is_a_function_of_the_key(drawn: list[tracks.Track]) -> None:
     )
 
 
-def test_course_of_a_seed_stays_the_same() -> None:
+def test_course_of_a_seed_stays_the_same():
     # Whoever publishes a seed publishes a course: a change of the drawing is a change of behaviour.
     track = tracks.random_track(0)
     assert track.name == "random_0_0"
@@ -249,6 +249,6 @@ UNMET = {
         ),
     ],
 )
-def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
+def test_bad_arguments_are_refused(arguments, message):
     with pytest.raises(tracks.TrackError, match=message):
         tracks.random_track(**{"key": 0, **arguments})

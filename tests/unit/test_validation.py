@@ -1,6 +1,6 @@
 """Messages about the content of files."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import pytest
 from msgspec import Meta
@@ -17,7 +17,7 @@ class Inner(Fields):
     count: Annotated[int, Meta(ge=1, le=9)] = 1
     is_on: bool = False
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         check_different("names", self.names)
         if self.high is not None and self.high <= self.low:
             raise ValueError("expected low below high")
@@ -67,7 +67,7 @@ class Outer(Fields):
         ({"inner": {}, " - at `$.other": 1}, "a.toml: "),
     ],
 )
-def test_messages_name_file_field_found_and_expected(value: Any, message: str) -> None:
+def test_messages_name_file_field_found_and_expected(value, message):
     with pytest.raises(ValueError) as error:
         convert("a.toml", value, Outer)
     assert str(error.value).startswith(message) and str(error.value).isprintable()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from flytrack.cli import main
 from flytrack_env.flown_race import follow_race
@@ -26,7 +27,7 @@ RACE = follow_race(STATES[:, POSITION], TRACK)
 SECOND = "flights/plant\\ \\/\\ 2"
 
 
-def record(folder: Path, sequence, gates=GATES, **options) -> Recording:
+def record(folder, sequence, gates=GATES, **options):
     """Return what was recorded as the only file of an empty folder."""
     path = folder / "flight.rrd"
     viz.visualize_state_action_sequence(sequence, gates, str(path), **options)
@@ -44,18 +45,16 @@ def test_handouts_function_has_its_defaults(tmp_path, monkeypatch):
 def test_handouts_function_records_the_numbers_that_it_is_given(tmp_path):
     handout = record(tmp_path, make_sequence(100), app_id="test_app")
     x, u = (np.array(part, float) for part in zip(*make_sequence(100), strict=True))
-    np.testing.assert_array_equal(
-        handout.series("/world/drone", "Transform3D:translation"), x[:, 0:3]
-    )
+    assert_array_equal(handout.series("/world/drone", "Transform3D:translation"), x[:, 0:3])
     rotation = handout.series("/world/drone", "Transform3D:quaternion")
-    np.testing.assert_allclose(rotation, x[:, [10, 11, 12, 9]], atol=1e-6)  # scalar last
+    assert_allclose(rotation, x[:, [10, 11, 12, 9]], atol=1e-6)  # scalar last
     speeds = np.linalg.norm(x[:, 3:6], axis=1), np.linalg.norm(x[:, 13:16], axis=1)
     expected = dict(zip([f"action/{name}" for name in Action._fields], u.T, strict=True))
     expected |= dict(zip(("speed", "angular_speed"), speeds, strict=True))
     grid = [(step, step * 10_000_000) for step in range(100)]
     for path, values in expected.items():
         found = handout.series(f"/plots/{path}", "Scalars:scalars")
-        np.testing.assert_allclose(found, values, rtol=1e-12, err_msg=path)
+        assert_allclose(found, values, rtol=1e-12, err_msg=path)
         assert sorted(handout.times[f"/plots/{path}"]) == grid, path
     assert handout.app_id == "test_app" and handout.timelines == {"step", "sim_time"}
 
@@ -67,10 +66,10 @@ def test_gates_alone_are_flown_as_the_flight_passes_them(tmp_path, is_back):
     found = record(tmp_path, list(zip(states, ACTIONS, strict=True)))
     vectors = found.once("/world/gates/direction", "Arrows3D:vectors")
     forward = np.stack(build_course(TRACK).gates.forward, axis=-1)
-    np.testing.assert_allclose(vectors, -forward if is_back else forward, atol=1e-6)
+    assert_allclose(vectors, -forward if is_back else forward, atol=1e-6)
 
 
-def with_state(index, value) -> list:
+def with_state(index, value):
     """Return a flight of three steps whose last state has that value there."""
     sequence = make_sequence(3)
     sequence[2][0][index] = value
@@ -86,7 +85,7 @@ def test_nan_outside_the_pose_is_a_gap_and_rounded_quaternions_are_normalised(tm
     speed = found.series("/plots/speed", "Scalars:scalars")
     assert np.isnan(speed).tolist() == [False, False, True]
     rotation = found.series("/world/drone", "Transform3D:quaternion")[2]
-    np.testing.assert_allclose(rotation, np.full(4, 0.5), atol=1e-7)
+    assert_allclose(rotation, np.full(4, 0.5), atol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -151,7 +150,7 @@ def test_passes_laps_events_and_table_are_the_races(tmp_path):
         one.row for one in RACE.passes
     ]
     for count, points in enumerate(rows, start=1):
-        np.testing.assert_allclose(points, [one.pos_w for one in RACE.passes[:count]], rtol=1e-6)
+        assert_allclose(points, [one.pos_w for one in RACE.passes[:count]], rtol=1e-6)
     first, lap = RACE.passes[0], RACE.passes[7]
     assert [step for step, _ in recording.times["/world/laps"]] == [lap.row]
     assert recording.rows["/world/laps", "Points3D:labels"] == [[f"lap 1: {lap.lap_time_s:.3f} s"]]
@@ -185,7 +184,7 @@ def test_command_shows_rollouts_beside_the_ghost(tmp_path, capsys):
     names = [line.split("|")[1].strip() for line in table.splitlines()[2:]]
     assert names == ["a_flight", "b_flight", "time-optimal"]
     ghost = found.series("/world/flights/time-optimal/drone", "Transform3D:translation")
-    np.testing.assert_allclose(ghost, STATES[:20, POSITION], rtol=1e-6)
+    assert_allclose(ghost, STATES[:20, POSITION], rtol=1e-6)
 
 
 def test_command_reads_pickles_if_allowed(tmp_path, monkeypatch):

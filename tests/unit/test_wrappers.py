@@ -1,12 +1,11 @@
 """What each wrapper adds to a flight, and that nothing of it survives an episode."""
 
-from typing import Any
-
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import (
@@ -34,7 +33,6 @@ from tests.support.wrapped_flights import (
     ALL,
     ENDS,
     NUM_ENVS,
-    Flight,
     arrays,
     before_ends,
     fly,
@@ -48,7 +46,7 @@ NO_NOISE = NoiseParams(0.0, 0.0, 0.0, 0.0)
 LATE_S = 0.013
 
 
-def same_model(delay_s: float = 0.0) -> RandomizationParams:
+def same_model(delay_s=0.0):
     """Return ranges that give the nominal model with a delay, in the default's structure."""
     still = Wind(0.0, 0.0, None, None, None, None)
     ends = (CommandDelay(delay_s, None, None), ThrustScale(1.0), still, LinearDrag(0.0, 0.0, 0.0))
@@ -56,14 +54,14 @@ def same_model(delay_s: float = 0.0) -> RandomizationParams:
 
 
 @pytest.fixture(scope="module")
-def flight() -> Flight:
+def flight():
     """Flights in all wrappers with their default parameters."""
     env = wrapped(*ALL)
     return fly(env, env.default_params.replace(max_steps_in_episode=50))
 
 
 @pytest.fixture(scope="module")
-def quiet_flights() -> dict[str, Flight]:
+def quiet_flights():
     """Flights in all wrappers without noise, with one model; late by effect, wrapper or neither."""
     cases = {"neither": (0.0, 0.0), "effect": (LATE_S, 0.0), "wrapper": (0.0, LATE_S)}
     return {
@@ -78,57 +76,57 @@ def quiet_flights() -> dict[str, Flight]:
 
 
 def test_neutral_wrappers_fly_as_none_and_the_delay_as_effect(
-    quiet_flights: dict[str, Flight],
-) -> None:
+    quiet_flights,
+):
     plain, found = fly(wrapped()), quiet_flights["neither"]
-    np.testing.assert_allclose(found.observations[..., :SIZE], plain.observations, atol=1e-4)
-    np.testing.assert_allclose(found.rewards, plain.rewards, atol=1e-4)
-    np.testing.assert_array_equal(found.ended, plain.ended)
+    assert_allclose(found.observations[..., :SIZE], plain.observations, atol=1e-4)
+    assert_allclose(found.rewards, plain.rewards, atol=1e-4)
+    assert_array_equal(found.ended, plain.ended)
     assert plain.ended.any()
     late = quiet_flights["effect"]
-    np.testing.assert_allclose(late.observations, quiet_flights["wrapper"].observations, atol=2e-4)
-    np.testing.assert_array_equal(late.terminated, quiet_flights["wrapper"].terminated)
+    assert_allclose(late.observations, quiet_flights["wrapper"].observations, atol=2e-4)
+    assert_array_equal(late.terminated, quiet_flights["wrapper"].terminated)
     assert np.abs(late.observations - found.observations).max() > 0.1
 
 
 @pytest.mark.slow
-def test_the_order_of_wrapping_does_not_change_the_flight(flight: Flight) -> None:
+def test_the_order_of_wrapping_does_not_change_the_flight(flight):
     """What is drawn hangs on names."""
     env = wrapped(ALL[5], ALL[3], ALL[1], ALL[0], ALL[2], ALL[4])
     other = fly(env, env.default_params.replace(max_steps_in_episode=50))
-    np.testing.assert_allclose(other.observations, flight.observations, atol=5e-4)
-    np.testing.assert_array_equal(other.ended, flight.ended)
+    assert_allclose(other.observations, flight.observations, atol=5e-4)
+    assert_array_equal(other.ended, flight.ended)
 
 
 # --- Each wrapper ---------------------------------------------------------------------------------
 
 
-def test_statistics_are_those_of_the_episode(flight: Flight) -> None:
+def test_statistics_are_those_of_the_episode(flight):
     total, length = np.zeros(NUM_ENVS), np.zeros(NUM_ENVS, int)
     for i, is_end in enumerate(flight.ended):
         total, length = total + np.asarray(flight.rewards[i], float), length + 1
-        np.testing.assert_allclose(flight.info["episode_return"][i], total, atol=1e-4)
-        np.testing.assert_array_equal(flight.info["episode_length"][i], length)
+        assert_allclose(flight.info["episode_return"][i], total, atol=1e-4)
+        assert_array_equal(flight.info["episode_length"][i], length)
         total, length = np.where(is_end, 0.0, total), np.where(is_end, 0, length)
     assert flight.ended.any() and flight.truncated.any()
 
 
-def test_commands_are_remembered_the_latest_first_within_the_episode(flight: Flight) -> None:
+def test_commands_are_remembered_the_latest_first_within_the_episode(flight):
     applied, one, three = np.split(np.asarray(flight.observations), [SIZE, SIZE + 4], axis=-1)
     applied = applied[..., 18:22]
-    np.testing.assert_array_equal(one, applied)
+    assert_array_equal(one, applied)
     first = np.asarray(flight.first)
     expected = np.repeat(first[:, None, 18:22], 3, axis=1)
-    np.testing.assert_array_equal(first[:, SIZE + 4 :].reshape(-1, 3, 4), expected)
+    assert_array_equal(first[:, SIZE + 4 :].reshape(-1, 3, 4), expected)
     for i, is_end in enumerate(flight.ended):
         shifted = np.concatenate([np.asarray(flight.actions[i])[:, None], expected[:, :-1]], axis=1)
         expected = np.where(
             is_end[:, None, None], np.repeat(applied[i][:, None], 3, axis=1), shifted
         )
-        np.testing.assert_allclose(three[i].reshape(-1, 3, 4), expected, atol=1e-6)
+        assert_allclose(three[i].reshape(-1, 3, 4), expected, atol=1e-6)
 
 
-def test_a_model_and_the_noise_hold_for_their_episode_and_their_step(flight: Flight) -> None:
+def test_a_model_and_the_noise_hold_for_their_episode_and_their_step(flight):
     states = jax.tree.map(
         lambda *leaves: np.concatenate([leaves[0][None], leaves[1]]), flight.start, flight.states
     )
@@ -137,20 +135,20 @@ def test_a_model_and_the_noise_hold_for_their_episode_and_their_step(flight: Fli
     assert isinstance(noise, ObservationNoise)
     words = {"noise": states.inner.inner.word, "model": states.inner.inner.inner.inner.inner.word}
     assert (words["noise"][1:] != words["noise"][:-1]).all()
-    np.testing.assert_array_equal(words["model"][1:][~is_end], words["model"][:-1][~is_end])
+    assert_array_equal(words["model"][1:][~is_end], words["model"][:-1][~is_end])
     assert (words["model"][1:][is_end] != words["model"][:-1][is_end]).all()
     for word in words.values():
         assert len(np.unique(word[-1])) == NUM_ENVS
 
 
-def test_noise_has_the_stated_deviations_and_is_white() -> None:
+def test_noise_has_the_stated_deviations_and_is_white():
     """In the observation's rows at rest on the start pose, where the drone does not move."""
     env = wrapped(ObservationNoise)
     noise = NoiseParams(position_m=0.1, velocity_m_per_s=0.2, attitude_deg=2.0, rates_rad_per_s=0.3)
     params = env.default_params.replace(wrappers={"observation_noise": noise})
     drone = env.env.drone(env.env.reset(jax.random.key(0))[1])
 
-    def observations(seed: jax.Array) -> jax.Array:
+    def observations(seed):
         state = env.begin(drone, 0, params, seed)
         later = state._replace(word=next_word(state.word))
         return jnp.stack([env.observe(None, each, None, params) for each in (state, later)])
@@ -163,8 +161,8 @@ def test_noise_has_the_stated_deviations_and_is_white() -> None:
         (slice(3, 6), 0.2 / 5),
         (slice(15, 18), 0.3 / 5),
     ):
-        np.testing.assert_allclose(error[:, rows].std(axis=0), deviation, rtol=0.05)
-        np.testing.assert_allclose(error[:, rows].mean(axis=0), 0.0, atol=0.08 * deviation)
+        assert_allclose(error[:, rows].std(axis=0), deviation, rtol=0.05)
+        assert_allclose(error[:, rows].mean(axis=0), 0.0, atol=0.08 * deviation)
         for axis in range(
             rows.start, rows.stop
         ):  # white: the next step's noise does not know this one's
@@ -174,25 +172,23 @@ def test_noise_has_the_stated_deviations_and_is_white() -> None:
     assert (error[:, 18:] == 0.0).all()  # applied action, battery and the track are known
 
 
-def test_noise_stays_inside_the_space_and_off_the_flight(quiet_flights: dict[str, Flight]) -> None:
+def test_noise_stays_inside_the_space_and_off_the_flight(quiet_flights):
     quiet = {"domain_randomization": same_model(), "action_delay": CommandDelay(0.0)}
     loud = fly(wrapped(*ALL), observation_noise=NoiseParams(50.0, 50.0, 90.0, 50.0), **quiet)
     assert (np.abs(loud.observations) <= np.asarray(wrapped(*ALL).observation_space().high)).all()
     attitude = np.asarray(loud.observations)[..., 6:15].reshape(-1, 3, 3)
     eye = np.broadcast_to(np.eye(3), attitude.shape)
-    np.testing.assert_allclose(attitude @ attitude.transpose(0, 2, 1), eye, atol=1e-5)
-    np.testing.assert_array_equal(
-        loud.rewards, quiet_flights["neither"].rewards
-    )  # of the true flight
+    assert_allclose(attitude @ attitude.transpose(0, 2, 1), eye, atol=1e-5)
+    assert_array_equal(loud.rewards, quiet_flights["neither"].rewards)  # of the true flight
 
 
-def sampled_models(model: Any, num: int) -> Any:
+def sampled_models(model, num):
     """Return models of that many words, leaves (num,), drawn from the default ranges."""
     words = jax.random.bits(jax.random.key(0), (num,))
     return jax.jit(jax.vmap(lambda word: sample_model(word, model, RandomizationParams())))(words)
 
 
-def test_everything_that_has_a_range_fills_it_and_independently() -> None:
+def test_everything_that_has_a_range_fills_it_and_independently():
     models, ranges = sampled_models(nominal_parameters(), 2000), RandomizationParams()
     columns = [(models.m, 0.8, 1.2)] + [(tau, 0.7 * 0.04, 1.3 * 0.04) for tau in models.tau]
     assert len(models.effects) == len(ranges.low)
@@ -214,7 +210,7 @@ def test_everything_that_has_a_range_fills_it_and_independently() -> None:
     assert np.abs(np.corrcoef(units) - np.eye(len(units))).max() < 0.1
 
 
-def test_what_the_model_itself_has_is_drawn_around_it() -> None:
+def test_what_the_model_itself_has_is_drawn_around_it():
     """Identified effects are scaled within their range; effects outside the ranges stay."""
     known = (CommandDelay(0.036), ThrustScale(0.6), LinearDrag(1.0, -0.5, 0.0), QuadraticDrag(0.1))
     models = sampled_models(nominal_parameters().with_effects(*known), 500)
@@ -239,7 +235,7 @@ def test_what_the_model_itself_has_is_drawn_around_it() -> None:
 
 OK = RandomizationParams()
 LATE = CommandDelay(0.1)
-REFUSALS: list[tuple[Any, Any, str]] = [
+REFUSALS = [
     (
         DomainRandomization,
         OK._replace(mass_factor_low=1.3),
@@ -265,13 +261,13 @@ REFUSALS: list[tuple[Any, Any, str]] = [
 
 
 @pytest.mark.parametrize(("wrapper", "parameters", "reason"), REFUSALS)
-def test_bad_parameters_are_refused(wrapper: Any, parameters: Any, reason: str) -> None:
+def test_bad_parameters_are_refused(wrapper, parameters, reason):
     env = wrapped(wrapper)
     with pytest.raises(ValueError, match=reason):
         env.check_params(env.default_params.replace(wrappers={env.key: parameters}))
 
 
-def test_bad_arguments_are_refused() -> None:
+def test_bad_arguments_are_refused():
     with pytest.raises(ValueError, match=r"delay_s: found 0\.05, expected 0 to 0\.04 s"):
         ActionDelay(FlyTrack(), delay_s=0.05)
     for argument, value in (("length", 0), ("kind", "wanted")):
@@ -282,7 +278,7 @@ def test_bad_arguments_are_refused() -> None:
 # --- Nothing survives an episode ------------------------------------------------------------------
 
 
-def step(keys: jax.Array, states: Any, actions: Any) -> Any:
+def step(keys, states, actions):
     """Step a batch in every wrapper."""
     env = wrapped(*ALL)
     return steps_of(env)(
@@ -290,7 +286,7 @@ def step(keys: jax.Array, states: Any, actions: Any) -> Any:
     )
 
 
-def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been() -> None:
+def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been():
     """After an end, the state is that of a reset with the same key, in every leaf and wrapper."""
     env = wrapped(*ALL)
     params, applied = arrays(env.default_params), Action(0.5, -0.5, 0.4, 0.3)
@@ -306,9 +302,7 @@ def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been() -> N
     last = np.asarray(info["final_observation"])
     assert np.isfinite(last).all() and (last != np.asarray(observation)).any(axis=1).all()
     # What is no number is remembered as 0, and the rest of the action clipped.
-    np.testing.assert_allclose(
-        last[list(ends).index("nan roll"), SIZE + 4 : SIZE + 8], [0.0, 1.0, -1.0, 0.5]
-    )
+    assert_allclose(last[list(ends).index("nan roll"), SIZE + 4 : SIZE + 8], [0.0, 1.0, -1.0, 0.5])
     starts = np.stack(jax.tree.leaves(env.drone(after).pos_w), -1)
     assert len(np.unique(starts, axis=0)) == NUM_ENVS
 
@@ -316,10 +310,10 @@ def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been() -> N
 LAST_STEP = wrapped().default_params.max_steps_in_episode - 1
 
 
-def poisoned(states: Any, poison: str, rng: np.random.Generator) -> Any:
+def poisoned(states, poison, rng):
     """Return states of which every number is anything, at an episode's last step."""
 
-    def anything(path: Any, leaf: jax.Array) -> np.ndarray:
+    def anything(path, leaf):
         if getattr(path[-1], "name", "") == "time":
             return np.full(leaf.shape, LAST_STEP, leaf.dtype)
         if leaf.dtype == bool:
@@ -339,7 +333,7 @@ def poisoned(states: Any, poison: str, rng: np.random.Generator) -> Any:
 
 
 @pytest.mark.parametrize("poison", ["nan", "infinite", "huge", "random"])
-def test_what_begins_depends_on_nothing_of_what_ended(flight: Flight, poison: str) -> None:
+def test_what_begins_depends_on_nothing_of_what_ended(flight, poison):
     """Bit for bit: the same key, another past, another last action, in every wrapper at once."""
     rng, states = np.random.default_rng(0), flight.start
     for seed in range(3):
@@ -350,16 +344,16 @@ def test_what_begins_depends_on_nothing_of_what_ended(flight: Flight, poison: st
             assert np.asarray(output[4]).all()
             found.append(jax.tree.leaves(output[:2]))
         for clean, after in zip(*found, strict=True):
-            np.testing.assert_array_equal(np.asarray(clean), np.asarray(after))
+            assert_array_equal(np.asarray(clean), np.asarray(after))
             assert np.isfinite(np.asarray(after)).all()
 
 
-def test_the_handouts_environment_steps_as_flytrack_does() -> None:
+def test_the_handouts_environment_steps_as_flytrack_does():
     env, same = DroneRaceEnv(track="split_s"), FlyTrack(track="split_s")
     params, rng = env.default_params, jax.random.key(3)
     obs, state = env.reset(rng=rng, params=params)
     expected, same_state = same.reset(rng, params)
-    np.testing.assert_array_equal(obs, expected)
+    assert_array_equal(obs, expected)
     action = jnp.array([0.1, -0.2, 0.3, 0.4])
     obs, state, reward, done, info = env.step(rng=rng, state=state, action=action, params=params)
     found = same.step(rng, same_state, action, params)
