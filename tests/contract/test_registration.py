@@ -4,6 +4,7 @@ import hashlib
 import importlib
 import subprocess
 import sys
+from functools import partial
 
 import gymnasium
 import gymnax
@@ -23,6 +24,7 @@ from flytrack_env.state import Action
 from flytrack_env.wrappers import DomainRandomization, layers_of
 from tests.support.coasting import Coasting, drone_at
 from tests.support.slow import slow_but
+from tests.support.stepping import flight, inputs
 
 CAUSES = ("crash", "ground", "out_of_bounds", "missed_gate", "battery_empty")
 RACE = ("gates_passed", "laps", "lap_completed", "lap_time_s", "gate_distance_m")
@@ -43,7 +45,7 @@ def test_every_id_follows_gymnaxs_protocol(env_id):
     begun = jax.eval_shape(env.reset, key, params)
     action = jax.eval_shape(env.action_space(params).sample, key)
     observation, state, reward, terminated, truncated, info = jax.eval_shape(
-        env.step, key, begun[1], action, params
+        env.step, key, begun[1], action
     )
     assert (observation, state) == begun and info["final_observation"] == observation
     assert (observation.shape, observation.dtype) == (
@@ -107,13 +109,9 @@ def test_wrong_calls_are_refused_in_a_sentence_that_says_what_to_do(message):
 
 def digest(env_id):
     """Return a digest of every bit of a seeded flight through several episodes."""
-    env, params = gymnax.make(env_id)
-    params = params.replace(max_steps_in_episode=3)
-    outputs = [env.reset(jax.random.key(3), params)]
-    for i, action in enumerate(jax.random.uniform(jax.random.key(4), (25, 4), minval=-1.0)):
-        outputs.append(env.step(jax.random.key(i), outputs[-1][1], action, params))
-    rows = [np.asarray(leaf).tobytes() for output in outputs for leaf in jax.tree.leaves(output)]
-    return hashlib.sha256(b"".join(rows)).hexdigest()
+    env = gymnax.make(env_id)[0]
+    leaves = jax.tree.leaves(jax.jit(flight(env))(*inputs(env)))
+    return hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in leaves)).hexdigest()
 
 
 # The plain one runs every time: wrappers have fast tests of their own, and each id takes seconds to
@@ -129,62 +127,30 @@ def test_identical_seeds_fly_identically_in_another_process(env_ids):
 # --- Gradients ----------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@OVER_IDS
-def test_gradients_are_those_of_finite_differences(env_id):
-    """In every action of the first of three steps in free flight, away from every gate."""
+@pytest.mark.parametrize("env_id", slow_but(BASE, ENVIRONMENTS))
+def test_gradients_are_those_of_finite_differences_and_detached_unless_asked_for(env_id):
+    """In float64, in every action of the first of three steps in free flight, away from gates."""
     env, params = gymnax.make(env_id)
     attached = env.with_transition_gradients()
     assert attached.transition_gradients_enabled and not env.transition_gradients_enabled
     drone = drone_at((14.0, 12.0, 3.0), (3.0, -2.0, 1.0), applied=Action(0.1, -0.1, 0.2, 0.0))
-    state = env.begin(drone, 0, params, jnp.uint32(11))
-    weights = jax.random.normal(jax.random.key(2), env.observation_space(params).shape)
-
-    @jax.jit
-    def value(action):
-        flown = state
-        for command in (action, jnp.full(4, 0.2), jnp.full(4, -0.1)):
-            observation, flown, *_ = attached.step_env(None, flown, command, params)
-        return weights @ observation
-
-    action = jnp.array([0.2, -0.3, 0.1, 0.4])
-    found = np.asarray(jax.jit(jax.grad(value))(action))
-    shifts = 0.05 * np.eye(4, dtype=np.float32)
-    expected = [float(value(action + shift) - value(action - shift)) / 0.1 for shift in shifts]
-    assert np.abs(expected).max() > 0.05
-    assert_allclose(found, expected, rtol=0.02, atol=2e-3)
-
-
-def test_transition_gradients_are_detached_unless_asked_for(env, params):
-    """In float64, of a smooth scalar of observation, reward and next state, in action and speed."""
-
-    def differentiable(env, state):
-        def scalar(action, speed):
-            drone = env.drone(state)
-            plant = state.plant._replace(drone=drone._replace(vel_w=drone.vel_w._replace(y=speed)))
-            observation, after, reward, *_ = env.step_env(
-                None, state._replace(plant=plant), action, params
-            )
-            squares = jnp.sum(observation**2) + sum(
-                leaf**2 for leaf in jax.tree.leaves(after.plant)
-            )
-            return squares + 10.0 * env.transition_gradients_enabled * reward
-
-        return scalar
-
-    action, speed = np.array([0.2, -0.3, 0.4, 0.1]), np.array(1.5)
+    weights = np.random.default_rng(2).normal(size=env.observation_space(params).shape)
     with jax.enable_x64(True):
-        state = env.begin(drone_at((15.0, 2.5, 1.0), (-5.0, 1.0, 0.5)), 0, params)
         state = jax.tree.map(
-            lambda leaf: leaf.astype(float) if leaf.dtype == jnp.float32 else leaf, state
+            lambda leaf: leaf.astype(float) if leaf.dtype == np.float32 else leaf,
+            env.begin(drone, 0, params, jnp.uint32(11)),
         )
-        detached = jax.jit(jax.grad(differentiable(env, state), argnums=(0, 1)))(action, speed)
-        scalar = jax.jit(differentiable(env.with_transition_gradients(), state))
-        gradient = jax.jit(jax.grad(scalar, argnums=(0, 1)))(action, speed)
-        shifts = 1e-6 * np.eye(4)
-        numeric = [(scalar(action + s, speed) - scalar(action - s, speed)) / 2e-6 for s in shifts]
-        slope = (scalar(action, speed + 1e-6) - scalar(action, speed - 1e-6)) / 2e-6
-    assert not np.asarray(detached[0]).any() and not np.asarray(detached[1]).any()
-    assert_allclose(gradient[0], numeric, rtol=1e-4, atol=1e-5)
-    assert_allclose(gradient[1], slope, rtol=1e-4, atol=1e-5)
-    assert np.abs(numeric).min() > 1e-6
+
+        def value(env, action):
+            flown = state
+            for command in (action, jnp.full(4, 0.2), jnp.full(4, -0.1)):
+                observation, flown, reward, *_ = env.step_env(None, flown, command, params)
+            return weights @ observation + 10.0 * env.transition_gradients_enabled * reward
+
+        action, shifts = np.array([0.2, -0.3, 0.1, 0.4]), 1e-6 * np.eye(4)
+        detached = jax.jit(jax.grad(partial(value, env)))(action)
+        gradient = jax.jit(jax.grad(partial(value, attached)))(action)
+        evaluate = jax.jit(partial(value, attached))
+        numeric = [(evaluate(action + s) - evaluate(action - s)) / 2e-6 for s in shifts]
+    assert not np.asarray(detached).any() and np.abs(numeric).min() > 1e-6
+    assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-5)

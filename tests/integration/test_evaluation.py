@@ -87,44 +87,36 @@ def test_every_step_kept_or_not_is_the_same_flight(flights, raced):
 
 @pytest.mark.parametrize("flown_by", slow_but(["black box"], ["black box", "plants"]))
 def test_command_flies_many(flown_by, checkpoint_path, tmp_path, monkeypatch, capsys, flights):
-    flown = []
-    fly = evaluate.Report.fly
-    monkeypatch.setattr(
-        evaluate.Report, "fly", lambda self: flown.extend([fly(self), self]) or flown[0]
-    )
-    if (
-        flown_by == "black box"
-    ):  # one program less to compile: single flights are those of test_commands
-        monkeypatch.setattr(
-            evaluate.Report, "_fly_first", lambda *_: jax.tree.map(lambda leaf: leaf[0], flights)
-        )
+    outcomes = []
+
+    def race(*given):
+        outcomes.append(race_many(*given))
+        return outcomes[0]
+
+    monkeypatch.setattr(evaluate, "race_many", race)
+    more = ["--episodes", 2, "--plants", 3]
+    if flown_by == "black box":
+        more = ["--episodes", 6, "--laps", 1]
+        first = jax.tree.map(lambda leaf: leaf[0], flights)  # one program less to compile
+        monkeypatch.setattr(evaluate.Report, "_fly_first", lambda *_: first)
     out, file = tmp_path / "flight.npy", tmp_path / "new" / "report.json"
-    more = (
-        ["--episodes", 2, "--plants", 3] if flown_by == "plants" else ["--episodes", 6, "--laps", 1]
-    )
     where = ["--checkpoint", checkpoint_path, "--out", out, "--json", file]
     run("eval", *where, "--steps", 120, "--track", "split_s", "--ghost", *more)
-    outcomes, rollout = flown[0], flown[1].rollout
-    report, text = json.loads(file.read_text()), capsys.readouterr().out
-    assert report["schema"] == 1 and report["flights"] == 6 and report["track"] == "split_s"
-    assert report["steps"] == outcomes.steps.sum() and report["success"]["of"] == 6
-    assert "track split_s" in text and f"complete {report['laps']} laps: 0 of 6" in text
-    states, _ = load_rollout(out)
-    assert len(states) == report["first_flight"]["steps"] == np.sum(rollout.is_flying)
-    assert len(load_rollout(report["ghost"])[0]) == len(states)
+    steps, report, text = outcomes[0].steps, json.loads(file.read_text()), capsys.readouterr().out
+    assert report["flights"] == report["success"]["of"] == 6 and report["track"] == "split_s"
+    assert report["schema"] == 1 and report["steps"] == steps.sum()
+    assert f"complete {report['laps']} laps: 0 of 6" in text
+    num_states = len(load_rollout(out)[0])
+    assert num_states == report["first_flight"]["steps"] == len(load_rollout(report["ghost"])[0])
     if flown_by == "plants":
-        single = outcomes_of(jax.tree.map(lambda leaf: leaf[None], rollout), 3, 7)
-        first = jax.tree.map(lambda leaf: leaf[:1], outcomes)
-        chex.assert_trees_all_close(first, single, rtol=1e-5, atol=1e-5)
-        assert "in the simulator, not on a black box" in text and report["black_box"] is None
-        assert report["optimal"]["model"] == "nominal" and report["success"]["low"] is None
-        assert report["plants"]["success"]["of"] == 3 and len(report["plants"]["by_thirds"]) == 12
-        assert len(set(outcomes.steps[::2].tolist())) > 1  # the plants differ
+        assert steps[0] == num_states and len(set(steps[::2].tolist())) > 1  # the plants differ
+        assert report["black_box"] is None and report["optimal"]["model"] == "nominal"
+        assert report["success"]["low"] is None and len(report["plants"]["by_thirds"]) == 12
+        assert report["plants"]["success"]["of"] == 3
     else:
         assert report["optimal"]["model"] == "black_box" and report["plants"] is None
-        assert report["success"]["high"] == pytest.approx(
-            0.390334, abs=1e-5
-        )  # Wilson's, of none of 6
+        # Wilson's interval, of none of 6.
+        assert report["success"]["high"] == pytest.approx(0.390334, abs=1e-5)
 
 
 def keys_of(value):
@@ -138,82 +130,59 @@ def test_a_single_flight_as_json_and_docs_name_every_key(
     checkpoint_path, tmp_path, monkeypatch, capsys, flights, raced
 ):
     index = int(np.argmax(raced.is_complete()))
-    monkeypatch.setattr(
-        evaluate.Report, "_fly_first", lambda *_: jax.tree.map(lambda leaf: leaf[index], flights)
-    )
-    out, file = tmp_path / "flight.npy", tmp_path / "report.json"
-    where = ["--checkpoint", checkpoint_path, "--out", out, "--json", file, "--steps", NUM_STEPS]
-    recording = tmp_path / "flight.rrd"
-    if importlib.util.find_spec("rerun") is not None:
-        where += ["--rrd", recording]
-    run("eval", *where)
+    flight = jax.tree.map(lambda leaf: leaf[index], flights)
+    monkeypatch.setattr(evaluate.Report, "_fly_first", lambda *_: flight)
+    out, file, recording = (tmp_path / name for name in ("f.npy", "report.json", "f.rrd"))
+    has_rerun = importlib.util.find_spec("rerun") is not None
+    where = ["--out", out, "--json", file, *["--rrd", recording] * has_rerun]
+    run("eval", "--checkpoint", checkpoint_path, "--steps", NUM_STEPS, *where)
     text, report = capsys.readouterr().out, json.loads(file.read_text())
-    if report["recording"] is not None:
+    if has_rerun:
         assert report["recording"] == str(recording)
-        found = Recording(recording)
+        recorded = Recording(recording)
         for drone in ("/world/drone", "/world/flights/simulator/drone"):
-            place = found.series(drone, "Transform3D:translation")
-            assert_allclose(place, load_rollout(out)[0][:, POSITION])
+            positions = recorded.series(drone, "Transform3D:translation")
+            assert_allclose(positions, load_rollout(out)[0][:, POSITION])
     assert "interval" not in text and report["success"] is None and report["ghost"] is None
-    assert_allclose(report["first_flight"]["lap_times_s"], raced.lap_times_s[index], atol=1e-5)
-    assert [line.split(":")[0] for line in text.splitlines()][:4] == [
-        "flown",
-        "gates",
-        "lap times",
-        "ended",
-    ]
+    lap_times_s = report["first_flight"]["lap_times_s"]
+    assert_allclose(lap_times_s, raced.lap_times_s[index], atol=1e-5)
+    starts = ("flown:", "gates:", "lap times:", "ended:")
+    assert all(map(str.startswith, text.splitlines(), starts))
     drawn = checkpoint_env.draw_plants(0, 3, nominal_parameters()).drawn
     plants = summarize_plants(drawn, np.ones((3, 1), bool))
-    text = (ROOT / "docs" / "baseline.md").read_text()
-    missing = {name for name in keys_of({**report, "plants": plants}) if f"`{name}`" not in text}
-    assert not missing
+    page = (ROOT / "docs" / "baseline.md").read_text()
+    assert not {name for name in keys_of({**report, "plants": plants}) if f"`{name}`" not in page}
 
 
 def test_plants_are_drawn_from_the_ranges_around_the_model():
-    known = (
-        LinearDrag(0.4, 0.4, 0.2),
-        CommandDelay(0.03),
-        ThrustScale(0.9),
-        QuadraticDrag(0.01, shared=0.0),
-    )
-    model = nominal_parameters().with_effects(*known)
-    plants = checkpoint_env.draw_plants(3, 200, model)
-    for name, bounds in checkpoint_env.RANGES.items():
-        drawn = plants.drawn[name]
-        assert (
-            bounds[0] <= drawn.min()
-            and drawn.max() <= bounds[1]
-            and np.ptp(drawn) > 0.5 * np.ptp(bounds)
-        )
-    found = plants.models
-    assert_allclose(found.effect("thrust_scale").factor, 0.9 * plants.drawn["thrust_scale"], 1e-6)
-    assert_allclose(found.effect("linear_drag").d_x, np.float32(0.4))
-    assert_allclose(
-        found.effect("command_delay").delay_s, 0.03 + plants.drawn["command_delay_s"], 1e-6
-    )
-    quadratic, wind = found.effect("quadratic_drag"), found.effect("wind")
-    assert quadratic.k_x.min() >= 0.01 and (quadratic.shared == 0.0).all()
-    assert_allclose(np.hypot(wind.v_x, wind.v_y), plants.drawn["wind_m_s"], atol=1e-6)
+    known = (LinearDrag(0.4, 0.4, 0.2), CommandDelay(0.03), ThrustScale(0.9))
+    model = nominal_parameters().with_effects(*known, QuadraticDrag(0.01, shared=0.0))
+    models, drawn = checkpoint_env.draw_plants(3, 200, model)
+    for name, (low, high) in checkpoint_env.RANGES.items():
+        assert low <= drawn[name].min() and drawn[name].max() <= high
+        assert np.ptp(drawn[name]) > 0.5 * (high - low)
+    delay, drag = models.effect("command_delay"), models.effect("quadratic_drag")
+    wind = models.effect("wind")
+    assert_allclose(models.effect("thrust_scale").factor, 0.9 * drawn["thrust_scale"], 1e-6)
+    assert_allclose(models.effect("linear_drag").d_x, np.float32(0.4))
+    assert_allclose(delay.delay_s, 0.03 + drawn["command_delay_s"], 1e-6)
+    assert drag.k_x.min() >= 0.01 and (drag.shared == 0.0).all()
+    assert_allclose(np.hypot(wind.v_x, wind.v_y), drawn["wind_m_s"], atol=1e-6)
     assert (wind.v_x < 0).any() and (wind.v_y < 0).any() and not np.any(wind.v_z)
-    fewer = checkpoint_env.draw_plants(3, 5, model)
-    assert_array_equal(fewer.models.effect("wind").v_x, wind.v_x[:5])
-    assert not np.array_equal(
-        checkpoint_env.draw_plants(4, 5, model).drawn["wind_m_s"], fewer.drawn["wind_m_s"]
-    )
+    fewer, another = (checkpoint_env.draw_plants(seed, 5, model).drawn for seed in (3, 4))
+    assert_array_equal(fewer["wind_m_s"], drawn["wind_m_s"][:5])
+    assert not np.array_equal(another["wind_m_s"], fewer["wind_m_s"])
 
 
 def test_what_breaks_the_policy_shows_in_its_thirds():
     drawn = checkpoint_env.draw_plants(0, 90, nominal_parameters()).drawn
     is_good = drawn["command_delay_s"] < np.quantile(drawn["command_delay_s"], 2.0 / 3.0)
     rows = summarize_plants(drawn, np.stack([is_good, np.ones(90, bool)], axis=1))["by_thirds"]
-    shares = {name: [r["plants"]["share"] for r in rows if r["quantity"] == name] for name in drawn}
-    assert shares["command_delay_s"] == [1.0, 1.0, 0.0]
-    assert all(min(shares[name]) > 0.3 for name in set(drawn) - {"command_delay_s"})
-    assert {row["flights_share"] for row in rows if row["quantity"] == "command_delay_s"} == {
-        1.0,
-        0.5,
-    }
-    assert len(rows) == 12
+    shares = {name: [] for name in drawn}
+    for row in rows:
+        shares[row["quantity"]].append((row["plants"]["share"], row["flights_share"]))
+    assert shares.pop("command_delay_s") == [(1.0, 1.0), (1.0, 1.0), (0.0, 0.5)]
+    assert len(rows) == 12 and all(min(share)[0] > 0.3 for share in shares.values())
     assert len(summarize_plants({"wind_m_s": np.ones(1)}, np.ones((1, 1), bool))["by_thirds"]) == 1
 
 

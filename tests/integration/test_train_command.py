@@ -10,6 +10,7 @@ from baselines.purejaxrl_ppo.train_ppo import make_trainer, parse
 from baselines.purejaxrl_ppo.training import DEFAULT_OPTIONS, DivergedError, Stopped, Trainer
 from tests.support.ppo_runs import CONFIG, SEED
 from tests.support.ppo_runs import make_trainer as make_shared_trainer
+from tests.support.tables import table
 
 
 def read(*arguments):
@@ -40,16 +41,7 @@ def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [
-        (["--learning-rate", "0.1"], "config.learning_rate: found 0.003, expected 0.1\n"),
-        (["--track", "split_s"], "track_data.name: found 'flytrack', expected 'split_s'"),
-        (["--seed", "7"], "seed: found 3, expected 7"),
-        (["--total-timesteps", "384"], "steps: found 2688, expected at most 384"),
-        (
-            ["--evaluation-episodes", "0"],
-            "options: evaluation_episodes: found 0, expected a whole number from 1",
-        ),
-    ],
+    table("resumed")["flags"],
 )
 def test_what_does_not_fit_a_run_is_refused(
     whole, tmp_path, monkeypatch, capsys, arguments, message
@@ -72,12 +64,7 @@ def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole):
 
 @pytest.mark.parametrize(
     ("changes", "message"),
-    [
-        ({"environment": {"reward.gate_pass": "a lot"}}, "environment: gate_pass: found 'a lot'"),
-        ({"env_id": "Hover-v0"}, "with its settings and the flags: env_id: found 'Hover-v0'"),
-        ({"seed": "x"}, "seed: found 'x', expected a whole number"),
-        ({"steps": 5}, "steps: found 5"),
-    ],
+    table("resumed")["changes"],
 )
 def test_a_checkpoint_that_cannot_be_resumed_is_named(whole, tmp_path, changes, message):
     path = tmp_path / "final.safetensors"

@@ -118,21 +118,6 @@ def test_every_flipped_bit_is_noticed(path):
             r"observation_size: found 1000000000000, expected a whole number .*up to 65536",
         ),
         ("config", [1, 2], "config: found .*, expected a table of fields"),
-        (
-            "config",
-            {"learning_rate": 10**400},
-            "learning_rate: found 1000.*, expected a number above 0",
-        ),
-        (
-            "config",
-            {"hidden_sizes": [8] * 5000},
-            "hidden_sizes: found .*, expected a list of 1 to 16",
-        ),
-        (
-            "config",
-            {"memory_size": 2**40},
-            "memory_size: found 1099511627776, expected a whole number .*up to 65536",
-        ),
         ("config", {"num_minibatches": 7}, "num_minibatches: found 7, expected a divisor"),
         ("missed_gate", None, "missed_gate: found None"),
     ],

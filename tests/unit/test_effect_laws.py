@@ -225,6 +225,9 @@ SHOWN = slice(15, 18)  # where the observation has the body rates
 GYRO_SCALE = next(entry.scale for entry in OBSERVATION if entry.key == "rates")
 
 
+BIAS = (0.1, -0.2, 0.3)
+
+
 class WithoutGyro(Plant):
     """The simulator without a gyro of its own."""
 
@@ -247,15 +250,13 @@ class WithoutGyro(Plant):
 def test_the_observation_shows_the_gyro_of_the_plant(parameters, plant, lateness, bias):
     env = FlyTrack(model=nominal_parameters().with_effects(*parameters), plant=plant)
     params, step = env.default_params, jax.jit(env.step_env)
-    state = env.begin(drone_with(rates_b=(0.5, -0.3, 0.2)), 0, params, jnp.uint32(0))
-    shown, true = (
-        [env.observe(None, state, None, params)[SHOWN]],
-        [np.stack(env.drone(state).rates_b)],
-    )
+    states = [env.begin(drone_with(rates_b=(0.5, -0.3, 0.2)), 0, params, jnp.uint32(0))]
+    observations = [env.observe(None, states[0], None, params)]
     for _ in range(3):
-        observation, state, *_ = step(None, state, jnp.array([0.2, -0.1, 0.3, 0.0]), params)
-        shown.append(observation[SHOWN])
-        true.append(np.stack(env.drone(state).rates_b))
-    expected = np.stack(true)[np.maximum(np.arange(4) - lateness, 0)] + bias
-    assert_allclose(np.stack(shown) * GYRO_SCALE, expected, atol=1e-5)
-    assert np.abs(np.diff(true, axis=0)).min() > 1e-3
+        observation, state, *_ = step(None, states[-1], jnp.array([0.2, -0.1, 0.3, 0.0]), params)
+        observations.append(observation)
+        states.append(state)
+    rates = np.stack([env.drone(state).rates_b for state in states])
+    late = rates[np.maximum(np.arange(4) - lateness, 0)]
+    assert_allclose(np.stack(observations)[:, SHOWN] * GYRO_SCALE, late + bias, atol=1e-5)
+    assert np.abs(np.diff(rates, axis=0)).min() > 1e-3

