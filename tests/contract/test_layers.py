@@ -72,18 +72,15 @@ REPOSITORY = (PACKAGE, *CONSUMERS)
 
 def import_graph():
     """Return the modules of the repository with those that each imports anywhere in it."""
-    paths = [path for name in REPOSITORY for path in files_of(name)]
-    names = {path: ".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths}
-    modules = {path: name.removesuffix(".__init__") for path, name in names.items()}
-    known = set(modules.values())
-
-    def imported(name):
-        return next((found for found in (name, name.rpartition(".")[0]) if found in known), None)
-
-    return {
-        module: {target for name, _ in imports_of(path) if (target := imported(name))} - {module}
-        for path, module in modules.items()
-    }
+    imports = {}
+    for path in (path for name in REPOSITORY for path in files_of(name)):
+        module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        imports[module] = [name for name, _ in imports_of(path)]
+    graph = {}
+    for module, names in imports.items():
+        targets = {name if name in imports else name.rpartition(".")[0] for name in names}
+        graph[module] = (targets & imports.keys()) - {module}
+    return graph
 
 
 def test_no_modules_import_each_other_in_a_circle():

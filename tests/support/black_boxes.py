@@ -1,9 +1,5 @@
 """Black boxes of the tests: the shipped one, others, and states to fly them from."""
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,14 +31,14 @@ AIRLESS = PlantParameters(
 )
 
 
-def start(applied: Any = (0.0, 0.0, 0.0, -1.0)) -> np.ndarray:
+def start(applied=(0.0, 0.0, 0.0, -1.0)):
     """The handout's start state, 3 m up, with an applied action."""
     x = np.array(blackbox.start_vector())
     x[2], x[APPLIED_ACTION] = 3.0, applied
     return x
 
 
-def random_inputs(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def random_inputs(count, seed=0):
     """States (count, 21) all over the flight envelope and actions (count, 4)."""
     rng = np.random.default_rng(seed)
     x = rng.normal(size=(count, 21)) * np.array([*[5.0] * 3, *[8.0] * 3, *[1.0] * 15])
@@ -53,9 +49,7 @@ def random_inputs(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return x.astype(np.float32), rng.uniform(-1.0, 1.0, (count, 4)).astype(np.float32)
 
 
-def write_artifact(
-    path: Path, function: Callable[..., Any], shapes: Any = ((21,), (4,)), **options: Any
-) -> Path:
+def write_artifact(path, function, shapes=((21,), (4,)), **options):
     """Export any function as an artifact, float32 unless ``dtype`` says otherwise."""
     dtype = options.pop("dtype", jnp.float32)
     arguments = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]

@@ -1,15 +1,11 @@
 """Drones, rows of gates, and a plant that flies straight on through them."""
 
 from functools import cache
-from typing import Any
 
 import jax.numpy as jnp
 
-from flytrack_env.dynamics import ModelParameters
 from flytrack_env.env import FlyTrack
 from flytrack_env.plants import Plant
-from flytrack_env.quaternion import Scalar
-from flytrack_env.state import Action, Drone
 from flytrack_env.tracks import Gate, Track
 from tests.support.simulated_flights import drone_with
 
@@ -19,30 +15,30 @@ FACING_X = (0.5**0.5, 0.0, 0.0, -(0.5**0.5))  # yaw -90 degrees: the gate's loca
 class Coasting(Plant):
     """A plant that flies straight on at constant velocity, whatever the command."""
 
-    def reset(self, drone: Drone, model: ModelParameters) -> Drone:
+    def reset(self, drone, model):
         return drone
 
-    def step(self, state: Drone, command: Action, dt: Scalar, model: ModelParameters) -> Drone:
+    def step(self, state, command, dt, model):
         """Return the drone moved along its velocity."""
         return state._replace(pos_w=state.pos_w + state.vel_w.scale(dt))
 
-    def drone(self, state: Drone) -> Drone:
+    def drone(self, state):
         return state
 
 
 def drone_at(
-    position: Any,
-    velocity: Any = (0.0, 0.0, 0.0),
-    quat: Any = (1.0, 0.0, 0.0, 0.0),
-    battery_v: float = 23.5,
-    **fields: Any,
-) -> Drone:
+    position,
+    velocity=(0.0, 0.0, 0.0),
+    quat=(1.0, 0.0, 0.0, 0.0),
+    battery_v=23.5,
+    **fields,
+):
     """Return a drone of float32 leaves; ``fields`` replace the other parts of its state."""
     drone = drone_with(pos_w=position, vel_w=velocity, quat=quat, **fields)
     return drone._replace(battery_v=jnp.float32(battery_v))
 
 
-def track_of_row(distances: list[float]) -> Track:
+def track_of_row(distances):
     """Return a track of gates in a row along +x at these x, flown towards +x."""
     gates = tuple(Gate(i, (x, 0.0, 2.0), FACING_X, 1.0, 1.5, 2.7) for i, x in enumerate(distances))
     low, high = (min(distances) - 100.0, -50.0, 0.0), (max(distances) + 100.0, 50.0, 50.0)
@@ -50,6 +46,6 @@ def track_of_row(distances: list[float]) -> Track:
 
 
 @cache
-def coasting_env(*distances: float) -> FlyTrack:
+def coasting_env(*distances):
     """Return the environment of a drone that coasts along a row of gates."""
     return FlyTrack(track=track_of_row(list(distances)), plant=Coasting())

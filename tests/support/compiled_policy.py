@@ -2,12 +2,9 @@
 
 import ctypes
 import subprocess
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from baselines.purejaxrl_ppo.export import ExportedPolicy
 from flytrack_env.state import ACTION_SIZE, BATTERY, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 
 FLAGS = (
@@ -45,14 +42,14 @@ void lag(const float *action, float *applied) { flytrack_lag(action, applied); }
 class CompiledPolicy:
     """A header of ``export``, compiled; it is called policy.h."""
 
-    def __init__(self, header: Path):
+    def __init__(self, header):
         source, library = header.with_name("loops.c"), header.with_name("policy.so")
         source.write_text(LOOPS)
         command = ["gcc", *FLAGS, f"-I{header.parent}", str(source), "-o", str(library), "-lm"]
         subprocess.run(command, check=True)
         self.functions = ctypes.CDLL(str(library))
 
-    def act(self, states: Any, gates: Any, past: Any = ()) -> np.ndarray:
+    def act(self, states, gates, past=()):
         """Return actions (N, 4) of states (N, 21), gates (N,) and, if read, past actions (N, P)."""
         actions = np.empty((len(states), ACTION_SIZE), np.float32)
         self._call(
@@ -60,19 +57,19 @@ class CompiledPolicy:
         )
         return actions
 
-    def next_gates(self, before: Any, after: Any, gates: Any) -> np.ndarray:
+    def next_gates(self, before, after, gates):
         """Return the gates to fly, (N,), after steps from states to states, (N, 21)."""
         gates = np.array(gates, np.int32)
         self._call("advance", len(gates), np.float32(before), np.float32(after), gates)
         return gates
 
-    def lag(self, action: Any, applied: Any) -> np.ndarray:
+    def lag(self, action, applied):
         """Return the applied action, (4,), after a step."""
         applied = np.array(applied, np.float32)
         self._call("lag", np.float32(action), applied)
         return applied
 
-    def _call(self, name: str, *arguments: Any) -> None:
+    def _call(self, name, *arguments):
         kept = [
             np.ascontiguousarray(value) if np.ndim(value) else int(value) for value in arguments
         ]
@@ -83,7 +80,7 @@ class CompiledPolicy:
         getattr(self.functions, name)(*given)
 
 
-def states_in_box(policy: ExportedPolicy, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def states_in_box(policy, count, seed):
     """Return states (count, 21) and gates; observations fill the box and a fifth beyond it."""
     rng = np.random.default_rng(seed)
     gates = rng.integers(0, len(policy.centres), count)

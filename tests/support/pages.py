@@ -2,30 +2,27 @@
 
 import re
 from pathlib import Path
-from typing import Any
-
-import pytest
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
-def examples(text: str) -> str:
+def examples(text):
     """Return the Python of a page."""
     return "\n".join(code for language, code in BLOCK.findall(text) if language == "python")
 
 
-def run_examples(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+def run_examples(text, folder, monkeypatch):
     """Run a page's Python as one script in a folder and return its names."""
     (folder / "blackbox").symlink_to(ROOT / "blackbox")
     monkeypatch.chdir(folder)
-    names: dict[str, Any] = {}
+    names = {}
     exec(compile("import gymnax\n" + examples(text), "page", "exec"), names)
     return names
 
 
-def commands(text: str) -> list[str]:
+def commands(text):
     """Return the commands in a page's shell blocks, one a line, without their comments."""
     lines = [
         line

@@ -18,7 +18,7 @@ DEAD_URI = "http://127.0.0.1:9"  # the port at which nothing listens
 
 
 @cache
-def make_trainer() -> Trainer:
+def make_trainer():
     """Return the trainer, compiled once for all tests of a process."""
     # The id with the most state: another drone in every episode, sensor noise, a history of
     # commands.

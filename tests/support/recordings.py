@@ -1,13 +1,12 @@
 """Recordings read back with Rerun's own reader, and flights to record."""
 
 from collections import defaultdict
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 
-def make_sequence(steps: int) -> list[tuple[np.ndarray, np.ndarray]]:
+def make_sequence(steps):
     """Return a random flight as pairs of state (21,) and action (4,), float32."""
     rng = np.random.default_rng(7)
     states = rng.normal(size=(steps, 21))
@@ -20,39 +19,35 @@ def make_sequence(steps: int) -> list[tuple[np.ndarray, np.ndarray]]:
 class Recording:
     """A recording's rows by (entity, component); times only for what is not static."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path):
         missing = "this rerun-sdk has no reader (rerun.chunk)"
         reader = pytest.importorskip("rerun.chunk", reason=missing).RrdReader(path)
         (entry,) = reader.recordings()
         self.app_id = entry.application_id
-        self.static: dict[tuple[str, str], list] = defaultdict(list)
-        self.rows: dict[tuple[str, str], list] = defaultdict(list)
-        self.times: dict[str, list[tuple[int, int]]] = defaultdict(list)
-        self.timelines: set[str] = set()
+        self.rows, self.times = defaultdict(list), defaultdict(list)
+        self.timelines = set()
         for chunk in reader.stream().to_chunks():
             self._read(chunk)
 
-    def _read(self, chunk) -> None:
+    def _read(self, chunk):
         batch = chunk.to_record_batch()
-        indexes = {"rerun.controls.RowId", *chunk.timeline_names}
         self.timelines |= set(chunk.timeline_names)
         if not chunk.is_static:
             steps = batch.column("step").to_pylist()
             nanoseconds = batch.column("sim_time").cast("int64").to_pylist()
             self.times[chunk.entity_path] += zip(steps, nanoseconds, strict=True)
-        for name in set(batch.schema.names) - indexes:
-            rows = self.static if chunk.is_static else self.rows
-            rows[chunk.entity_path, name] += batch.column(name).to_pylist()
+        for name in set(batch.schema.names) - {"rerun.controls.RowId", *chunk.timeline_names}:
+            self.rows[chunk.entity_path, name] += batch.column(name).to_pylist()
 
-    def once(self, entity: str, component: str) -> np.ndarray:
+    def once(self, entity, component):
         """Return a static component's instances, logged exactly once."""
-        (value,) = self.static[entity, component]
+        assert not self.times[entity]
+        (value,) = self.rows[entity, component]
         return np.array(value)
 
-    def series(self, entity: str, component: str) -> np.ndarray:
+    def series(self, entity, component):
         """Return the one instance per row of a component, by steps; empty rows are left out."""
-        steps = [step for step, _ in self.times[entity]]
-        found = zip(steps, self.rows[entity, component], strict=True)
-        rows = [row for _, row in sorted(found, key=lambda pair: pair[0]) if row]
+        rows = zip(self.times[entity], self.rows[entity, component], strict=True)
+        rows = [row for _, row in sorted(rows, key=lambda pair: pair[0]) if row]
         assert {len(row) for row in rows} == {1}
         return np.array(rows)[:, 0]

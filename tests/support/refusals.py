@@ -1,18 +1,16 @@
 """Commands that run, or end with one sentence about what cannot be used."""
 
-from typing import Any
-
 import pytest
 
 from flytrack.cli import main
 
 
-def run(*words: Any) -> None:
+def run(*words):
     """Run a command."""
     main([*map(str, words)])
 
 
-def refused(capsys: pytest.CaptureFixture[str], *words: Any) -> str:
+def refused(capsys, *words):
     """Run a command that must be refused and return its message, one line."""
     capsys.readouterr()
     with pytest.raises(SystemExit, match="2"):

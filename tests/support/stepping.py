@@ -5,8 +5,6 @@ compares.
 """
 
 import sys
-from collections.abc import Callable
-from typing import Any
 
 import chex
 import gymnax
@@ -24,7 +22,7 @@ MAX_STEPS = 3  # of an episode, so that episodes end
 TOLERANCE = 1e-4  # rounding of a float32 step depends on how many environments are computed at once
 
 
-def short_episodes(env: Any) -> Any:
+def short_episodes(env):
     """Return the parameters of an environment or a race with a time limit of ``MAX_STEPS``."""
     params = env.default_params
     if hasattr(params, "max_steps_in_episode"):
@@ -33,16 +31,16 @@ def short_episodes(env: Any) -> Any:
     return params._replace(race=params.race._replace(flight=flight))
 
 
-def flight(env: Any) -> Callable[..., Any]:
+def flight(env):
     """Return a function of keys (n,), actions (n, ...) and parameters: a reset, then steps.
 
     Episodes that end are reset.
     """
 
-    def fly(keys: jax.Array, actions: jax.Array, params: Any) -> Any:
+    def fly(keys, actions, params):
         step = jax.vmap(env.step, in_axes=(0, 0, 0, None))
 
-        def advance(begun: Any, _: Any) -> Any:
+        def advance(begun, _):
             observation, state, reward, terminated, truncated, _ = step(
                 keys, begun[1], actions, params
             )
@@ -54,16 +52,14 @@ def flight(env: Any) -> Callable[..., Any]:
     return fly
 
 
-def inputs(env: Any) -> tuple[jax.Array, jax.Array, Any]:
+def inputs(env):
     """Return keys, actions and parameters for ``flight``."""
     shape = (NUM_ENVS, *env.action_space(env.default_params).shape)
     actions = jax.random.uniform(jax.random.key(1), shape, jnp.float32, minval=-1.0)
     return jax.random.split(jax.random.key(0), NUM_ENVS), actions, short_episodes(env)
 
 
-def _by_named_sharding(
-    fly: Any, keys: jax.Array, actions: jax.Array, params: Any, mesh: Mesh
-) -> Any:
+def _by_named_sharding(fly, keys, actions, params, mesh):
     placed = jax.device_put((keys, actions), NamedSharding(mesh, PartitionSpec("batch")))
     program = jax.jit(fly).lower(*placed, params).compile()
     text = program.as_text()
@@ -75,7 +71,7 @@ def _by_named_sharding(
     return flown
 
 
-def _by_shard_map(fly: Any, keys: jax.Array, actions: jax.Array, params: Any, mesh: Mesh) -> Any:
+def _by_shard_map(fly, keys, actions, params, mesh):
     batch, steps = PartitionSpec("batch"), PartitionSpec(None, "batch")
     specs = {"in_specs": (batch, batch, PartitionSpec()), "out_specs": (batch, steps)}
     return jax.jit(jax.shard_map(fly, mesh=mesh, **specs))(keys, actions, params)
@@ -84,7 +80,7 @@ def _by_shard_map(fly: Any, keys: jax.Array, actions: jax.Array, params: Any, me
 WAYS = (_by_named_sharding, _by_shard_map)
 
 
-def main(env_ids: list[str]) -> None:
+def main(env_ids):
     """Fly each id in every way; raise AssertionError if one differs from that on one device."""
     assert len(jax.devices()) == NUM_DEVICES
     mesh = Mesh(np.array(jax.devices()), ("batch",))

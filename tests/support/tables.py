@@ -2,11 +2,10 @@
 
 import tomllib
 from pathlib import Path
-from typing import Any
 
 FOLDER = Path(__file__).with_name("tables")
 
 
-def table(name: str) -> dict[str, Any]:
+def table(name):
     """Return what a file of tables has."""
     return tomllib.loads((FOLDER / f"{name}.toml").read_text(encoding="utf-8"))

@@ -1,6 +1,5 @@
 """Flights of FlyTrack in wrappers, which tests share: each environment's step is compiled once."""
 
-from collections.abc import Iterable
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -39,33 +38,33 @@ class Flight(NamedTuple):
     info: Any
 
     @property
-    def ended(self) -> np.ndarray:
+    def ended(self):
         """Whether each step ended its episode."""
         return np.asarray(self.terminated | self.truncated)
 
 
 @cache
-def wrapped(*wrappers: Any) -> Any:
+def wrapped(*wrappers):
     """Return FlyTrack in wrappers, the innermost first."""
-    env: Any = FlyTrack()
+    env = FlyTrack()
     for wrapper in wrappers:
         env = wrapper(env)
     return env
 
 
 @cache
-def resets_of(env: Any) -> Any:
+def resets_of(env):
     """Return the compiled reset of NUM_ENVS environments."""
     return jax.jit(jax.vmap(env.reset, in_axes=(0, None)))
 
 
 @cache
-def steps_of(env: Any) -> Any:
+def steps_of(env):
     """Return the compiled step, with auto-reset, of NUM_ENVS environments."""
     return jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
 
 
-def fly(env: Any, params: Any = None, actions: Any = None, **wrappers: Any) -> Flight:
+def fly(env, params=None, actions=None, **wrappers):
     """Return flights of random actions, or of given ones (T, NUM_ENVS, 4).
 
     wrappers: parameters of wrappers that are not the default ones.
@@ -84,7 +83,7 @@ def fly(env: Any, params: Any = None, actions: Any = None, **wrappers: Any) -> F
     return Flight(first, start, actions, *jax.tree.map(lambda *leaves: np.stack(leaves), *outputs))
 
 
-def arrays(params: Any) -> Any:
+def arrays(params):
     """Return parameters as float32 arrays, so that no other type compiles a step again."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)
 
@@ -96,10 +95,10 @@ ENDS = {
 }
 
 
-def before_ends(env: Any, params: Any, ends: Iterable[Any], **fields: Any) -> tuple[Any, jax.Array]:
+def before_ends(env, params, ends, **fields):
     """Return a batch of states a step before some ``ENDS``, and the actions of that step."""
 
-    def with_time(steps: int, path: Any, leaf: jax.Array) -> jax.Array:
+    def with_time(steps, path, leaf):
         return jnp.int32(steps) if getattr(path[-1], "name", "") == "time" else leaf
 
     states, actions = [], []

@@ -17,7 +17,7 @@ from flytrack.cli import main
 from flytrack_env import blackbox, make
 from flytrack_env.dynamics import lag
 from flytrack_env.observations import observe_race
-from flytrack_env.state import Action, pack, unpack, unpack_action
+from flytrack_env.state import POSITION, Action, pack, unpack, unpack_action
 from flytrack_env.wrappers import NoiseParams, ObservationNoise
 from tests.support.compiled_policy import CompiledPolicy, states_in_box
 from tests.support.evaluated import write_checkpoint
@@ -36,58 +36,49 @@ CASES = {
 }
 
 
-def acted(env, checkpoint):
+def act_in_python(env, checkpoint):
     """Return states, gates, past actions, and the policy's actions given the observations."""
     params = env.default_params
     if ObservationNoise.key in params.wrappers:
-        none = NoiseParams(*np.zeros(len(NoiseParams._fields)))
+        none = NoiseParams(0.0, 0.0, 0.0, 0.0)
         params = params.replace(wrappers={**params.wrappers, ObservationNoise.key: none})
     policy = policy_of(checkpoint, "a.safetensors")
-    past = (
-        np.random.default_rng(SEED)
-        .uniform(-1.0, 1.0, (COUNT, len(policy.past), 4))
-        .astype(np.float32)
-    )
+    states, gates = states_in_box(policy, COUNT, SEED)
+    rng = np.random.default_rng(SEED)
+    past = rng.uniform(-1.0, 1.0, (COUNT, len(policy.past), 4)).astype(np.float32)
 
+    @jax.jit
+    @jax.vmap
     def act(state, gate, past):
         begun = env.begin(unpack(state), gate, params)
         if policy.past:
             begun = begun._replace(actions=tuple(map(unpack_action, past)))
         observation = env.observe(None, begun, None, params)
-        return jnp.clip(
-            checkpoint.network.apply(checkpoint.params, observation)[0].mode(), -1.0, 1.0
-        )
+        mode = checkpoint.network.apply(checkpoint.params, observation)[0].mode()
+        return jnp.clip(mode, -1.0, 1.0)
 
-    states, gates = states_in_box(policy, COUNT, SEED)
-    return (
-        states,
-        gates,
-        past.reshape(COUNT, -1),
-        np.asarray(jax.jit(jax.vmap(act))(states, gates, past)),
-    )
+    actions = np.asarray(act(states, gates, past))
+    return {"state": states, "gate": gates, "past": past.reshape(COUNT, -1)}, actions
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
-    *told, is_float64 = CASES[case]
-    checkpoint = load_checkpoint(write_checkpoint(tmp_path / "a.safetensors", *told))
-    states, gates, past, actions = acted(make(*told[:1], track=told[1]), checkpoint)
+    env_id, track, hidden_sizes, is_float64 = CASES[case]
+    path, header = tmp_path / "a.safetensors", tmp_path / "policy.h"
+    checkpoint = load_checkpoint(write_checkpoint(path, env_id, track, hidden_sizes))
+    inputs, actions = act_in_python(make(env_id, track=track), checkpoint)
     assert np.ptp(actions, axis=0).min() > 0.01, "actions that differ"
 
-    header = tmp_path / "policy.h"
     header.write_text("old")
-    main(["export", str(tmp_path / "a.safetensors"), "--c", str(header)])
+    main(["export", str(path), "--c", str(header)])
     assert f"{header}: {header.stat().st_size} bytes" in capsys.readouterr().out
     if shutil.which("gcc") is not None:
+        states, *others = inputs.values()
         compiled = CompiledPolicy(header)
-        assert_allclose(compiled.act(states, gates, past), actions, rtol=0.0, atol=LARGEST)
-        assert np.isnan(compiled.act(states * np.nan, gates, past)).all()
-
-    flags = ["--float64"] * is_float64
-    found = act_by_onnx(
-        tmp_path / "a.safetensors", flags, {"state": states, "gate": gates, "past": past}
-    )
-    assert_allclose(found, actions, rtol=0.0, atol=LARGEST)
+        assert_allclose(compiled.act(states, *others), actions, rtol=0.0, atol=LARGEST)
+        assert np.isnan(compiled.act(states * np.nan, *others)).all()
+    onnx_actions = act_by_onnx(path, ["--float64"] * is_float64, inputs)
+    assert_allclose(onnx_actions, actions, rtol=0.0, atol=LARGEST)
 
 
 def act_by_onnx(checkpoint, flags, inputs):
@@ -154,24 +145,20 @@ def test_a_header_counts_gates_and_lags_as_the_environment_does(tmp_path):
     main(["export", str(tmp_path / "a.safetensors"), "--c", str(tmp_path / "policy.h")])
     compiled = CompiledPolicy(tmp_path / "policy.h")
     params = make("FlyTrack-v0", track="split_s").default_params
-    gates = params.course.gates
+    gates, count = params.course.gates, np.arange(params.course.num_gates)
     centres, forward, up = (
         np.stack(axis, axis=-1) for axis in (gates.centre, gates.forward, gates.up)
     )
-    count = np.arange(len(centres))
-    for ahead, aside, is_pass in (
-        (1.0, 0.0, True),
-        (1.0, 0.5, True),
-        (1.0, 0.7, False),
-        (-1.0, 0.0, False),
-    ):
-        ends = [np.zeros((len(count), 21)) for _ in range(2)]
-        for end, sign in zip(ends, (-ahead, ahead), strict=True):
-            end[:, :3] = centres + sign * forward + aside * up
-        assert_array_equal(compiled.next_gates(*ends, count), (count + is_pass) % len(count))
+    cases = ((1.0, 0.0, True), (1.0, 0.5, True), (1.0, 0.7, False), (-1.0, 0.0, False))
+    for ahead, aside, is_pass in cases:
+        before, after = np.zeros((2, len(count), 21))
+        before[:, POSITION] = centres - ahead * forward + aside * up
+        after[:, POSITION] = centres + ahead * forward + aside * up
+        expected = (count + is_pass) % len(count)
+        assert_array_equal(compiled.next_gates(before, after, count), expected)
     action, applied = np.array([1.0, -1.0, 0.5, 0.2]), np.array([0.0, 0.3, -0.5, 1.0])
-    wanted = lag(unpack_action(applied), Action(*action), 0.01, params.model.tau)
-    assert_allclose(compiled.lag(action, applied), wanted, atol=LARGEST_LAG)
+    expected = lag(unpack_action(applied), Action(*action), 0.01, params.model.tau)
+    assert_allclose(compiled.lag(action, applied), expected, atol=LARGEST_LAG)
 
 
 def test_observations_that_cannot_be_exported_are_told(tmp_path, monkeypatch, capsys):

@@ -1,6 +1,7 @@
 """Flying by hand: keys and axes, laps and gaps, the ghost, the rollout, and refusals."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -41,12 +42,14 @@ def display(monkeypatch):
 
 @pytest.fixture
 def pad(monkeypatch):
-    methods = {"get_axis": 0.0, "get_numaxes": 6, "get_instance_id": 7, "get_name": "Pad"}
-    joystick = type(
-        "Joystick", (), {name: lambda *_, value=value: value for name, value in methods.items()}
+    joystick = SimpleNamespace(
+        get_axis=lambda number: 0.0,
+        get_numaxes=lambda: 6,
+        get_instance_id=lambda: 7,
+        get_name=lambda: "Pad",
     )
     monkeypatch.setattr(pygame.joystick, "get_count", lambda: 1)
-    monkeypatch.setattr(pygame.joystick, "Joystick", lambda number: joystick())
+    monkeypatch.setattr(pygame.joystick, "Joystick", lambda number: joystick)
 
 
 @pytest.fixture(scope="module")
@@ -99,26 +102,22 @@ def test_a_gamepad_that_replays_the_optimum_times_its_lap(session, display, pad,
             battery_v = float(session.now.log.rows[-1, BATTERY])
             hover = hover_action(MODEL.thrust_coeffs, MODEL.m * MODEL.g, battery_v)
             throttle = (command[3] - hover) / (1.0 - hover if command[3] > hover else 1.0 + hover)
-            for axis, value in zip(
-                (3, 4, 0, 1), (command[0], *-command[1:3], -throttle), strict=True
-            ):
+            values = {3: command[0], 4: -command[1], 0: -command[2], 1: -throttle}
+            for axis, value in values.items():
                 post(pygame.JOYAXISMOTION, instance_id=7, axis=axis, value=value)
         return 0.01
 
     monkeypatch.setattr(play, "make_renderer", lambda course, gate_ids: Renderer())
     pygame.display.init()
-    play.play(
-        session, play.Controls(Gamepad(0, deadzone=0.0, expo=0.0)), lambda picture: None, tick
-    )
+    controls = play.Controls(Gamepad(0, deadzone=0.0, expo=0.0))
+    play.play(session, controls, lambda picture: None, tick)
     flight = session.now
-    assert flight.num_gates == 8 and flight.lap_times_s == pytest.approx(
-        [STANDING.time_s], abs=1e-3
-    )
+    assert flight.num_gates == 8
+    assert flight.lap_times_s == pytest.approx([STANDING.time_s], abs=1e-3)
     assert seen[0].startswith("W, or throttle up") and "best 3.88 s" in seen[-1]
     for gate in TRACK.gates:
-        assert any(
-            re.search(rf"gate {gate.id}: .0.00 s to the time-optimal", notes) for notes in seen
-        )
+        gap = f"gate {gate.id}: .0.00 s to the time-optimal"
+        assert any(re.search(gap, notes) for notes in seen)
     (lap,) = cut_laps(np.asarray(flight.rollout()[0], float), TRACK)
     assert_allclose(lap.gate_times_s, GHOST.first.gate_times_s, atol=1e-3)
 
@@ -166,21 +165,24 @@ def test_the_picture_shows_the_ghost_and_looks_where_the_nose_points(session):
     assert_allclose(forward_w[:2], (-1.0, 0.0), atol=0.02)
 
 
-def test_sticks_steps_and_ghosts():
+def test_keys_move_sticks_steadily_and_gamepads_by_their_curve():
     pulls, sticks = np.array([-1.0, 0.0, 1.0, 0.0]), np.zeros(4)
-    for is_full, pulled, expected in (
-        (0, pulls, [-0.4, 0, 1, 0]),
-        (1, pulls, pulls),
-        (0, 0 * UP, 0 * UP),
-    ):
+    gentle = [-0.4, 0.0, 1.0, 0.0]
+    for is_full, pulled, expected in ((0, pulls, gentle), (1, pulls, pulls), (0, 0 * UP, 0 * UP)):
         for _ in range(50):
             before, sticks = sticks, move_by_keys(sticks, pulled, bool(is_full), 0.01)
             assert np.abs(sticks - before).max() < 0.07
         assert_allclose(sticks, expected, atol=1e-9)
-    values = [
-        Gamepad(expo=0.5, deadzone=0.1).sticks(np.full(4, value)) for value in (0.1, -0.55, 1.0)
-    ]
-    assert_allclose(values, [[0.0] * 4, [-0.3125, 0.3125, 0.3125, 0.5], [1.0, -1.0, -1.0, -1.0]])
+    pad = Gamepad(expo=0.5, deadzone=0.1)
+    for value, expected in (
+        (0.1, np.zeros(4)),
+        (-0.55, [-0.3125, 0.3125, 0.3125, 0.5]),
+        (1.0, [1.0, -1.0, -1.0, -1.0]),
+    ):
+        assert_allclose(pad.sticks(np.full(4, value)), expected)
+
+
+def test_steps_and_ghosts_follow_the_clock():
     assert steps_due(0.004, 0.017, 0.01) == (2, pytest.approx(0.001))
     assert steps_due(0.0, 5.0, 0.01)[0] == 10, "a late picture is not made up for"
     assert_allclose(GHOST.state_at(0, 1.0), STANDING.states[100], atol=1e-6)

@@ -60,13 +60,19 @@ def test_every_number_of_the_parameters_has_a_range():
 
 def test_courses_that_cannot_be_flown():
     course = PARAMS.course
-    one = course._replace(gates=jax.tree.map(lambda leaf: leaf[:1], course.gates))
-    far = course._replace(bounds_high=course.bounds_high._replace(y=np.float32(np.inf)))
-    crooked = course._replace(start_quat=course.start_quat._replace(w=np.float32(0.01)))
+    single = jax.tree.map(lambda leaf: leaf[:1], course.gates)
+    far = course.bounds_high._replace(y=np.float32(np.inf))
+    crooked = course.start_quat._replace(w=np.float32(0.01))
     cases = (
-        (one, r"course\.gates: found 1, expected at least 2"),
-        (far, r"course\.bounds_high\.y: found inf, expected finite numbers within \+-1e\+06"),
-        (crooked, r"course\.start_quat: found norm 1\.0000\d+, expected 1"),
+        (course._replace(gates=single), r"course\.gates: found 1, expected at least 2"),
+        (
+            course._replace(bounds_high=far),
+            r"course\.bounds_high\.y: found inf, expected finite numbers within \+-1e\+06",
+        ),
+        (
+            course._replace(start_quat=crooked),
+            r"course\.start_quat: found norm 1\.0000\d+, expected 1",
+        ),
     )
     for wrong, reason in cases:
         with pytest.raises(ValueError, match=reason):

@@ -9,39 +9,19 @@ from flytrack_env import rewards
 from flytrack_env.env import FlyTrack
 from flytrack_env.quaternion import Vec3
 from flytrack_env.rewards import TERMS, RewardWeights, Transition, total_reward
-from flytrack_env.state import Action
 from tests.support.coasting import coasting_env, drone_at
+from tests.support.tables import table
 
 
 def make_transition(before=None, after=None, **fields):
     """Return a still transition 5 m before a gate, with some parts replaced."""
-    still = {
-        "gate_centre_w": Vec3(*map(jnp.float32, (1.0, 2.0, 3.0))),
-        "num_passed": jnp.int32(0),
-        "offset": jnp.float32(0.5),
-        "is_terminated": jnp.asarray(False),
-    }
+    still = {"num_passed": 0, "offset": 0.5, "is_terminated": False}
     drones = [drone_at(**{"position": (-4.0, 2.0, 3.0), **(d or {})}) for d in (before, after)]
-    return Transition(*drones, **{**still, **fields})
+    events = jax.tree.map(jnp.asarray, {**still, **fields})
+    return Transition(*drones, gate_centre_w=Vec3(*map(jnp.float32, (1.0, 2.0, 3.0))), **events)
 
 
-PASSED = {"num_passed": jnp.int32(1)}
-CASES = [
-    ("progress", {"after": {"position": (-3.0, 2.0, 3.0)}}, 1.0),
-    ("progress", {"after": {"position": (-5.0, 2.0, 3.0)}}, -1.0),
-    ("progress", {"after": {"position": (1.0, 6.0, 6.0)}}, 0.0),
-    ("progress", {"after": {"position": (1.0, 2.0, 3.0)}}, 5.0),
-    ("gate_pass", PASSED, 1.0),
-    ("gate_pass", {"num_passed": jnp.int32(2)}, 2.0),
-    ("off_centre", PASSED, 0.25),
-    ("off_centre", {**PASSED, "offset": jnp.float32(1.0)}, 1.0),
-    ("off_centre", {**PASSED, "offset": jnp.float32(0.0)}, 0.0),
-    ("termination", {"is_terminated": jnp.asarray(True)}, 1.0),
-    ("body_rates", {"after": {"rates_b": Vec3(1.0, -2.0, 3.0)}}, 14.0),
-    ("body_rates", {"before": {"rates_b": Vec3(1.0, -2.0, 3.0)}}, 0.0),
-    ("action_change", {"after": {"applied": Action(0.1, -0.2, 0.3, -0.4)}}, 0.3),
-    ("action_change", {"before": {"applied": Action(1.0, 1.0, 1.0, 1.0)}}, 4.0),
-]
+CASES = table("rewards")["terms"]
 STILL = [(name, {}, 0.0) for name in RewardWeights._fields]
 
 
