@@ -14,16 +14,16 @@ ENV = JaxMarlRace(flytrack_env.make_race("FlyTrackRace-v0", 3))
 
 def test_it_is_an_environment_of_jaxmarl():
     assert isinstance(ENV, MultiAgentEnv) and len(ENV.agents) == ENV.num_agents == 3
-    for agent in ENV.agents:
-        for space in (ENV.observation_space(agent), ENV.action_space(agent)):
-            assert isinstance(space, Space)
     observations, state = ENV.reset(jax.random.key(0))
-    assert all(ENV.observation_space(agent).contains(observations[agent]) for agent in ENV.agents)
-    again = ENV.get_obs(state)
-    assert all(jnp.allclose(again[agent], observations[agent], atol=2e-5) for agent in ENV.agents)
-    actions = {agent: ENV.action_space(agent).sample(jax.random.key(1)) for agent in ENV.agents}
-    observations, _, rewards, dones, infos = ENV.step(jax.random.key(2), state, actions)
-    assert all(ENV.observation_space(agent).contains(observations[agent]) for agent in ENV.agents)
+    again, actions = ENV.get_obs(state), {}
+    for agent in ENV.agents:
+        assert isinstance(ENV.observation_space(agent), Space)
+        actions[agent] = ENV.action_space(agent).sample(jax.random.key(1))
+        assert jnp.allclose(again[agent], observations[agent], atol=2e-5)
+    after, _, rewards, dones, infos = ENV.step(jax.random.key(2), state, actions)
+    for agent in ENV.agents:
+        assert ENV.observation_space(agent).contains(observations[agent])
+        assert ENV.observation_space(agent).contains(after[agent])
     assert set(rewards) == set(ENV.agents) and set(dones) == {*ENV.agents, "__all__"}
     assert infos["rank"].shape == (3,) and ENV.get_avail_actions(state)["drone_0"].all()
 

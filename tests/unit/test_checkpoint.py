@@ -18,6 +18,7 @@ from baselines.purejaxrl_ppo.checkpoint import (
 )
 from flytrack_env import FlyTrack
 from flytrack_env.observations import OBSERVATION_SIZE
+from tests.support.tables import table
 
 CONFIG = Config(hidden_sizes=(8,))
 DESCRIPTION = {
@@ -105,23 +106,7 @@ def test_every_flipped_bit_is_noticed(path):
             load_checkpoint(path)
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "reason"),
-    [
-        ("factor", np.nan, "not finite"),
-        ("config", {"hidden_sizes": [9]}, r"found 'float32 of shape \(8,\)', expected .*\(9,\)"),
-        ("config", {"memory_size": 8}, r"found nothing, expected 'float32 of shape "),
-        ("format", "flytrack-ppo-9", "format: found 'flytrack-ppo-9', expected 'flytrack-ppo-3'"),
-        (
-            "observation_size",
-            10**12,
-            r"observation_size: found 1000000000000, expected a whole number .*up to 65536",
-        ),
-        ("config", [1, 2], "config: found .*, expected a table of fields"),
-        ("config", {"num_minibatches": 7}, "num_minibatches: found 7, expected a divisor"),
-        ("missed_gate", None, "missed_gate: found None"),
-    ],
-)
+@pytest.mark.parametrize(("name", "value", "reason"), table("checkpoints")["refused"])
 def test_descriptions_that_cannot_be_used_are_refused(path, params, name, value, reason):
     arrays = {f"policy.{key}": array for key, array in as_named_arrays(params).items()}
     if name == "factor":

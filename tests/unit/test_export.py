@@ -16,7 +16,6 @@ from baselines.purejaxrl_ppo.flights import start_pose_params
 from flytrack.cli import main
 from flytrack_env import blackbox, make
 from flytrack_env.dynamics import lag
-from flytrack_env.observations import observe_race
 from flytrack_env.state import POSITION, Action, pack, unpack, unpack_action
 from flytrack_env.wrappers import NoiseParams, ObservationNoise
 from tests.support.compiled_policy import CompiledPolicy, states_in_box
@@ -25,7 +24,7 @@ from tests.support.pages import ROOT
 from tests.support.refusals import refused
 
 SEED, COUNT = 5, 200
-LARGEST, LARGEST_LAG, LARGEST_FLOAT64 = 1e-5, 1e-6, 1e-7
+MAX_ERROR, MAX_LAG_ERROR, MAX_FLOAT64_ERROR = 1e-5, 1e-6, 1e-7
 CHAMPIONS = ROOT / "baselines" / "purejaxrl_ppo" / "champion"
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
 # Environment id, track, hidden layers, and whether the ONNX file is float64 inside.
@@ -36,12 +35,15 @@ CASES = {
 }
 
 
-def act_in_python(env, checkpoint):
+def act_in_python(env, checkpoint, dtype=np.float32):
     """Return states, gates, past actions, and the policy's actions given the observations."""
     params = env.default_params
     if ObservationNoise.key in params.wrappers:
         none = NoiseParams(0.0, 0.0, 0.0, 0.0)
         params = params.replace(wrappers={**params.wrappers, ObservationNoise.key: none})
+    params, weights = jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, dtype), (params, checkpoint.params)
+    )
     policy = policy_of(checkpoint, "a.safetensors")
     states, gates = states_in_box(policy, COUNT, SEED)
     rng = np.random.default_rng(SEED)
@@ -54,10 +56,9 @@ def act_in_python(env, checkpoint):
         if policy.past:
             begun = begun._replace(actions=tuple(map(unpack_action, past)))
         observation = env.observe(None, begun, None, params)
-        mode = checkpoint.network.apply(checkpoint.params, observation)[0].mode()
-        return jnp.clip(mode, -1.0, 1.0)
+        return jnp.clip(checkpoint.network.apply(weights, observation)[0].mode(), -1.0, 1.0)
 
-    actions = np.asarray(act(states, gates, past))
+    actions = np.asarray(act(states.astype(dtype), gates, past))
     return {"state": states, "gate": gates, "past": past.reshape(COUNT, -1)}, actions
 
 
@@ -75,10 +76,10 @@ def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
     if shutil.which("gcc") is not None:
         states, *others = inputs.values()
         compiled = CompiledPolicy(header)
-        assert_allclose(compiled.act(states, *others), actions, rtol=0.0, atol=LARGEST)
+        assert_allclose(compiled.act(states, *others), actions, rtol=0.0, atol=MAX_ERROR)
         assert np.isnan(compiled.act(states * np.nan, *others)).all()
     onnx_actions = act_by_onnx(path, ["--float64"] * is_float64, inputs)
-    assert_allclose(onnx_actions, actions, rtol=0.0, atol=LARGEST)
+    assert_allclose(onnx_actions, actions, rtol=0.0, atol=MAX_ERROR)
 
 
 def act_by_onnx(checkpoint, flags, inputs):
@@ -95,23 +96,11 @@ def act_by_onnx(checkpoint, flags, inputs):
 
 def test_a_float64_file_acts_as_the_policy_in_float64(tmp_path):
     path = write_checkpoint(tmp_path / "a.safetensors", "FlyTrack-v0", "flytrack", (8, 5))
-    checkpoint = load_checkpoint(path)
-    params = make("FlyTrack-v0").default_params
-    states, gates = states_in_box(policy_of(checkpoint, path.name), COUNT, SEED)
+    checkpoint, env = load_checkpoint(path), make("FlyTrack-v0")
     with jax.enable_x64(True):
-        trees = checkpoint.params, params.course
-        weights, course = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), trees)
-
-        @jax.jit
-        @jax.vmap
-        def act(state, gate):
-            frames = course.gate(gate), course.gate(course.next_index(gate))
-            observation = jnp.stack(observe_race(unpack(state), *frames, params.model.battery))
-            return jnp.clip(checkpoint.network.apply(weights, observation)[0].mode(), -1.0, 1.0)
-
-        actions = np.asarray(act(states.astype(np.float64), gates))
-    found = act_by_onnx(path, ["--float64"], {"state": states, "gate": gates})
-    assert_allclose(found, actions, rtol=0.0, atol=LARGEST_FLOAT64)
+        inputs, actions = act_in_python(env, checkpoint, np.float64)
+    onnx_actions = act_by_onnx(path, ["--float64"], inputs)
+    assert_allclose(onnx_actions, actions, rtol=0.0, atol=MAX_FLOAT64_ERROR)
 
 
 @needs_gcc
@@ -158,7 +147,7 @@ def test_a_header_counts_gates_and_lags_as_the_environment_does(tmp_path):
         assert_array_equal(compiled.next_gates(before, after, count), expected)
     action, applied = np.array([1.0, -1.0, 0.5, 0.2]), np.array([0.0, 0.3, -0.5, 1.0])
     expected = lag(unpack_action(applied), Action(*action), 0.01, params.model.tau)
-    assert_allclose(compiled.lag(action, applied), expected, atol=LARGEST_LAG)
+    assert_allclose(compiled.lag(action, applied), expected, atol=MAX_LAG_ERROR)
 
 
 def test_observations_that_cannot_be_exported_are_told(tmp_path, monkeypatch, capsys):

@@ -44,14 +44,13 @@ def top_view_pixel(renderer, position):
 
 def test_top_view_shows_trail_drone_and_the_next_gate_where_they_are():
     renderer = make_renderer(COURSE, range(COURSE.num_gates))
-    rows, log = [], FlightLog(0.01)  # from the start pose through gate 0, ever faster
-    for share in np.linspace(0.0, 1.0, 60):
-        position, velocity = (18.6 - 9.0 * share, 2.0, 0.3 + share), (-20.0 * share, 0.0, 0.0)
-        rows.append(np.zeros(SCENE_SIZE, np.float32))
-        rows[-1][POSITION], rows[-1][VELOCITY] = position, velocity
-        rows[-1][QUATERNION], rows[-1][BATTERY] = (0.0, 0.0, 0.0, 1.0), 23.5
-        rows[-1][GATE_INDEX] = share > 0.7
-        log.append(rows[-1])
+    log, share = FlightLog(0.01), np.linspace(0.0, 1.0, 60)
+    rows = np.zeros((60, SCENE_SIZE), np.float32)
+    rows[:, 0], rows[:, 1], rows[:, 2] = 18.6 - 9.0 * share, 2.0, 0.3 + share  # through gate 0
+    rows[:, VELOCITY.start] = -20.0 * share
+    rows[:, QUATERNION.stop - 1], rows[:, BATTERY], rows[:, GATE_INDEX] = 1.0, 23.5, share > 0.7
+    for row in rows:
+        log.append(row)
     picture = renderer.draw(log)
     assert distance_to(picture[top_view_pixel(renderer, rows[-1][POSITION])], scene.DRONE) < 40
     for row in (rows[18], rows[35]):

@@ -16,10 +16,6 @@ def make_flight(steps):
     return tuple(map(np.stack, zip(*make_sequence(steps), strict=True)))
 
 
-def without_rate_actions(states):
-    return np.delete(states, (16, 17, 18), axis=1)
-
-
 @pytest.mark.parametrize("steps", [1, 300])
 def test_round_trip_is_exact(tmp_path, steps):
     states, actions = make_flight(steps)
@@ -96,29 +92,23 @@ def test_bad_files_are_refused_before_memory_is_allocated(tmp_path, reason):
         tracemalloc.stop()
 
 
-def test_short_rows_lack_the_applied_rate_actions(tmp_path):
-    """[position, velocity, acceleration, quaternion, rates, previous thrust, battery | u]."""
-    states, actions = make_flight(6)
-    np.save(tmp_path / "flight.npy", np.hstack([without_rate_actions(states), actions]))
-    found = load_rollout(tmp_path / "flight.npy")
-    states[:, 16:19] = np.nan
-    assert_array_equal(found[0], states)
-    assert_array_equal(found[1], actions)
-
-
 @pytest.mark.parametrize("is_short", [False, True])
-@pytest.mark.parametrize("columns", [False, True])
-def test_pickled_pairs_are_read_only_if_allowed(tmp_path, columns, is_short):
+@pytest.mark.parametrize("layout", ["rows", "pairs", "columns"])
+def test_layouts_are_read_and_pickles_only_if_allowed(tmp_path, layout, is_short):
+    """Short rows lack the applied rate actions."""
     path, (states, actions) = tmp_path / "flight.npy", make_flight(5)
-    rows = without_rate_actions(states) if is_short else states
-    pairs = pairs_of(*zip(rows, actions, strict=True))
-    if columns:
-        pairs = np.stack([pairs_of(*rows), pairs_of(*actions)], axis=1)
-    np.save(path, pairs, allow_pickle=True)
-    with pytest.raises(RolloutError, match=r"found pickled objects.* only if allowed"):
-        load_rollout(path)
+    rows = np.delete(states, (16, 17, 18), axis=1) if is_short else states
+    layouts = {
+        "rows": np.hstack([rows, actions]),
+        "pairs": pairs_of(*zip(rows, actions, strict=True)),
+        "columns": np.stack([pairs_of(*rows), pairs_of(*actions)], axis=1),
+    }
+    np.save(path, layouts[layout], allow_pickle=True)
+    if layout != "rows":
+        with pytest.raises(RolloutError, match=r"found pickled objects.* only if allowed"):
+            load_rollout(path)
     if is_short:
         states[:, 16:19] = np.nan
-    found = load_rollout(path, allow_pickle=True)
-    assert_array_equal(found[0], states)
-    assert_array_equal(found[1], actions)
+    read_states, read_actions = load_rollout(path, allow_pickle=layout != "rows")
+    assert_array_equal(read_states, states)
+    assert_array_equal(read_actions, actions)

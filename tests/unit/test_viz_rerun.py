@@ -166,32 +166,27 @@ def test_passes_laps_events_and_table_are_the_races(tmp_path):
     )
 
 
-def test_command_shows_rollouts_beside_the_ghost(tmp_path, capsys):
+def test_command_shows_rollouts_and_pickles_beside_the_ghost(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    pairs = np.empty((20, 2), object)
+    for step in range(20):
+        pairs[step] = STATES[step], ACTIONS[step]
     for folder in ("a", "b"):
-        (tmp_path / folder).mkdir()
-        save_rollout(tmp_path / folder / "flight.npy", STATES[:20], ACTIONS[:20])
-    files = [str(tmp_path / folder / "flight.npy") for folder in ("a", "b")]
-    main(["show", *files, "--out", str(tmp_path / "out"), "--ghost"])
-    said, out = capsys.readouterr().out.splitlines(), tmp_path / "out/flights.rrd"
-    assert said[0] == "shown: a_flight, b_flight, time-optimal, 20 steps on flytrack"
-    assert said[1] == f"{out}: {out.stat().st_size} bytes"
+        Path(folder).mkdir()
+    save_rollout("a/flight.npy", STATES[:20], ACTIONS[:20])
+    np.save("b/flight.npy", pairs, allow_pickle=True)
+    main(["show", "a/flight.npy", "b/flight.npy", "--allow-pickle", "--ghost"])
+    lines, out = capsys.readouterr().out.splitlines(), Path("runs/show/flights.rrd")
+    assert lines[0] == "shown: a_flight, b_flight, time-optimal, 20 steps on flytrack"
+    assert lines[1] == f"{out}: {out.stat().st_size} bytes"
     views = [f"{name}_flight_{view}.png" for name in "ab" for view in ("top", "side", "commands")]
     pictures = [*views, "comparison_top.png"]
-    assert [Path(line.split(":")[0]).name for line in said[2:]] == pictures
-    assert all((tmp_path / "out" / name).read_bytes().startswith(b"\x89PNG") for name in pictures)
-    found = Recording(out)
-    (table,) = found.once("/about", "TextDocument:text")
+    assert [Path(line.split(":")[0]).name for line in lines[2:]] == pictures
+    assert all(out.with_name(name).read_bytes().startswith(b"\x89PNG") for name in pictures)
+    recording = Recording(out)
+    (table,) = recording.once("/about", "TextDocument:text")
     names = [line.split("|")[1].strip() for line in table.splitlines()[2:]]
     assert names == ["a_flight", "b_flight", "time-optimal"]
-    ghost = found.series("/world/flights/time-optimal/drone", "Transform3D:translation")
-    assert_allclose(ghost, STATES[:20, POSITION], rtol=1e-6)
-
-
-def test_command_reads_pickles_if_allowed(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    pairs = np.empty((30, 2), object)
-    for step, pair in enumerate(make_sequence(30)):
-        pairs[step] = pair
-    np.save("pickled.npy", pairs, allow_pickle=True)
-    main(["show", "pickled.npy", "--allow-pickle"])
-    assert Path("runs/show/flights.rrd").exists()
+    for drone in ("drone", "flights/b_flight/drone", "flights/time-optimal/drone"):
+        positions = recording.series(f"/world/{drone}", "Transform3D:translation")
+        assert_allclose(positions, STATES[:20, POSITION], rtol=1e-6)
