@@ -82,7 +82,7 @@ def optimise(track: Track, kind: str, model: ModelParameters, model_name: str) -
     params = env.default_params
     dt_s, start = float(params.dt), start_state(track, layout.BATTERY_FULL_V)
     task = Task(kind, params.course, float(params.drone_radius), start)
-    optimum = find_optimum(task, drained_in_float32(model, start, dt_s), dt_s)
+    flight, how = find_optimum(task, drained_in_float32(model, start, dt_s), dt_s)
     about = {
         "command": report.command_line(),
         "casadi": casadi.__version__,
@@ -100,11 +100,11 @@ def optimise(track: Track, kind: str, model: ModelParameters, model_name: str) -
         model_name=model_name,
         model=model,
         dt_s=dt_s,
-        time_s=float(optimum.gate_times_s[-1]),
-        states=optimum.flight.states,
-        commands=optimum.flight.commands,
-        gate_times_s=optimum.gate_times_s,
-        found=optimum.found | about,
+        time_s=float(flight.gate_times_s[-1]),
+        states=flight.states,
+        commands=flight.commands,
+        gate_times_s=flight.gate_times_s,
+        found=how | about,
     )
 
 
