@@ -22,7 +22,6 @@ import flytrack_env
 from baselines.purejaxrl_ppo import Checkpoint, flights, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint_env import simulated_env
 from benchmarks import report
-from benchmarks.log_faults import fault_table
 from flytrack_env import ModelParameters
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import ACCELERATION, APPLIED_ACTION, BATTERY, QUATERNION, unpack_action
@@ -306,7 +305,6 @@ def main(timesteps: int = 10_000_000, seed: int = 0) -> None:
         timesteps=f"{timesteps / 1e6:g}",
         full=f"{100.0 * full:.2f}",
         hover=f"{hover:.4f}",
-        faults=fault_table(),
     )
 
 

@@ -11,22 +11,22 @@ the same commit; --page writes docs/results/beyond.md, of the last lines of each
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from benchmarks import hidden, report
-from benchmarks.diagnosis import model_of
+from benchmarks.diagnosis import model_of, round_values
 from benchmarks.hidden.oracle import removed
+from benchmarks.real.crafts import CRAFTS
 from benchmarks.real.section import formulas_of
+from benchmarks.real_logs import record_path
 from flytrack_sysid.diagnosis import diagnose
 from flytrack_sysid.log import FlightLog
 
 LINES = report.RESULTS / "beyond.jsonl"
-REAL = report.ROOT / "benchmarks" / "data" / "real"  # `python -m benchmarks.real_logs --diagnose`
 SEED, SECONDS = 67, 60.0  # rules were looked at on seeds 7, 41, 43, 47, 53, 59 and 61
 # On the page: no rule was made on these laws, and none on plants without a law of two seeds more.
 SEEDS_OF_LAWS = (61, SEED)
@@ -47,7 +47,15 @@ RIGHT: dict[str, tuple[set[str], set[str]]] = {
 }
 LOAD = "payload"  # swings on a string, for which the grammar has no term
 KINDS = (*RIGHT, LOAD)
-Trial = tuple[str, int]
+Line = dict[str, Any]
+
+
+class Trial(NamedTuple):
+    """One plant: a kind of law, clean or listed; its number and the seed."""
+
+    row: str
+    number: int
+    seed: int = SEED
 
 
 def truth_of(row: str, rng: np.random.Generator) -> hidden.Truth:
@@ -62,87 +70,74 @@ def truth_of(row: str, rng: np.random.Generator) -> hidden.Truth:
     )
 
 
-def flown_plant(row: str, number: int) -> tuple[hidden.Truth, FlightLog, np.random.Generator]:
+def flown_plant(trial: Trial) -> tuple[hidden.Truth, FlightLog, np.random.Generator]:
     """Return one plant, a measured flight of it, and what draws more of them."""
-    rng = np.random.default_rng([SEED, number, sorted([*KINDS, "clean", "listed"]).index(row)])
+    row, number, seed = trial
+    rng = np.random.default_rng([seed, number, sorted([*KINDS, "clean", "listed"]).index(row)])
     truth = replace(truth_of(row, rng), motion=hidden.MOTIONS[number % len(hidden.MOTIONS)])
     return truth, hidden.measure(hidden.fly(truth, SECONDS, rng), "sensors", rng), rng
 
 
-def plant(row: str, number: int) -> dict[str, Any]:
+def plant(trial: Trial) -> Line:
     """Return what was learnt of one plant, graded."""
-    truth, log, rng = flown_plant(row, number)
+    truth, log, rng = flown_plant(trial)
     started_s = time.process_time()
-    found = diagnose(log, model_of(truth))
-    line: dict[str, Any] = {
+    diagnosis = diagnose(log, model_of(truth))
+    line: Line = {
         "truth": truth.text(),
         "motion": truth.motion,
-        "found_motion": found.extended.motion.value,
-        "verdict": found.verdict,
-        "causes": [one.effect for one in found.causes],
-        "unexplained": {name: round(size, 3) for name, size in found.unexplained.shares.items()},
+        "found_motion": diagnosis.extended.motion.value,
+        "verdict": diagnosis.verdict,
+        "causes": [cause.effect for cause in diagnosis.causes],
+        "unexplained": round_values(diagnosis.unexplained.shares),
         "law": [],
         "cpu_s": round(time.process_time() - started_s, 1),
     }
-    learned = found.learned
+    learned = diagnosis.learned
     if learned is not None:
-        line["law"] = [one.text() for one in learned.law.terms]
-        if row in RIGHT:
-            quantities = {one.quantity for one in learned.law.terms[0].factors}
-            shapes = {one.shape for one in learned.law.terms[0].factors}
-            line["is_variable"] = bool(quantities & RIGHT[row][0])
-            line["is_form"] = line["is_variable"] and bool(shapes & RIGHT[row][1])
+        terms = learned.law.terms
+        line["law"] = [term.text() for term in terms]
+        if trial.row in RIGHT:
+            quantities, shapes = RIGHT[trial.row]
+            factors = terms[0].factors
+            line["is_variable"] = any(factor.quantity in quantities for factor in factors)
+            is_shape = any(factor.shape in shapes for factor in factors)
+            line["is_form"] = line["is_variable"] and is_shape
         clean = hidden.fly(truth, SECONDS, rng)
         neutral = learned.effect._replace(scale=0.0)
-        share, size = removed(clean, found.base.with_effects(neutral), found.extended)
+        share, size = removed(clean, diagnosis.base.with_effects(neutral), diagnosis.extended)
         line["removed"] = [round(share, 4), round(size, 4)]
     return line
 
 
-def run(trials: Sequence[Trial]) -> None:
-    """Diagnose what has no line of this commit yet, and append the lines."""
-    commit = report.commit_of_checkout()
-    done = {(line["row"], line["number"]) for line in report.lines_of_commit(LINES, commit)}
-    left = [one for one in trials if one not in done]
-    for place, (row, number) in enumerate(report.progress(left, "plants")):
-        if place % PLANTS_A_CACHE == 0:
-            jax.clear_caches()
-        line = {"row": row, "number": number, "seed": SEED, "commit": commit}
-        try:
-            line |= plant(row, number)
-        except Exception as error:  # a crash is a result too, and the others go on
-            line["error"] = f"{type(error).__name__}: {error}"
-        report.append_line(LINES, line)
-
-
-def figures(lines: Sequence[dict[str, Any]]) -> list[report.Figure]:
+def figures(lines: Sequence[Line]) -> list[report.Figure]:
     """Return the figures of graded plants."""
     laws = [line for line in lines if line["row"] in RIGHT]
     unexplained = [line for line in laws if line["unexplained"]]
     learned = [line for line in laws if line["law"]]
-    controls = {
-        row: [bool(line["law"]) for line in lines if line["row"] == row]
-        for row in ("clean", "listed")
-    }
-    loads = ["unexplained" in line["verdict"] for line in lines if line["row"] == LOAD]
-    shares = [
-        ("variable right", "70 %", [line.get("is_variable", False) for line in laws]),
-        ("variable and form right", "70 %", [line.get("is_form", False) for line in laws]),
-        (
-            "the same, of those left unexplained",
-            "",
-            [line.get("is_form", False) for line in unexplained],
-        ),
-        ("law of another variable", "at most 2 %", [not line["is_variable"] for line in learned]),
-        *((f"law, {row}", "at most 1 %", flags) for row, flags in controls.items()),
-        *([("swinging load left unexplained", "100 %", loads)] if loads else []),
-    ]
+    loads = [line for line in lines if line["row"] == LOAD]
     # A thermal is elsewhere on every flight, so that a new one says nothing of it.
     on_new_flights = [line for line in laws if "removed" in line and line["row"] != "position"]
     removed_percent = [100.0 * line["removed"][0] for line in on_new_flights]
     cpu_s = [line["cpu_s"] for line in lines]
+
+    def flags(lines: Iterable[Line], name: str) -> list[bool]:
+        return [bool(line.get(name)) for line in lines]
+
+    shares = [
+        ("variable right", "70 %", flags(laws, "is_variable")),
+        ("variable and form right", "70 %", flags(laws, "is_form")),
+        ("the same, of those left unexplained", "", flags(unexplained, "is_form")),
+        ("law of another variable", "at most 2 %", [not line["is_variable"] for line in learned]),
+    ]
+    for row in ("clean", "listed"):
+        controls = [line for line in lines if line["row"] == row]
+        shares.append((f"law, {row}", "at most 1 %", flags(controls, "law")))
+    if loads:
+        is_unexplained = ["unexplained" in line["verdict"] for line in loads]
+        shares.append(("swinging load left unexplained", "100 %", is_unexplained))
     return [
-        *(report.Figure(name, target, *report.share(flags)) for name, target, flags in shares),
+        *(report.share_figure(*share) for share in shares),
         report.Figure(
             "explainable error removed on a new flight, median of those learnt",
             "90 %",
@@ -153,78 +148,67 @@ def figures(lines: Sequence[dict[str, Any]]) -> list[report.Figure]:
     ]
 
 
-def kind_rows(lines: Sequence[dict[str, Any]]) -> list[tuple[str, int, int, int]]:
+def kinds_table(lines: Sequence[Line]) -> str:
     """Return, by kind of law, the numbers of plants, of right forms and of laws learnt."""
     rows = []
     for kind in RIGHT:
-        own = [line for line in lines if line["row"] == kind]
-        right = sum(one.get("is_form", False) for one in own)
-        rows.append((kind, len(own), right, sum(bool(one["law"]) for one in own)))
-    return rows
+        plants = [line for line in lines if line["row"] == kind]
+        num_right = sum(line.get("is_form", False) for line in plants)
+        rows.append((kind, len(plants), num_right, sum(bool(line["law"]) for line in plants)))
+    return report.table("kind | plants | form right | any law learnt", rows)
 
 
-def diagnoses_of(record: Any) -> list[dict[str, Any]]:
-    """Return the diagnoses anywhere in a record of measured flights."""
-    if isinstance(record, list):
-        return [found for one in record for found in diagnoses_of(one)]
-    if not isinstance(record, dict):
-        return []
-    if "diagnosis" in record:
-        return [record["diagnosis"]]
-    return [found for one in record.values() for found in diagnoses_of(one)]
-
-
-def real_rows() -> list[tuple[str, str, str, str]]:
-    """Return what each diagnosis of measured flights learnt, and its ratios of errors.
+def _learned_cells(diagnosis: Any) -> tuple[str, str, str]:
+    """Return what a diagnosis learnt, and the median and largest ratio of errors.
 
     Errors are of velocity and position on held-out rows, over those of the extended model without
     it.
     """
+    if diagnosis["learned"] is None:
+        has_law = any("from another log" in warning for warning in diagnosis["warnings"])
+        return "not looked for: the model has a law" if has_law else "nothing", "-", "-"
+    errors = diagnosis["prediction"]["errors"]
+    ratios = [
+        errors["extended"][quantity][horizon] / without
+        for quantity, by_horizon in errors["without_learned"].items()
+        if quantity.split("_")[0] in ("velocity", "position")
+        for horizon, without in by_horizon.items()
+    ]
+    formulas = "; ".join(formulas_of(diagnosis["learned"]))
+    return formulas, f"{np.median(ratios):.2f}", f"{max(ratios):.2f}"
+
+
+def real_table() -> str:
+    """Return a table of what each diagnosis of measured flights learnt."""
     rows = []
-    for path in sorted(REAL.glob("*_diagnosis.json")):
-        for number, found in enumerate(diagnoses_of(json.loads(path.read_text()))):
-            name = f"{path.stem.removesuffix('_diagnosis')} {number + 1}"
-            learned, errors = found["learned"], found["prediction"]["errors"]
-            if learned is None:
-                has_law = any("from another log" in warning for warning in found["warnings"])
-                rows.append(
-                    (
-                        name,
-                        "not looked for: the model has a law" if has_law else "nothing",
-                        "-",
-                        "-",
-                    )
-                )
-                continue
-            ratios = [
-                errors["extended"][quantity][horizon] / before
-                for quantity, by_horizon in errors["without_learned"].items()
-                if quantity.split("_")[0] in ("velocity", "position")
-                for horizon, before in by_horizon.items()
-            ]
-            rows.append(
-                (
-                    name,
-                    "; ".join(formulas_of(learned)),
-                    f"{np.median(ratios):.2f}",
-                    f"{max(ratios):.2f}",
-                )
-            )
-    return rows
+    for name in sorted(CRAFTS):
+        record = json.loads(record_path(name).read_text(encoding="utf-8"))
+        for number, part in enumerate(CRAFTS[name].diagnoses(record).values()):
+            rows.append((f"{name} {number + 1}", *_learned_cells(part["diagnosis"])))
+    return report.table("flights | learnt | error over the one without, median | largest", rows)
 
 
 def write_page() -> None:
     """Write the page of each seed's last plants with and without a law, and of measured flights."""
-    every = report.lines_in(LINES)
-    last = {(line["row"] in KINDS, line["seed"]): line["commit"] for line in every}
-    laws = [(True, seed) for seed in SEEDS_OF_LAWS]
-    controls = [(False, seed) for seed in SEEDS_OF_CONTROLS]
-    used = {*laws, *controls} & set(last)
-    lines = [
-        line
-        for line in every
-        if (key := (line["row"] in KINDS, line["seed"])) in used and line["commit"] == last[key]
-    ]
+    by_group: dict[tuple[bool, int], list[Line]] = {}
+    for line in report.lines_in(LINES):
+        group = line["row"] in KINDS, line["seed"]
+        earlier = by_group.get(group, [])
+        by_group[group] = [*(one for one in earlier if one["commit"] == line["commit"]), line]
+    groups = {
+        "laws": [(True, seed) for seed in SEEDS_OF_LAWS],
+        "controls": [(False, seed) for seed in SEEDS_OF_CONTROLS],
+    }
+    sources = {
+        name: ", ".join(
+            f"seed {group[1]} at commit {by_group[group][-1]['commit']}"
+            for group in members
+            if group in by_group
+        )
+        for name, members in groups.items()
+    }
+    members = [*groups["laws"], *groups["controls"]]
+    lines = [line for group in members for line in by_group.get(group, [])]
     good = [line for line in lines if "error" not in line]
     rows = [
         (
@@ -239,16 +223,11 @@ def write_page() -> None:
     report.fill_page(
         LINES.with_suffix(".md"),
         "beyond",
-        **{
-            name: ", ".join(f"seed {one[1]} at commit {last[one]}" for one in keys if one in used)
-            for name, keys in (("laws", laws), ("controls", controls))
-        },
+        **sources,
         crashed=len(lines) - len(good),
         figures=report.figures_table(figures(good)),
-        kinds=report.table("kind | plants | form right | any law learnt", kind_rows(good)),
-        real=report.table(
-            "flights | learnt | error over the one without, median | largest", real_rows()
-        ),
+        kinds=kinds_table(good),
+        real=real_table(),
         plants=report.table("kind | truth | learnt | left unexplained by the list", rows),
     )
 
@@ -270,9 +249,13 @@ def main(
         return
     counts = dict.fromkeys(kinds, laws) | {"clean": clean, "listed": listed}
     most = max(counts.values())
-    run(
-        [(row, number) for number in range(most) for row, count in counts.items() if number < count]
-    )
+    trials = [
+        Trial(row, number)
+        for number in range(most)
+        for row, count in counts.items()
+        if number < count
+    ]
+    report.record_trials(LINES, trials, plant, PLANTS_A_CACHE)
 
 
 if __name__ == "__main__":

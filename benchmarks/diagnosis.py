@@ -8,31 +8,20 @@ commit and versions it was measured at, and skips plants that have a line of the
 ``python -m benchmarks.diagnosis_page`` writes the page of the last commit's lines.
 """
 
-import os
-import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from datetime import date
 from itertools import product
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from benchmarks import hidden
 from benchmarks.hidden.oracle import known, removed, signal_to_noise
-from benchmarks.report import (
-    RESULTS,
-    append_line,
-    command,
-    commit_of_checkout,
-    lines_of_commit,
-    progress,
-)
+from benchmarks.report import RESULTS, command, record_trials
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
-from flytrack_sysid.diagnosis import diagnose
+from flytrack_sysid.diagnosis import Cause, diagnose
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import held_out_rows
 
@@ -109,35 +98,39 @@ def plant(trial: Trial) -> dict[str, Any]:
     """Return the diagnosis of one plant, graded."""
     truth, clean, log, model, rng = make_log(trial)
     started = time.process_time()
-    found = diagnose(log, model)
+    diagnosis = diagnose(log, model)
     seconds = time.process_time() - started
     line: dict[str, Any] = {
         "truth": truth.text(),
         "effects": list(truth.effects),
-        "verdict": found.verdict,
-        "is_motion_right": found.extended.motion is MOTION_OF[truth.motion],
-        "causes": [_graded(cause, truth) for cause in found.causes],
-        "negligible": [_graded(cause, truth) for cause in found.negligible],
-        "beyond_the_list": [cause.effect for cause in found.beyond],
-        "unexplained": {name: round(size, 3) for name, size in found.unexplained.shares.items()},
-        "not_identifiable": [one.effect for one in found.not_identifiable],
+        "verdict": diagnosis.verdict,
+        "is_motion_right": diagnosis.extended.motion is MOTION_OF[truth.motion],
+        "causes": [_grade_cause(cause, truth) for cause in diagnosis.causes],
+        "negligible": [_grade_cause(cause, truth) for cause in diagnosis.negligible],
+        "beyond_the_list": [cause.effect for cause in diagnosis.beyond],
+        "unexplained": round_values(diagnosis.unexplained.shares),
+        "not_identifiable": [one.effect for one in diagnosis.not_identifiable],
         "cpu_s": round(seconds, 2),
     }
     if truth.onset_s is not None:
         line["onset"] = round(truth.onset_s, 3)
     elif truth.effects:
         true_model = model._replace(motion=MOTION_OF[truth.motion])
-        could = known(clean, log, ~held_out_rows(log), true_model, truth.effects)
+        visibility = known(clean, log, ~held_out_rows(log), true_model, truth.effects)
         line["known"] = {
-            name: [float(f"{v:.4g}") for v in one[:2]] + [one[2]] for name, one in could.items()
+            name: [float(f"{one.lambda_:.4g}"), float(f"{one.lambda_sep:.4g}"), one.rival]
+            for name, one in visibility.items()
         }
         # Of explainable error on a new flight, and how large that is, times the noise.
-        share, size = removed(hidden.fly(truth, SECONDS, rng), found.base, found.extended)
+        share, size = removed(hidden.fly(truth, SECONDS, rng), diagnosis.base, diagnosis.extended)
         line["removed"] = [round(share, 4), round(size, 4)]
     if trial.row == "clock":
-        late = [one for one in found.causes if one.effect == "mocap_latency"]
-        found_s = late[0].parameters["latency_s"].value if late else 0.0
-        line["late_s"] = [round(truth.mocap_late_s, 5), round(found_s, 5)]
+        latencies_s = [
+            cause.parameters["latency_s"].value
+            for cause in diagnosis.causes
+            if cause.effect == "mocap_latency"
+        ]
+        line["late_s"] = [round(truth.mocap_late_s, 5), round((*latencies_s, 0.0)[0], 5)]
     if truth.outside is not None:
         line["depends_on"] = truth.outside.kind
         line["amplitude"] = round(truth.outside.amplitude, 3)
@@ -145,17 +138,18 @@ def plant(trial: Trial) -> dict[str, Any]:
     return line
 
 
-def _graded(cause: Any, truth: hidden.Truth) -> dict[str, Any]:
+def round_values(values: Mapping[str, float]) -> dict[str, float]:
+    """Return values rounded for a line."""
+    return {name: round(value, 3) for name, value in values.items()}
+
+
+def _grade_cause(cause: Cause, truth: hidden.Truth) -> dict[str, Any]:
     """Return a cause's name, when it acts, and, by parameter, true value, estimate and interval."""
     true = truth.effects.get(cause.effect, {})
-    spans = {"onset_s": cause.onset_s, "end_s": cause.end_s}
+    times = {"onset_s": cause.onset_s, "end_s": cause.end_s}
     return {
         "effect": cause.effect,
-        **{
-            name: [round(x, 3) for x in (one.value, *one.ci95)]
-            for name, one in spans.items()
-            if one
-        },
+        **{name: np.round((t.value, *t.ci95), 3).tolist() for name, t in times.items() if t},
         "equivalent": list(cause.equivalent),
         "gain": float(f"{cause.chi2_gain:.4g}"),
         "heldout": float(f"{cause.heldout_gain:.4g}"),
@@ -165,28 +159,6 @@ def _graded(cause: Any, truth: hidden.Truth) -> dict[str, Any]:
             if name in true
         },
     }
-
-
-def read_lines(commit: str | None) -> dict[Trial, dict[str, Any]]:
-    """Return the lines of a commit by plant; of the last line's if None."""
-    return {
-        Trial(*(line[name] for name in Trial._fields)): line
-        for line in lines_of_commit(LINES, commit)
-    }
-
-
-def run(trials: list[Trial]) -> None:
-    """Diagnose what is not done yet and append the lines."""
-    commit = commit_of_checkout()
-    done = read_lines(commit)
-    machine = f"{platform.machine()}, {os.cpu_count()} cores, jax {jax.__version__}"
-    for trial in progress([one for one in trials if one not in done], "plants"):
-        line = {**trial._asdict(), "commit": commit, "date": str(date.today()), "machine": machine}
-        try:
-            line |= plant(trial)
-        except Exception as error:  # a crash is a result too, and the others go on
-            line["error"] = f"{type(error).__name__}: {error}"
-        append_line(LINES, line)
 
 
 def main(
@@ -205,7 +177,8 @@ def main(
     every = product(
         range(first, plants), rows.split(","), motion.split(","), map(int, rate.split(","))
     )
-    run([Trial(row, number, seed, moved, one_rate) for number, row, moved, one_rate in every])
+    trials = [Trial(row, number, seed, *flown) for number, row, *flown in every]
+    record_trials(LINES, trials, plant)
 
 
 if __name__ == "__main__":

@@ -9,12 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.diagnosis import LINES, ROWS, Trial, read_lines
+from benchmarks.diagnosis import LINES, ROWS, Trial
 from benchmarks.hidden import MOTIONS
-from benchmarks.report import Figure, figures_table, fill_page, share, table
+from benchmarks.report import (
+    Figure,
+    figures_table,
+    fill_page,
+    lines_of_commit,
+    share_figure,
+    table,
+)
 
 Line = dict[str, Any]
-Rows = dict[str, list[Line]]
 CONTROLS = ("clean", "heavy", "coloured", "gusts")
 SHOWN, SEPARATE, HIDDEN = 30.0, 20.0, 8.0  # lambda
 NOTABLE = 0.2  # of the noise: error that a new flight shows
@@ -25,30 +31,25 @@ ONSET_WITHIN_S = 1.0
 VISIBLE = 10.0  # standard deviations of an effect outside the list: it was there, and flown
 
 
-def named(line: Line) -> list[str]:
+def names_in(line: Line) -> list[str]:
     """Return the names that a line gives."""
     return [cause["effect"] for cause in line["causes"]]
 
 
-def found(line: Line) -> list[dict[str, Any]]:
+def causes_in(line: Line) -> list[dict[str, Any]]:
     """Return the causes that a line names, and true ones that it lists as too small to matter."""
-    return line["causes"] + [one for one in line["negligible"] if one["effect"] in line["effects"]]
+    true = [cause for cause in line["negligible"] if cause["effect"] in line["effects"]]
+    return line["causes"] + true
 
 
-def classes(line: Line) -> list[set[str]]:
+def classes_in(line: Line) -> list[set[str]]:
     """Return the names of each cause found with those that cannot be told from it."""
-    return [{cause["effect"], *cause["equivalent"]} for cause in found(line)]
+    return [{cause["effect"], *cause["equivalent"]} for cause in causes_in(line)]
 
 
 def is_exact(line: Line) -> bool:
     """Return whether a line finds all effects of its plant and names no other."""
-    return sorted(cause["effect"] for cause in found(line)) == sorted(line["effects"])
-
-
-def is_clear(line: Line) -> bool:
-    """Return whether all effects of a plant are shown and separable."""
-    sizes = [line["known"].get(effect, (0.0, 0.0)) for effect in line["effects"]]
-    return all(size[0] > SHOWN and size[1] > SEPARATE for size in sizes)
+    return sorted(cause["effect"] for cause in causes_in(line)) == sorted(line["effects"])
 
 
 def exact_sets(lines: Iterable[Line]) -> list[bool]:
@@ -56,7 +57,12 @@ def exact_sets(lines: Iterable[Line]) -> list[bool]:
 
     Effects are clear if all of them are shown and separable.
     """
-    return [is_exact(line) for line in lines if is_clear(line)]
+    flags = []
+    for line in lines:
+        sizes = [line["known"].get(effect, (0.0, 0.0)) for effect in line["effects"]]
+        if all(size[0] > SHOWN and size[1] > SEPARATE for size in sizes):
+            flags.append(is_exact(line))
+    return flags
 
 
 def covered(lines: Iterable[Line]) -> list[bool]:
@@ -64,7 +70,7 @@ def covered(lines: Iterable[Line]) -> list[bool]:
     return [
         low <= true <= high
         for line in lines
-        for cause in found(line)
+        for cause in causes_in(line)
         if cause["effect"] not in OTHER_LAW
         for true, _, low, high in cause["intervals"].values()
     ]
@@ -77,14 +83,15 @@ def percentiles(values: list[float], *which: int, unit: str = "") -> str:
 
 def is_clock_right(line: Line) -> bool:
     """Return whether a late motion capture is found within 2 ms, and nothing else is named."""
-    true_s, found_s = line["late_s"]
-    return set(named(line)) <= {CLOCK} and abs(found_s - true_s) <= CLOCK_WITHIN_S
+    true_s, estimate_s = line["late_s"]
+    return set(names_in(line)) <= {CLOCK} and abs(estimate_s - true_s) <= CLOCK_WITHIN_S
 
 
 def is_onset_right(line: Line) -> bool:
     """Return whether exactly the true effect is found, and its onset within a second."""
-    times = [cause.get("onset_s", [np.inf])[0] for cause in found(line)]
-    return is_exact(line) and all(abs(one - line["onset"]) <= ONSET_WITHIN_S for one in times)
+    onsets_s = [cause.get("onset_s", [np.inf])[0] for cause in causes_in(line)]
+    errors_s = np.abs(np.array(onsets_s) - line["onset"])
+    return is_exact(line) and bool((errors_s <= ONSET_WITHIN_S).all())
 
 
 def is_time_told(line: Line) -> bool:
@@ -94,39 +101,37 @@ def is_time_told(line: Line) -> bool:
     )
 
 
-def figures(by_row: Rows) -> list[Figure]:
+def figures(lines: list[Line]) -> list[Figure]:
     """Return the figures of plants that move in one way."""
-    one = [(line, *case) for line in by_row["one"] for case in line.get("known", {}).items()]
-    shown = [(line, effect, size) for line, effect, size in one if size[0] > SHOWN]
+    by_row = {row: [line for line in lines if line["row"] == row] for row in ROWS}
+    singles = [(line, *case) for line in by_row["one"] for case in line.get("known", {}).items()]
+    shown = [(line, effect) for line, effect, size in singles if size[0] > SHOWN]
+    invisible = [line for line, _, size in singles if size[0] < HIDDEN]
     hiding = [line for row in ("one", "two", "three") for line in by_row[row]]
     other_law = [line for line in hiding if any(effect in OTHER_LAW for effect in line["effects"])]
     same_law = [line for line in hiding if line not in other_law]
     removed = [100.0 * line["removed"][0] for line in hiding if line["removed"][1] >= NOTABLE]
-    sizes = [len(names) for line in by_row["one"] for names in classes(line)]
+    sizes = [len(names) for line in by_row["one"] for names in classes_in(line)]
     outside = [line for line in by_row["outside"] if line["visible"] >= VISIBLE]
-    every = [line for lines in by_row.values() for line in lines]
-    controls = {
-        row: [bool(named(line) or line.get("beyond_the_list")) for line in by_row[row]]
-        for row in CONTROLS
-    }
-    any_name = [flag for flags in controls.values() for flag in flags]
-    others = [line for row in ROWS if row != "onset" for line in by_row[row]]
+    controls = [line for row in CONTROLS for line in by_row[row]]
+    steady = [line for line in lines if line["row"] != "onset"]
+    cpu_s = [line["cpu_s"] for line in lines]
+
+    def is_any_named(lines: list[Line]) -> list[bool]:
+        return [bool(line["causes"] or line.get("beyond_the_list")) for line in lines]
+
     shares = [
-        ("any name on plants without an effect", "at most 1 %", any_name),
-        *((f"the same, {row}", "", flags) for row, flags in controls.items()),
-        (
-            "something negligible on them",
-            "",
-            [bool(line["negligible"]) for row in CONTROLS for line in by_row[row]],
-        ),
-        ("detected: any name, lambda > 30", "99 %", [bool(found(line)) for line, *_ in shown]),
+        ("any name on plants without an effect", "at most 1 %", is_any_named(controls)),
+        *((f"the same, {row}", "", is_any_named(by_row[row])) for row in CONTROLS),
+        ("something negligible on them", "", [bool(line["negligible"]) for line in controls]),
+        ("detected: any name, lambda > 30", "99 %", [bool(causes_in(line)) for line, _ in shown]),
         ("exact name, lambda > 30 and lambda_sep > 20", "98 %", exact_sets(by_row["one"])),
         (
             "truth in the reported class, lambda > 30",
             "98 %",
-            [any(effect in names for names in classes(line)) for line, effect, _ in shown],
+            [any(effect in names for names in classes_in(line)) for line, effect in shown],
         ),
-        ("silent, lambda < 8", "", [not found(line) for line, _, size in one if size[0] < HIDDEN]),
+        ("silent, lambda < 8", "", [not causes_in(line) for line in invisible]),
         ("exact set of 2, each separable", "95 %", exact_sets(by_row["two"])),
         ("exact set of 3, each separable", "90 %", exact_sets(by_row["three"])),
         ("95 % intervals cover the truth", "92 to 98 %", covered(same_law)),
@@ -137,7 +142,7 @@ def figures(by_row: Rows) -> list[Figure]:
             "80 %",
             [any(line["depends_on"] in name for name in line["unexplained"]) for line in outside],
         ),
-        ("outside the list: false name", "at most 5 %", [bool(named(line)) for line in outside]),
+        ("outside the list: false name", "at most 5 %", [bool(line["causes"]) for line in outside]),
         (
             "motion capture 0 to 40 ms late: within 2 ms, no other name",
             "95 %",
@@ -148,119 +153,114 @@ def figures(by_row: Rows) -> list[Figure]:
             "90 %",
             [is_onset_right(line) for line in by_row["onset"]],
         ),
-        ("others: an onset or end told", "", [is_time_told(line) for line in others]),
-        ("motion recognised", "", [line["is_motion_right"] for line in every]),
+        ("others: an onset or end told", "", [is_time_told(line) for line in steady]),
+        ("motion recognised", "", [line["is_motion_right"] for line in lines]),
     ]
-    cpu_s = [line["cpu_s"] for line in every]
-    return [
-        *(Figure(name, target, *share(flags)) for name, target, flags in shares),
-        Figure(
-            "mean size of a class",
-            "at most 1.5",
-            f"{np.mean(sizes):.2f}" if sizes else "none",
-            len(sizes),
-        ),
-        Figure(
+    mean_size = f"{np.mean(sizes):.2f}" if sizes else "none"
+    medians = [
+        ("mean size of a class", "at most 1.5", mean_size, len(sizes)),
+        (
             "explainable error removed on a new flight: median, tenth percentile",
             "99 %, 95 %",
             percentiles(removed, 50, 10, unit=" %"),
             len(removed),
         ),
-        Figure(
+        (
             "CPU seconds a log: median, 95th percentile",
             "8, 15",
             percentiles(cpu_s, 50, 95),
             len(cpu_s),
         ),
     ]
+    return [*(share_figure(*share) for share in shares), *(Figure(*median) for median in medians)]
 
 
-def figures_of_motions(by_trial: dict[Trial, Line]) -> str:
+def figures_of_motions(lines: list[Line]) -> str:
     """Return the figures of the usual rate, two columns a motion."""
-    columns = [figures(by_row_of(by_trial, motion, USUAL_RATE)) for motion in MOTIONS]
+    columns = [figures(flown(lines, motion, USUAL_RATE)) for motion in MOTIONS]
     rows = []
     for figure, *others in zip(*columns, strict=True):
         rows.append([*figure, *(cell for other in others for cell in (other.measured, other.n))])
-    return table(
-        ["figure", "target", *(head for motion in MOTIONS for head in (motion, "n"))], rows
-    )
+    heads = [head for motion in MOTIONS for head in (motion, "n")]
+    return table(["figure", "target", *heads], rows)
 
 
-def figures_of_rates(by_trial: dict[Trial, Line]) -> str:
+def figures_of_rates(lines: list[Line]) -> str:
     """Return names on clean plants and exact ones of other rates."""
-    kinds = sorted({(trial.rate, trial.motion) for trial in by_trial if trial.rate != USUAL_RATE})
     rows = []
-    for rate, motion in kinds:
-        by_row, flown = by_row_of(by_trial, motion, rate), f"{rate} Hz, {motion}"
-        is_named = [bool(named(line)) for line in by_row["clean"]]
-        rows.append(Figure(f"{flown}: any name on clean plants", "at most 2 %", *share(is_named)))
-        rows.append(Figure(f"{flown}: exact single", "95 %", *share(exact_sets(by_row["one"]))))
+    for rate, motion in sorted({(line["rate"], line["motion"]) for line in lines}):
+        if rate == USUAL_RATE:
+            continue
+        plants = flown(lines, motion, rate)
+        is_named = [bool(line["causes"]) for line in plants if line["row"] == "clean"]
+        singles = [line for line in plants if line["row"] == "one"]
+        name = f"{rate} Hz, {motion}"
+        rows.append(share_figure(f"{name}: any name on clean plants", "at most 2 %", is_named))
+        rows.append(share_figure(f"{name}: exact single", "95 %", exact_sets(singles)))
     return figures_table(rows)
 
 
-def by_row_of(by_trial: dict[Trial, Line], motion: str, rate: int) -> Rows:
-    """Return the lines of a motion and rate by row."""
-    chosen = {
-        trial: line
-        for trial, line in by_trial.items()
-        if (trial.motion, trial.rate) == (motion, rate)
-    }
-    return {row: [line for trial, line in chosen.items() if trial.row == row] for row in ROWS}
+def flown(lines: list[Line], motion: str, rate: int) -> list[Line]:
+    """Return the lines of a motion and rate."""
+    return [line for line in lines if (line["motion"], line["rate"]) == (motion, rate)]
 
 
-def counted(header: str, pairs: Iterable[tuple[str, str]]) -> str:
+def count_names(header: str, pairs: Iterable[tuple[str, str]]) -> str:
     """Return a table of truths and how often each was given which name."""
     counts: dict[str, Counter[str]] = {}
     for truth, name in pairs:
         counts.setdefault(truth, Counter()).update([name])
     rows = [
-        (truth, own.total(), ", ".join(f"{name} {number}" for name, number in own.most_common()))
-        for truth, own in sorted(counts.items())
+        (truth, names.total(), ", ".join(f"{name} {n}" for name, n in names.most_common()))
+        for truth, names in sorted(counts.items())
     ]
     return table(header, rows)
 
 
-def misses(by_trial: dict[Trial, Line]) -> str:
+def misses(lines: list[Line]) -> str:
     """Return every plant on which a name was missing or false, with what could be known."""
     rows = []
-    for trial, line in sorted(by_trial.items()):
-        if not is_exact(line) and named(line) != [CLOCK]:
-            known = line.get("known", {}).items()
-            could = ", ".join(
-                f"{name} {size:.3g}, {beside:.3g}" for name, (size, beside, _) in known
+    for line in sorted(lines, key=lambda line: [line[name] for name in Trial._fields]):
+        names = names_in(line)
+        if not is_exact(line) and names != [CLOCK]:
+            known = ", ".join(
+                f"{name} {size:.3g}, {beside:.3g}"
+                for name, (size, beside, _) in line.get("known", {}).items()
             )
-            flown = f"{trial.motion}, {trial.rate} Hz"
-            rows.append((trial.row, flown, line["truth"], could, ", ".join(named(line)) or "none"))
+            conditions = f"{line['motion']}, {line['rate']} Hz"
+            rows.append((line["row"], conditions, line["truth"], known, ", ".join(names) or "none"))
     return table("row | flown | truth | lambda, lambda_sep | named", rows)
 
 
 def main() -> None:
     """Write the page."""
-    lines = list(read_lines(None).values())
-    by_trial = {trial: line for trial, line in read_lines(None).items() if "error" not in line}
-    by_row = {row: [line for trial, line in by_trial.items() if trial.row == row] for row in ROWS}
+    every_line = lines_of_commit(LINES)
+    lines = [line for line in every_line if "error" not in line]
+    rows = Counter(line["row"] for line in lines)
     singles = [
-        (line["effects"][0], " + ".join(sorted(named(line))) or "none") for line in by_row["one"]
+        (line["effects"][0], " + ".join(sorted(names_in(line))) or "none")
+        for line in lines
+        if line["row"] == "one"
     ]
     outside = []
-    for line in by_row["outside"]:
-        if line["visible"] >= VISIBLE:
-            seen = {name.split(": ")[1].split(" at ")[0] for name in line["unexplained"]}
-            outside.append((line["depends_on"], " + ".join(sorted(seen)) or "none"))
+    for line in lines:
+        if line.get("visible", 0.0) >= VISIBLE:
+            names = {name.split(": ")[1].split(" at ")[0] for name in line["unexplained"]}
+            outside.append((line["depends_on"], " + ".join(sorted(names)) or "none"))
     fill_page(
         LINES.with_suffix(".md"),
         "diagnosis",
-        plants=", ".join(f"{row} {len(by_row[row])}" for row in ROWS),
-        crashed=len(lines) - len(by_trial),
-        seeds=sorted({line["seed"] for line in lines}),
-        commits=", ".join(sorted({f"{line['commit']} of {line['date']}" for line in lines})),
-        machines="; ".join(sorted({line["machine"] for line in lines})),
+        plants=", ".join(f"{row} {rows[row]}" for row in ROWS),
+        crashed=len(every_line) - len(lines),
+        seeds=sorted({line["seed"] for line in every_line}),
+        commits=", ".join(sorted({f"{line['commit']} of {line['date']}" for line in every_line})),
+        machines="; ".join(sorted({line["machine"] for line in every_line})),
         visible=VISIBLE,
-        figures=figures_of_motions(by_trial),
-        rates=figures_of_rates(by_trial),
-        singles=counted("truth | plants | named", singles),
-        outside=counted("depends on | plants | found", outside),
-        misses=misses(by_trial),
+        figures=figures_of_motions(lines),
+        rates=figures_of_rates(lines),
+        singles=count_names("truth | plants | named", singles),
+        outside=count_names("depends on | plants | found", outside),
+        misses=misses(lines),
     )
 
 

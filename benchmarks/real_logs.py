@@ -23,7 +23,7 @@ RESULT = RESULTS / "real_logs_diagnosis.md"
 NO_RECORD = "Not on record; `python -m benchmarks.real_logs --diagnose {craft}` makes one."
 
 
-def kept(craft: str) -> Path:
+def record_path(craft: str) -> Path:
     """Return the file that keeps a craft's record."""
     return LINES.with_name(f"{craft}_diagnosis.json")
 
@@ -33,10 +33,10 @@ def page() -> tuple[str, dict[str, bytes]]:
     parts, pictures = [filled("real_logs"), crazyflie_part()], {}
     for name, craft in CRAFTS.items():
         parts.append(f"## {craft.title}")
-        if not kept(name).exists():
+        if not record_path(name).exists():
             parts.append(NO_RECORD.format(craft=name))
             continue
-        measured = json.loads(kept(name).read_text(encoding="utf-8"))
+        measured = json.loads(record_path(name).read_text(encoding="utf-8"))
         parts.append(craft.part(measured))
         for number, (title, one) in enumerate(craft.diagnoses(measured).items()):
             file, figure = f"real_{name}_{number}.png", draw(one)
@@ -55,7 +55,7 @@ def main(data: Path = DATA, diagnose: str = "") -> None:
                 f"skipped: no measured flights at {folder}; --data or {VARIABLE} names their folder"
             )
         try:
-            write_json(kept(name), CRAFTS[name].measure(data))
+            write_json(record_path(name), CRAFTS[name].measure(data))
         except LogError as error:
             sys.exit(f"skipped: {error}")
     if not diagnose:

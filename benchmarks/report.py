@@ -128,6 +128,11 @@ def figures_table(figures: Iterable[Figure]) -> str:
     return table("figure | target | measured | n", figures)
 
 
+def share_figure(name: str, target: str, flags: Sequence[bool | int]) -> Figure:
+    """Return a figure that is the share of true values."""
+    return Figure(name, target, *share(flags))
+
+
 def share(flags: Sequence[bool | int]) -> tuple[str, int]:
     """Return the share of true values as text, "none" of no values, and the number of values."""
     return f"{100.0 * sum(flags) / len(flags):.1f} %" if len(flags) else "none", len(flags)
@@ -191,6 +196,46 @@ def lines_in(path: Path) -> list[dict[str, Any]]:
     text = path.read_text(encoding="utf-8") if path.exists() else ""
     # What a kill has cut off has no end of line.
     return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
+
+
+def record_trials(
+    path: Path,
+    trials: Iterable[Any],
+    measure: Callable[[Any], dict[str, Any]],
+    programs_kept: int | None = None,
+) -> None:
+    """Measure what has no line of this commit yet, and append a line of JSON for each trial.
+
+    A line has the trial's fields, the commit, date and machine, and what was measured, or the
+    error: a crash is a result too, and the others go on.
+
+    Args:
+        path: file of lines.
+        trials: named tuples.
+        measure: returns what is measured of a trial.
+        programs_kept: trials after which compiled programs are forgotten, since a process may map
+            only so many into its memory; None for never.
+    """
+    commit = commit_of_checkout()  # before lines change a file
+    machine = f"{platform.machine()}, {os.cpu_count()} cores, jax {version('jax')}"
+    stamp = {"commit": commit, "date": str(date.today()), "machine": machine}
+    done = lines_of_commit(path, commit)
+
+    def is_done(trial: Any) -> bool:
+        fields = json.loads(json.dumps(trial._asdict()))
+        return any(fields.items() <= line.items() for line in done)
+
+    remaining = [trial for trial in trials if not is_done(trial)]
+    for number, trial in enumerate(progress(remaining, "trials")):
+        if programs_kept and number % programs_kept == 0:
+            import jax
+
+            jax.clear_caches()
+        try:
+            result = measure(trial)
+        except Exception as error:
+            result = {"error": f"{type(error).__name__}: {error}"}
+        append_line(path, {**trial._asdict(), **stamp, **result})
 
 
 def lines_of_commit(path: Path, commit: str | None = None) -> list[dict[str, Any]]:

@@ -79,10 +79,9 @@ def test_nothing_is_learnt_beside_a_law_of_another_log() -> None:
     assert any("learned_law from another log" in warning for warning in found.warnings)
 
 
-def test_a_thermal_that_held_out_rows_do_not_pass_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thermal_that_held_out_rows_do_not_pass_is_found() -> None:
     """On this plant, another motion seemed likelier before the search."""
-    monkeypatch.setattr(beyond, "SEED", 43)
-    line = beyond.plant("position", 0)
+    line = beyond.plant(beyond.Trial("position", 0, seed=43))
     assert (line["motion"], line["found_motion"]) == ("handout", "handout")
     assert line["is_form"] and len(line["law"]) == 1 and not line["causes"]
 
@@ -94,11 +93,8 @@ def test_a_load_on_a_string_stays_unexplained() -> None:
     assert found.learned is None or share_removed(found, clean) > 0.0
 
 
-def test_a_thrust_curve_says_where_it_could_be_motors_that_warm_up(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(beyond, "SEED", 59)
-    truth, log, _ = beyond.flown_plant("heating", 1)
+def test_a_thrust_curve_says_where_it_could_be_motors_that_warm_up() -> None:
+    truth, log, _ = beyond.flown_plant(beyond.Trial("heating", 1, seed=59))
     warm = diagnose(log, model_of(truth))
     rng = np.random.default_rng(74)
     truth = replace(hidden.draw_base(rng), motion="handout")
