@@ -9,7 +9,8 @@ of docs/results/firmware.md.
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from functools import cache
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from flytrack_loop.stages import measure_gap
 from flytrack_sysid import Diagnosis, FlightLog, collect, diagnose, diagnose_change
 from flytrack_sysid.diagnosis import Cause
 from flytrack_sysid.diagnosis.score_test import Candidate
-from flytrack_sysid.excitation import script
+from flytrack_sysid.excitation import script as excitation_script
 from flytrack_sysid.manoeuvres import flights_of, hover_action
 from flytrack_sysid.script_file import script_of
 
@@ -50,15 +51,16 @@ GAINS, LATE, CENTER, *MOTORS = (f"betaflight_loop.{group[0]}" for group in LOOP_
 RESPONSE = ("second_order_rates", "rate_slew_limit", "command_delay", GAINS, LATE)
 THRUST = ("thrust_curve", "thrust_scale")
 Rng = np.random.Generator
+Line = dict[str, Any]
 
 
 class Kind(NamedTuple):
     """Something that changes: how it is drawn, its names, and others that fly alike.
 
-    draw: of settings and fields of the body.
+    draw: settings and fields of the body.
     """
 
-    draw: Callable[[Rng], tuple[dict[str, Any], dict[str, Any]]]
+    draw: Callable[[Rng], dict[str, Any]]
     names: tuple[str, ...]
     alike: tuple[str, ...] = ()
 
@@ -80,55 +82,42 @@ def _rates(rng: Rng, center: tuple[float, float], full: tuple[float, float]) -> 
 
 
 KINDS = {
-    "expo": Kind(lambda rng: (_rates(rng, (0.35, 0.65), (62, 62)), {}), ("rate_expo",)),
-    "rates": Kind(
-        lambda rng: (_rates(rng, (1, 1), (70, 85)), {}), ("rate_scale",), ("gyro_scale",)
-    ),
-    "P and D term": Kind(lambda rng: (_both(rng, (0.4, 0.65), p=45, d=30), {}), (GAINS,), RESPONSE),
+    "expo": Kind(lambda rng: _rates(rng, (0.35, 0.65), (62, 62)), ("rate_expo",)),
+    "rates": Kind(lambda rng: _rates(rng, (1, 1), (70, 85)), ("rate_scale",), ("gyro_scale",)),
+    "P and D term": Kind(lambda rng: _both(rng, (0.4, 0.65), p=45, d=30), (GAINS,), RESPONSE),
     "filters": Kind(
         # A dynamic filter would take the static one's place.
-        lambda rng: (
-            {"gyro_lpf1_dyn_min_hz": 0, "gyro_lpf1_static_hz": int(rng.uniform(25, 50))},
-            {},
-        ),
+        lambda rng: {"gyro_lpf1_dyn_min_hz": 0, "gyro_lpf1_static_hz": int(rng.uniform(25, 50))},
         (LATE,),
         RESPONSE,
     ),
-    "thrust linearisation": Kind(
-        lambda rng: ({"thrust_linear": int(rng.uniform(60, 120))}, {}), THRUST
-    ),
+    "thrust linearisation": Kind(lambda rng: {"thrust_linear": int(rng.uniform(60, 120))}, THRUST),
     "motor output limit": Kind(
-        lambda rng: ({"motor_output_limit": int(rng.uniform(70, 88))}, {}), THRUST
+        lambda rng: {"motor_output_limit": int(rng.uniform(70, 88))}, THRUST
     ),
     "a weak motor": Kind(
-        lambda rng: (
-            {},
-            {"health": tuple(rng.permutation([rng.uniform(0.7, 0.85), 1.0, 1.0, 1.0]).tolist())},
-        ),
+        lambda rng: {"health": tuple(rng.permutation([rng.uniform(0.7, 0.85), 1, 1, 1]).tolist())},
         (),  # the motor that is drawn: see ``names_of``
         ("motor_imbalance", *MOTORS, *THRUST),
     ),
     "drag": Kind(
-        lambda rng: ({}, {"linear_drag": (*[float(rng.uniform(0.15, 0.4))] * 2, 0.1)}),
+        lambda rng: {"linear_drag": (*[float(rng.uniform(0.15, 0.4))] * 2, 0.1)},
         ("linear_drag",),
         ("rotor_drag", "quadratic_drag"),
     ),
     "sag": Kind(
-        lambda rng: ({}, {"resistance_ohm": float(rng.uniform(0.012, 0.03))}),
-        ("voltage_sag",),
-        THRUST,
+        lambda rng: {"resistance_ohm": float(rng.uniform(0.012, 0.03))}, ("voltage_sag",), THRUST
     ),
-    "mass": Kind(lambda rng: ({}, {"mass_kg": float(rng.uniform(1.1, 1.35))}), THRUST),
-    "thrust curve": Kind(lambda rng: ({}, {"linear": float(rng.uniform(0.3, 0.7))}), THRUST),
+    "mass": Kind(lambda rng: {"mass_kg": float(rng.uniform(1.1, 1.35))}, THRUST),
+    "thrust curve": Kind(lambda rng: {"linear": float(rng.uniform(0.3, 0.7))}, THRUST),
     "bent thrust": Kind(
-        lambda rng: (
-            {},
-            {"thrust_tilt_rad": (float(rng.choice([-1, 1]) * rng.uniform(0.04, 0.08)), 0.0)},
-        ),
+        lambda rng: {
+            "thrust_tilt_rad": (float(rng.choice([-1, 1]) * rng.uniform(0.04, 0.08)), 0.0)
+        },
         ("thrust_tilt",),
     ),
     "centre of mass": Kind(
-        lambda rng: ({}, {"center_of_mass_m": (float(rng.uniform(0.01, 0.02)), 0.0)}),
+        lambda rng: {"center_of_mass_m": (float(rng.uniform(0.01, 0.02)), 0.0)},
         (CENTER,),
         ("motor_imbalance", *MOTORS, *THRUST),
     ),
@@ -138,7 +127,8 @@ KINDS = {
 class Trial(NamedTuple):
     """One flown set-up.
 
-    It has a row (matched, single or pair), a nominal set-up, an excitation, changes and a number.
+    It has a row (matched, single or pair), a nominal set-up, an excitation, changes, a number and
+    the benchmark's seed.
     """
 
     row: str
@@ -146,6 +136,7 @@ class Trial(NamedTuple):
     flown: str
     kinds: tuple[str, ...]
     number: int
+    seed: int
 
 
 class Known(NamedTuple):
@@ -160,12 +151,13 @@ def fly(settings: Mapping[str, Any], body: Body, flown: str, seed: int) -> tuple
     """Return a noisy log of a minute, and the model to fit from."""
     with Betaflight(settings, body) as plant:
         model = plant.nominal_model()
-        own = None
+        script = None
         if flown == "gentle":
-            own = script_of(flights_of(GENTLE, hover_action(model), seed))
-        return collect(plant, 1.0, seed, 1.0, script=own), model
+            script = script_of(flights_of(GENTLE, hover_action(model), seed))
+        return collect(plant, 1.0, seed, 1.0, script=script), model
 
 
+@cache
 def know(setup: str, flown: str, seed: int) -> Known:
     """Return what is known of a nominal set-up after it was flown and diagnosed."""
     log, start = fly(SETUPS[setup], Body(), flown, seed)
@@ -176,54 +168,55 @@ def know(setup: str, flown: str, seed: int) -> Known:
 def places(settings: Mapping[str, Any], body: Body, seed: int) -> np.ndarray:
     """Return displacements after a second of ``collect``'s excitation, (flights, 3), m."""
     hover = hover_action(nominal_parameters())
-    flown = script_of(script(FLIGHTS, hover, np.random.default_rng(seed)))
+    flights = script_of(excitation_script(FLIGHTS, hover, np.random.default_rng(seed)))
     with Betaflight(settings, body) as plant:
-        states = plant.fly(flown.starts, flown.commands[:, :SECOND])
-    return states[:, -1, POSITION] - flown.starts[:, POSITION]
+        states = plant.fly(flights.starts, flights.commands[:, :SECOND])
+    return states[:, -1, POSITION] - flights.starts[:, POSITION]
 
 
-def graded(trial: Trial, known: Known, seed: int) -> dict[str, Any]:
+def grade_trial(trial: Trial) -> dict[str, Any]:
     """Fly a changed set-up and return how its diagnosis did."""
-    rng = np.random.default_rng(
-        [seed, trial.number, *(list(KINDS).index(kind) for kind in trial.kinds)]
-    )
-    settings, body = dict(SETUPS[trial.setup]), Body()
+    seed, known = trial.seed, know(trial.setup, trial.flown, trial.seed)
+    numbers = [list(KINDS).index(kind) for kind in trial.kinds]
+    rng = np.random.default_rng([seed, trial.number, *numbers])
+    changes = dict(SETUPS[trial.setup])
     for kind in trial.kinds:
-        own, fields = KINDS[kind].draw(rng)
-        settings, body = settings | own, replace(body, **fields)
+        changes |= KINDS[kind].draw(rng)
+    nominal = vars(Body())
+    fields = {name: value for name, value in changes.items() if name in nominal}
+    settings = {name: value for name, value in changes.items() if name not in nominal}
+    body = Body(**fields)
     log, _ = fly(settings, body, trial.flown, seed + 1000 + trial.number)
     apart = np.linalg.norm(places(settings, body, seed) - known.places_m, axis=1)
     started = time.process_time()
-    found = diagnose_change(log, known.log, known.model, motion=known.model.motion)
-    named = {name: values for one in found.causes for name, values in by_name(one).items()}
+    diagnosis = diagnose_change(log, known.log, known.model, motion=known.model.motion)
+    named: dict[str, dict[str, list[float]]] = {}
+    for cause in diagnosis.causes:
+        named |= values_by_name(cause)
     return {
         "settings": settings,
-        "body": {
-            name: value for name, value in vars(body).items() if value != getattr(Body(), name)
-        },
+        "body": fields,
         "apart": round(float(np.median(apart / np.linalg.norm(known.places_m, axis=1))), 4),
-        "verdict": found.verdict,
-        "found": {k: {p: [v.value, *v.ci95] for p, v in own.items()} for k, own in named.items()},
-        "negligible": [one.effect for one in found.negligible],
+        "verdict": diagnosis.verdict,
+        "found": named,
+        "negligible": [cause.effect for cause in diagnosis.negligible],
         **grade([names_of(kind, body) for kind in trial.kinds], [*named]),
-        "error": error_ratios(found),
+        "error": error_ratios(diagnosis),
         "cpu_s": round(time.process_time() - started, 1),
     }
 
 
-def by_name(cause: Cause) -> dict[str, Mapping[str, Any]]:
-    """Return a cause's parameters by name.
+def values_by_name(cause: Cause) -> dict[str, dict[str, list[float]]]:
+    """Return a cause's parameters, each with its value and interval, by name.
 
     Those of the loop are grouped by the settings that change together, under the first of them.
     """
+    values = {name: [x.value, *x.ci95] for name, x in cause.parameters.items()}
     if cause.effect != "betaflight_loop":
-        return {cause.effect: cause.parameters}
-    groups = Candidate(
-        cause.effect, tuple(f"{cause.effect}.{name}" for name in cause.parameters)
-    ).groups
-    return {
-        own[0]: {field: cause.parameters[field.split(".")[1]] for field in own} for own in groups
-    }
+        return {cause.effect: values}
+    values = {f"{cause.effect}.{name}": value for name, value in values.items()}
+    groups = Candidate(cause.effect, tuple(values)).groups
+    return {group[0]: {field: values[field] for field in group} for group in groups}
 
 
 def names_of(kind: str, body: Body) -> tuple[set[str], set[str]]:
@@ -238,15 +231,16 @@ def grade(changes: Sequence[tuple[set[str], set[str]]], names: list[str]) -> dic
     changes: as of ``names_of``. Each has at least one of its names, and each name belongs to a
     change.
     """
+    named = set(names)
+    exact, equivalent = ([change[side] for change in changes] for side in (0, 1))
 
     def fits(classes: Sequence[set[str]]) -> bool:
-        return all(own & set(names) for own in classes) and set(names) <= set().union(*classes)
+        return all(named & one for one in classes) and named <= set().union(*classes)
 
-    exact, alike = ([change[side] for change in changes] for side in (0, 1))
     return {
         "is_exact": fits(exact),
-        "is_in_class": fits(alike),
-        "is_false": not set(names) <= set().union(*alike),
+        "is_in_class": fits(equivalent),
+        "is_false": not named <= set().union(*equivalent),
     }
 
 
@@ -261,53 +255,58 @@ def error_ratios(found: Diagnosis) -> dict[str, float]:
     }
 
 
-def tables(lines: list[dict[str, Any]]) -> str:
+def figures(by_row: Mapping[str, list[Line]]) -> list[report.Figure]:
+    """Return the figures of graded set-ups."""
+    is_named = [bool(line["found"]) for line in by_row["matched"]]
+    result = [report.share_figure("matched set-up: any name", "", is_named)]
+    for row in ROWS[1:]:
+        notable = [line for line in by_row[row] if line["apart"] >= NOTABLE]
+        for flag in ("is_exact", "is_in_class", "is_false"):
+            name = f"{row} that matters: {flag[3:].replace('_', ' ')}"
+            result.append(report.share_figure(name, "", [line[flag] for line in notable]))
+    changed = [*by_row["single"], *by_row["pair"]]
+    errors = [line["error"] for line in changed if line["found"] and line["error"]]
+    seconds = [line["cpu_s"] for lines in by_row.values() for line in lines]
+    ratio = "extended over refitted"
+    values = {
+        f"{ratio}: largest at any horizon": ([max(one.values()) for one in errors], np.max, ".3f"),
+        f"{ratio} after 1 s: median": (
+            [one["1"] for one in errors if "1" in one],
+            np.median,
+            ".3f",
+        ),
+        "CPU s of a diagnosis: median": (seconds, np.median, ".0f"),
+    }
+    for name, (sizes, statistic, digits) in values.items():
+        if sizes:
+            result.append(report.Figure(name, "", format(statistic(sizes), digits), len(sizes)))
+    return result
+
+
+def kinds_table(singles: list[Line]) -> str:
+    """Return how each kind of change is named."""
+    rows = []
+    for kind, about in KINDS.items():
+        lines = [line for line in singles if line["kinds"] == [kind]]
+        named = sorted({" + ".join(line["found"]) or "nothing" for line in lines})
+        sizes = report.spread([100.0 * line["apart"] for line in lines], ".1f") if lines else ""
+        is_right = report.share([line["is_in_class"] for line in lines])
+        names = ", ".join(about.names) or "that motor"
+        rows.append([kind, sizes, names, *is_right, "; ".join(named)])
+    header = "changed | flies apart, % | its names | in class | n | what was named"
+    return report.table(header, rows)
+
+
+def tables(lines: list[Line]) -> str:
     """Return the results as tables in Markdown."""
     by_row = {row: [line for line in lines if line["row"] == row] for row in ROWS}
-    is_named = [bool(line["found"]) for line in by_row["matched"]]
-    figures = [report.Figure("matched set-up: any name", "", *report.share(is_named))]
-    for row in ROWS[1:]:
-        some = [line for line in by_row[row] if line["apart"] >= NOTABLE]
-        for figure in ("is_exact", "is_in_class", "is_false"):
-            name = f"{row} that matters: {figure[3:].replace('_', ' ')}"
-            figures.append(report.Figure(name, "", *report.share([line[figure] for line in some])))
-    named = [
-        line["error"] for row in ROWS[1:] for line in by_row[row] if line["found"] and line["error"]
+    champions = [
+        f"The shipped champion, blind: {line['success']:.1%} of {line['episodes']} starts finish "
+        f"3 laps; {line['gates']:.1f} of 24 gates in the mean."
+        for line in lines
+        if line["row"] == "champion"
     ]
-    if named:
-        worst, last = (
-            [max(one.values()) for one in named],
-            [one["1"] for one in named if "1" in one],
-        )
-        ratio = "extended over refitted"
-        figures.append(
-            report.Figure(f"{ratio}: largest at any horizon", "", f"{max(worst):.3f}", len(worst))
-        )
-        figures.append(
-            report.Figure(f"{ratio} after 1 s: median", "", f"{np.median(last):.3f}", len(last))
-        )
-    seconds = [line["cpu_s"] for some in by_row.values() for line in some]
-    figures.append(
-        report.Figure("CPU s of a diagnosis: median", "", f"{np.median(seconds):.0f}", len(seconds))
-    )
-    parts = [report.figures_table(figures)]
-    cells = []
-    for kind, own in KINDS.items():
-        some = [line for line in by_row["single"] if line["kinds"] == [kind]]
-        said = sorted({" + ".join(line["found"]) or "nothing" for line in some})
-        flags = [line["is_in_class"] for line in some]
-        sizes = report.spread([100.0 * line["apart"] for line in some], ".1f") if some else ""
-        names = ", ".join(own.names) or "that motor"
-        cells.append([kind, sizes, names, *report.share(flags), "; ".join(said)])
-    header = "changed | flies apart, % | its names | in class | n | what was named"
-    parts.append(report.table(header, cells))
-    for line in lines:
-        if line["row"] == "champion":
-            share = f"{line['success']:.1%} of {line['episodes']} starts finish 3 laps"
-            parts.append(
-                f"The shipped champion, blind: {share}; "
-                f"{line['gates']:.1f} of 24 gates in the mean."
-            )
+    parts = [report.figures_table(figures(by_row)), kinds_table(by_row["single"]), *champions]
     return "\n\n".join(parts)
 
 
@@ -319,38 +318,36 @@ def main(
     matched: flights of each set-up and excitation. single: draws of each kind of change. pairs:
     set-ups with two changes. champion: starts of it, 0 for none.
     """
-    rng = np.random.default_rng([seed, 7])
     trials = [
-        Trial("matched", setup, flown, (), number)
-        for setup in SETUPS
-        for flown in ("full", "gentle")
-        for number in range(matched)
+        Trial("matched", *flown, seed=seed)
+        for flown in product(SETUPS, ("full", "gentle"), [()], range(matched))
     ]
-    sets = [(kind,) for kind in KINDS for _ in range(single)]
-    apart = [kind for kind in KINDS if kind != "expo"]  # it is made of the settings of the rates
-    sets += [tuple(rng.choice(apart, 2, replace=False).tolist()) for _ in range(pairs)]
-    trials += [
-        Trial(ROWS[len(own)], "stock", "full", own, 10 + number) for number, own in enumerate(sets)
-    ]
-    commit = report.commit_of_checkout()
+    changes = [(kind,) for kind in KINDS for _ in range(single)]
+    kinds = [kind for kind in KINDS if kind != "expo"]  # it is made of the settings of the rates
+    rng = np.random.default_rng([seed, 7])
+    changes += [tuple(rng.choice(kinds, 2, replace=False).tolist()) for _ in range(pairs)]
+    for number, change in enumerate(changes):
+        trials.append(Trial(ROWS[len(change)], "stock", "full", change, 10 + number, seed))
     if champion:
+        commit = report.commit_of_checkout()
         with Betaflight() as plant:
             raced = measure_gap(load_checkpoint(CHAMPION), plant, seed, champion).plant
         line = {"commit": commit, "row": "champion", "episodes": champion, **raced._asdict()}
         report.append_line(LINES, line)
-    known: dict[tuple[str, str], Known] = {}
-    for trial in report.progress(trials, "set-ups"):
-        key = trial.setup, trial.flown
-        known[key] = known.get(key) or know(*key, seed)
-        report.append_line(
-            LINES, {"commit": commit, **trial._asdict(), **graded(trial, known[key], seed)}
-        )
-    found = report.lines_of_commit(LINES)
-    text = PAGE.read_text(encoding="utf-8")
-    before, after = text.split(MARKS[0])[0], text.split(MARKS[1])[1]
-    record = report.provenance("scipy") | {"commit": found[-1]["commit"]}
-    own = f"{tables(found)}\n\nSeed {seed}. {report.provenance_line(record)}"
-    write_atomically(PAGE, f"{before}{MARKS[0]}\n\n{own}\n\n{MARKS[1]}{after}".encode())
+    report.record_trials(LINES, trials, grade_trial)
+    write_tables(seed)
+
+
+def write_tables(seed: int) -> None:
+    """Write the tables of the last commit's lines into the page."""
+    lines = report.lines_of_commit(LINES)
+    record = report.provenance("scipy") | {"commit": lines[-1]["commit"]}
+    is_crash = [isinstance(line.get("error"), str) for line in lines]  # else ratios of errors
+    results = tables([line for line, crashed in zip(lines, is_crash, strict=True) if not crashed])
+    before, _, after = PAGE.read_text(encoding="utf-8").partition(MARKS[0])
+    after = after.partition(MARKS[1])[2]
+    text = f"{results}\n\nSeed {seed}. {report.provenance_line(record)}"
+    write_atomically(PAGE, f"{before}{MARKS[0]}\n\n{text}\n\n{MARKS[1]}{after}".encode())
 
 
 if __name__ == "__main__":
