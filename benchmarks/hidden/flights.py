@@ -54,13 +54,13 @@ def _attempt(
 ) -> dict[str, np.ndarray]:
     """Return the channels of one attempt, including the time to settle."""
     moments = plan(seconds, rng, caution)
-    settling = [moments[0]._replace(vel_w=(0.0, 0.0, 0.0), acc_w=(0.0, 0.0, 0.0))] * round(
-        SETTLE_S / DT_S
-    )
-    start = Start(moments[0].pos_w, moments[0].heading, float(rng.uniform(*OPEN_V)), HOVER_STICK)
+    hover = moments[0]._replace(vel_w=np.zeros(3), acc_w=np.zeros(3))
+    settling = [hover] * round(SETTLE_S / DT_S)
+    start_w = tuple(hover.pos_w.tolist())
+    start = Start(start_w, hover.heading, float(rng.uniform(*OPEN_V)), HOVER_STICK)
     # An effect of position is centred on a point of the planned path.
     share = truth.outside.shape.get("at_share", 0.0) if truth.outside is not None else 0.0
-    centre_w = moments[int(share * (len(moments) - 1))].pos_w
+    centre_w = tuple(moments[int(share * (len(moments) - 1))].pos_w.tolist())
     drone = HiddenDrone(truth, start, rng, seconds + SETTLE_S, centre_w, SETTLE_S)
     pilot, rows, last = Pilot(truth, rng), [], -1
     planned = [*settling, *moments]

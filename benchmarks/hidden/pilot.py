@@ -15,20 +15,13 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from benchmarks.hidden.draws import log_uniform
 from flytrack_bench.hidden import DT_S, STICKS, HiddenDrone, Truth
 from flytrack_bench.hidden.drone import Sticks
 from flytrack_bench.hidden.laws import FirstOrderNoise
-from flytrack_bench.hidden.vectors import (
-    Vector,
-    add,
-    clip_length,
-    norm,
-    rotation,
-    to_body,
-    wrap_angle,
-)
+from flytrack_bench.hidden.vectors import Vector, norm, rotation, to_body, wrap_angle
 
 Rng = np.random.Generator
 CLIMB, TURN_RATE = 5.0, math.radians(70.0)  # m/s, rad/s: what a plan asks for
@@ -83,20 +76,20 @@ BRAKING, ROOM_M, FASTEST = 5.0, 4.0, 15.0  # m/s^2, m, m/s
 LOOK_AHEAD_S, FLOOR_M, FLOOR_GAIN = 0.25, 0.14, 12.0
 
 
-Hands = tuple[float | None, ...]  # sticks moved by hand, None where the pilot flies
+AUTOMATIC = np.full(4, np.nan)  # no stick is moved by hand
 
 
 class Moment(NamedTuple):
     """The target at one time, world: m, m/s, m/s^2, rad.
 
-    sticks: those moved by hand; None where the pilot flies.
+    sticks: (4,), those moved by hand; nan where the pilot flies.
     """
 
-    pos_w: Vector
-    vel_w: Vector
-    acc_w: Vector
+    pos_w: np.ndarray
+    vel_w: np.ndarray
+    acc_w: np.ndarray
     heading: float
-    sticks: Hands | None
+    sticks: np.ndarray
 
 
 class Sketch:
@@ -105,48 +98,46 @@ class Sketch:
     caution: number of earlier attempts that were too low or too fast.
     """
 
-    def __init__(self, rng: Rng, start_w: Vector, heading: float, caution: int):
+    def __init__(self, rng: Rng, start_w: np.ndarray, heading: float, caution: int):
         self.rng, self.caution = rng, caution
         self.start_w, self.pos_w, self.heading = start_w, start_w, heading
-        self._velocities: list[Vector] = []
-        self._headings: list[float] = []
-        self._sticks: list[Hands | None] = []
+        self._rows: list[np.ndarray] = []
 
     def __len__(self) -> int:
-        return len(self._velocities)
+        return len(self._rows)
 
-    def add(self, vel_w: Vector, heading: float | None = None, sticks: Hands | None = None) -> None:
+    def add(
+        self, vel_w: ArrayLike, heading: float | None = None, sticks: np.ndarray = AUTOMATIC
+    ) -> None:
         """Append a moment; the heading is kept if not given."""
         self.heading = self.heading if heading is None else heading
-        self._velocities.append(vel_w)
-        self._headings.append(self.heading)
-        self._sticks.append(sticks)
-        self.pos_w = tuple(p + v * DT_S for p, v in zip(self.pos_w, vel_w, strict=True))
+        vel_w = np.asarray(vel_w)
+        self._rows.append(np.concatenate([vel_w, [self.heading], sticks]))
+        self.pos_w = self.pos_w + vel_w * DT_S
 
     def wait(self, seconds: float) -> None:
         """Append a hover."""
         for _ in range(steps_of(seconds)):
-            self.add((0.0, 0.0, 0.0))
+            self.add(np.zeros(3))
 
     def turn_to(self, heading: float) -> None:
         """Append a hover that turns to a heading the shorter way."""
-        way = wrap_angle(heading - self.heading)
-        first, steps = self.heading, max(1, steps_of(abs(way) / TURN_RATE))
+        turn = wrap_angle(heading - self.heading)
+        first, steps = self.heading, max(1, steps_of(abs(turn) / TURN_RATE))
         for step in range(steps):
-            self.add((0.0, 0.0, 0.0), first + way * (step + 1) / steps)
+            self.add(np.zeros(3), first + turn * (step + 1) / steps)
 
     def climb_to(self, height_m: float) -> None:
         """Append a climb or descent."""
-        way = height_m - self.pos_w[2]
-        steps = max(1, steps_of(abs(way) / CLIMB))
+        climb = height_m - self.pos_w[2]
+        steps = max(1, steps_of(abs(climb) / CLIMB))
         for _ in range(steps):
-            self.add((0.0, 0.0, way / steps / DT_S))
+            self.add((0.0, 0.0, climb / steps / DT_S))
 
     def hands_on(self, sticks: np.ndarray) -> None:
         """Append moments with sticks (num_rows, 4) moved by hand; nan where the pilot flies."""
-        for row in sticks.tolist():
-            given = tuple(None if math.isnan(stick) else stick for stick in row)
-            self.add((0.0, 0.0, 0.0), None, given)
+        for row in sticks:
+            self.add(np.zeros(3), sticks=row)
 
     def moments(self, seconds: float) -> list[Moment]:
         """Return a plan of this length with smoothed velocities and headings."""
@@ -155,21 +146,15 @@ class Sketch:
             self.wait((count - len(self)) * DT_S)
         width = steps_of(SMOOTH_S)
         kernel = np.hanning(width + 2)[1:-1]
-        rows = np.column_stack([np.array(self._velocities), np.array(self._headings)])
+        rows, sticks = np.split(np.array(self._rows), [4], axis=1)
         padded = np.concatenate([np.tile(rows[0] * [0, 0, 0, 1], (width, 1)), rows])
-        smooth = np.stack(
-            [
-                np.convolve(column, kernel / kernel.sum())[width : width + len(rows)]
-                for column in padded.T
-            ],
-            axis=1,
-        )
-        vel_w, heading = smooth[:, :3], smooth[:, 3]
-        pos_w = np.array(self.start_w) + np.cumsum(vel_w, axis=0) * DT_S
+        smooth = [np.convolve(column, kernel / kernel.sum())[width:] for column in padded.T]
+        vel_w, heading = np.stack(smooth[:3], axis=1)[: len(rows)], smooth[3]
+        pos_w = self.start_w + np.cumsum(vel_w, axis=0) * DT_S
         acc_w = np.gradient(vel_w, DT_S, axis=0)
-        vectors = (map(tuple, column[:count].tolist()) for column in (pos_w, vel_w, acc_w))
-        columns = (*vectors, heading[:count].tolist(), self._sticks[:count])
-        return [Moment(*row) for row in zip(*columns, strict=True)]
+        return [
+            Moment(pos_w[i], vel_w[i], acc_w[i], float(heading[i]), sticks[i]) for i in range(count)
+        ]
 
 
 def steps_of(seconds: float) -> int:
@@ -307,15 +292,19 @@ def plan(seconds: float, rng: Rng, caution: int = 0) -> list[Moment]:
 
     caution: number of earlier attempts that were too low or too fast.
     """
-    start_w = (
-        *rng.uniform(-START_SPREAD_M, START_SPREAD_M, 2).tolist(),
-        HIGHER_M * caution + float(rng.uniform(*HIGH_M)),
-    )
+    start_w = np.append(rng.uniform(-START_SPREAD_M, START_SPREAD_M, 2), 0.0)
+    start_w[2] = HIGHER_M * caution + rng.uniform(*HIGH_M)
     sketch = Sketch(rng, start_w, float(rng.uniform(-math.pi, math.pi)), caution)
     sketch.wait(BEGIN_S)
     while len(sketch) * DT_S < seconds:
         cycle(sketch)
     return sketch.moments(seconds)
+
+
+def clip_length(vector: np.ndarray, most: float) -> np.ndarray:
+    """Return a vector shortened to a length, if it is longer."""
+    length = norm(vector.tolist())
+    return vector if length <= most else most / length * vector
 
 
 class Pilot:
@@ -336,22 +325,23 @@ class Pilot:
         self._attitude = min(QUICKEST_ATTITUDE, ATTITUDE_PER_LAG / turn_lag)
         self._level = VELOCITY_PER_ATTITUDE * self._attitude
         self._upright = min(QUICKEST_HEIGHT, ATTITUDE_PER_LAG / (slow_fall * truth.tau[3] + delay))
-        self._learnt_w = (0.0, 0.0, 0.0)
+        self._gains = np.array([self._level, self._level, self._upright])
+        self._learnt_w = np.zeros(3)
         self._tremble = FirstOrderNoise(TREMBLE_S, rng, len(truth.tau))
         self._stick, self._is_cut_off = FIRST_STICK, False
 
     def command(self, drone: HiddenDrone, moment: Moment) -> Sticks:
         """Return sticks in [-1, 1] for the plant's state at a moment of the plan."""
-        has_stick = moment.sticks is not None
-        self._is_cut_off = has_stick and (self._is_cut_off or self._is_unsafe(drone))
-        is_free = not has_stick or self._is_cut_off
-        force_w = self._force(drone, moment, is_free)
-        own, shakes = self._sticks(drone, force_w, moment.heading), self._tremble.step(DT_S)
-        hands = moment.sticks if moment.sticks is not None and not is_free else (None,) * len(own)
-        return tuple(
-            max(-1.0, min(1.0, stick + TREMBLE * shake if hand is None else hand))
-            for stick, shake, hand in zip(own, shakes, hands, strict=True)
+        by_hand = moment.sticks
+        has_hand = not np.isnan(by_hand).all()
+        self._is_cut_off = has_hand and (self._is_cut_off or self._is_unsafe(drone))
+        is_free = not has_hand or self._is_cut_off
+        automatic = np.array(
+            self._sticks(drone, self._force(drone, moment, is_free), moment.heading)
         )
+        automatic += TREMBLE * np.array(self._tremble.step(DT_S))
+        sticks = automatic if is_free else np.where(np.isnan(by_hand), automatic, by_hand)
+        return tuple(sticks.clip(-1.0, 1.0).tolist())
 
     def _is_unsafe(self, drone: HiddenDrone) -> bool:
         falling = max(0.0, -drone.vel_w[2])
@@ -360,32 +350,20 @@ class Pilot:
 
     def _force(self, drone: HiddenDrone, moment: Moment, is_free: bool) -> Vector:
         """Return the wanted specific force, world, m/s^2."""
-        gains = (self._level, self._level, self._upright)
-        away = tuple(
-            POSITION_PER_VELOCITY * gain * (there - here)
-            for gain, there, here in zip(gains, moment.pos_w, drone.pos_w, strict=True)
-        )
-        wanted = add(clip_length(away, MOST_CORRECTION), moment.vel_w)
-        error = tuple(
-            a - b for a, b in zip(clip_length(wanted, MOST_SPEED), drone.vel_w, strict=True)
-        )
-        acc = [
-            a + gain * e + k
-            for a, gain, e, k in zip(moment.acc_w, gains, error, self._learnt_w, strict=True)
-        ]
+        gains = self._gains
+        away = POSITION_PER_VELOCITY * gains * (moment.pos_w - drone.pos_w)
+        wanted = clip_length(away, MOST_CORRECTION) + moment.vel_w
+        error = clip_length(wanted, MOST_SPEED) - drone.vel_w
+        acc = moment.acc_w + gains * error + self._learnt_w
         if is_free:
-            learn = tuple(
-                known + DT_S * LEARN_PER_VELOCITY * gain * gain * e
-                for known, gain, e in zip(
-                    self._learnt_w, gains, clip_length(error, MOST_LESSON), strict=True
-                )
-            )
-            self._learnt_w = clip_length(learn, MOST_LEARNT)
+            lesson = DT_S * LEARN_PER_VELOCITY * gains * gains * clip_length(error, MOST_LESSON)
+            self._learnt_w = clip_length(self._learnt_w + lesson, MOST_LEARNT)
         ahead = drone.pos_w[2] + LOOK_AHEAD_S * drone.vel_w[2]
         if ahead < FLOOR_M:
             acc[2] += FLOOR_GAIN * self._upright * (FLOOR_M - ahead)
-        up = self._truth.gravity + max(-MOST_DOWN, min(MOST_UP, acc[2]))
-        side = clip_length((acc[0], acc[1], 0.0), up * math.tan(MOST_TILTED))
+        up = self._truth.gravity + max(-MOST_DOWN, min(MOST_UP, float(acc[2])))
+        acc[2] = 0.0
+        side = clip_length(acc, up * math.tan(MOST_TILTED)).tolist()
         return (side[0], side[1], up)
 
     def _sticks(self, drone: HiddenDrone, force_w: Vector, heading: float) -> Sticks:
