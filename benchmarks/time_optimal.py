@@ -176,14 +176,19 @@ def replay(reference: Reference, track: Track, plant: Plant | None = None) -> Re
 def is_verified(reference: Reference, flown: Replay) -> bool:
     """Return whether a replay passed every gate, touched no frame and took the expected time."""
     is_whole = flown.gates_passed == len(reference.gate_times_s) and not flown.ended_by
-    return (
-        is_whole
-        and flown.frames_touched == 0
-        and abs(flown.time_s - reference.time_s) <= LARGEST_ERROR_S
-    )
+    is_on_time = abs(flown.time_s - reference.time_s) <= LARGEST_ERROR_S
+    return is_whole and flown.frames_touched == 0 and is_on_time
 
 
-def verified(folder: Path, tracks: list[Track]) -> tuple[list[tuple[Reference, str, Replay]], bool]:
+class Flown(NamedTuple):
+    """A reference, the plant that flew its commands, and the replay."""
+
+    reference: Reference
+    flown_by: str
+    replay: Replay
+
+
+def verified(folder: Path, tracks: list[Track]) -> tuple[list[Flown], bool]:
     """Return a folder's references with their replays, and whether those in their model are right.
 
     References of the model ``black_box`` are flown on the shipped black box as well. tracks: where
@@ -193,23 +198,20 @@ def verified(folder: Path, tracks: list[Track]) -> tuple[list[tuple[Reference, s
         files.ReferenceFileError, TrackError: a file that cannot be used, or no references.
     """
     plant = blackbox.load(blackbox.SHIPPED)
-    replays, is_good = [], True
     references = list(map(files.load_reference, folder.glob("*.npz")))
     if not references:
         raise files.ReferenceFileError(f"{folder}: found no .npz, expected references")
-    known = {track.name: track for track in tracks}
-    for reference in sorted(
-        references, key=lambda found: (found.model_name != NOMINAL, found.track, found.kind)
-    ):
-        track = known.get(reference.track) or flytrack_env.load_track(reference.track)
-        flown = replay(reference, track)
-        is_good &= (
-            is_verified(reference, flown) and files.track_digest(track) == reference.track_sha256
-        )
-        replays.append((reference, "simulator", flown))
+    references.sort(key=lambda one: (one.model_name != NOMINAL, one.track, one.kind))
+    by_name = {track.name: track for track in tracks}
+    flights, is_good = [], True
+    for reference in references:
+        track = by_name.get(reference.track) or flytrack_env.load_track(reference.track)
+        flights.append(Flown(reference, "simulator", replay(reference, track)))
+        is_good &= is_verified(reference, flights[-1].replay)
+        is_good &= files.track_digest(track) == reference.track_sha256
         if reference.model_name == BLACK_BOX:
-            replays.append((reference, "black box", replay(reference, track, plant)))
-    return replays, is_good
+            flights.append(Flown(reference, "black box", replay(reference, track, plant)))
+    return flights, is_good
 
 
 def write_pictures(page: Path, references: list[Reference], tracks: list[Track]) -> None:
@@ -217,57 +219,67 @@ def write_pictures(page: Path, references: list[Reference], tracks: list[Track])
     from flytrack_env.pictures import draw_flight, make_flight
     from flytrack_env.pictures.drawing import png_of  # matplotlib, needed only here
 
-    first = {found.track: found for found in reversed(references) if found.kind == "flying"}
-    for track in (one for one in tracks if one.name in first):
-        found = first[track.name]
-        name = f"{found.model_name} model, {TITLES[found.kind]}"
-        commands = np.concatenate([found.commands, found.commands[-1:]])  # one per state
-        flight = make_flight(name, found.states.astype(np.float32), commands, track)
+    laps = {one.track: one for one in reversed(references) if one.kind == "flying"}
+    for track in tracks:
+        lap = laps.get(track.name)
+        if lap is None:
+            continue
+        name = f"{lap.model_name} model, {TITLES[lap.kind]}"
+        commands = np.concatenate([lap.commands, lap.commands[-1:]])  # one per state
+        flight = make_flight(name, lap.states.astype(np.float32), commands, track)
         picture = png_of(draw_flight(flight)["top"])
         write_atomically(page.with_name(f"{page.stem}_{track.name}.png"), picture)
 
 
+def _names(reference: Reference) -> tuple[str, str, str]:
+    return reference.track, reference.model_name, TITLES[reference.kind]
+
+
 def _optimum_row(reference: Reference) -> tuple[Any, ...]:
-    found, states = reference.found, reference.states
-    starts = [seconds for seconds in found["coarse_times_s"] if seconds is not None]
-    agree = sum(seconds <= min(starts) * (1.0 + AGREE_SHARE) for seconds in starts)
+    search, states = reference.found, reference.states
+    times_s = [seconds for seconds in search["coarse_times_s"] if seconds is not None]
+    num_agree = sum(seconds <= min(times_s) * (1.0 + AGREE_SHARE) for seconds in times_s)
     return (
-        reference.track,
-        reference.model_name,
-        TITLES[reference.kind],
+        *_names(reference),
         f"{reference.time_s:.4f}",
-        f"{found['free_time_s']:.4f}",
-        f"{agree} of {len(found['coarse_times_s'])}",
+        f"{search['free_time_s']:.4f}",
+        f"{num_agree} of {len(search['coarse_times_s'])}",
         f"{np.linalg.norm(states[:, layout.VELOCITY], axis=1).max():.1f}",
         f"{states[:, layout.POSITION][:, 2].min():.2f}",
-        found["status"],
-        found["iterations"],
-        f"{found['cpu_s']:.0f}",
+        search["status"],
+        search["iterations"],
+        f"{search['cpu_s']:.0f}",
     )
 
 
-def _replay_row(reference: Reference, flown_by: str, flown: Replay) -> tuple[Any, ...]:
-    late_ms = MILLI * (flown.time_s - reference.time_s)
-    times = ("-", "-") if np.isnan(flown.time_s) else (f"{flown.time_s:.4f}", f"{late_ms:+.3f}")
-    gates = ", ".join([f"{flown.gates_passed} of {len(reference.gate_times_s)}", *flown.ended_by])
-    names = reference.track, reference.model_name, TITLES[reference.kind], flown_by
-    return (*names, gates, *times, f"{MILLI * flown.drift_m:.2f}", flown.frames_touched)
+def _replay_row(flown: Flown) -> tuple[Any, ...]:
+    reference, replay = flown.reference, flown.replay
+    late_ms = MILLI * (replay.time_s - reference.time_s)
+    times = ("-", "-") if np.isnan(late_ms) else (f"{replay.time_s:.4f}", f"{late_ms:+.3f}")
+    gates = [f"{replay.gates_passed} of {len(reference.gate_times_s)}", *replay.ended_by]
+    drift = f"{MILLI * replay.drift_m:.2f}"
+    return (
+        *_names(reference),
+        flown.flown_by,
+        ", ".join(gates),
+        *times,
+        drift,
+        replay.frames_touched,
+    )
 
 
-def write_page(path: Path | None, replays: list[tuple[Reference, str, Replay]]) -> None:
+def write_page(path: Path | None, flights: list[Flown]) -> list[Reference]:
     """Print, and write unless the path is None, the tables of references and their replays.
 
-    replays: references, the plants that flew them, and the replays; a reference may occur several
-    times.
+    Returns the references.
     """
-    references = list({id(found): found for found, _, _ in replays}.values())
-    notes = [reference.found for reference in references]
+    references = [one.reference for one in flights if one.flown_by == "simulator"]
 
     def each(line: str) -> str:
         """Return the line for each reference, without repetitions."""
-        return "; ".join(sorted({line.format(**note) for note in notes}))
+        return "; ".join(sorted({line.format(**reference.found) for reference in references}))
 
-    commands = sorted({note["command"].strip("`") for note in notes})
+    commands = sorted({reference.found["command"].strip("`") for reference in references})
     tracks = sorted({reference.track for reference in references})
     pictures = [f"![{name}]({path.stem}_{name}.png)\n\n" for name in tracks if path is not None]
     report.fill_page(
@@ -282,9 +294,10 @@ def write_page(path: Path | None, replays: list[tuple[Reference, str, Replay]]) 
         radius=each("{drone_radius_m:g} m"),
         smoothing=each("{smoothing_s:g} s"),
         optima=report.table(HEADER, map(_optimum_row, references)),
-        replays=report.table(REPLAY_HEADER, (_replay_row(*entry) for entry in replays)),
+        replays=report.table(REPLAY_HEADER, map(_replay_row, flights)),
         pictures="".join(pictures),
     )
+    return references
 
 
 def main(
@@ -300,22 +313,19 @@ def main(
     tracks: names or files. model: file; by default the simulator's nominal model. verify: only
     replay existing references. out: their folder. page: to write, with pictures beside it.
     """
-    known = list(map(flytrack_env.load_track, tracks))
+    courses = list(map(flytrack_env.load_track, tracks))
     if not verify:
-        named = (
-            (nominal(), NOMINAL) if model is None else (flytrack_env.load_model(model), model.stem)
-        )
-        for track, kind in product(known, kinds):
-            found = optimise(track, kind, *named)
-            files.save_reference(out / f"{track.name}_{found.model_name}_{kind}.npz", found)
-            print(
-                f"{track.name} {kind}: {found.time_s:.4f} s, {found.found['cpu_s']} CPU s",
-                flush=True,
-            )
-    replays, is_good = verified(out, known)
-    write_page(page, replays)
+        flown = nominal() if model is None else flytrack_env.load_model(model)
+        name = NOMINAL if model is None else model.stem
+        for track, kind in product(courses, kinds):
+            reference = optimise(track, kind, flown, name)
+            files.save_reference(out / f"{track.name}_{name}_{kind}.npz", reference)
+            cpu_s = reference.found["cpu_s"]
+            print(f"{track.name} {kind}: {reference.time_s:.4f} s, {cpu_s} CPU s", flush=True)
+    flights, is_good = verified(out, courses)
+    references = write_page(page, flights)
     if page is not None:
-        write_pictures(page, [reference for reference, _, _ in replays], known)
+        write_pictures(page, references, courses)
     raise SystemExit(0 if is_good else 1)
 
 
