@@ -177,7 +177,7 @@ def main(
     every = product(
         range(first, plants), rows.split(","), motion.split(","), map(int, rate.split(","))
     )
-    trials = [Trial(row, number, seed, *flown) for number, row, *flown in every]
+    trials = [Trial(row, number, seed, moved, per_s) for number, row, moved, per_s in every]
     record_trials(LINES, trials, plant)
 
 

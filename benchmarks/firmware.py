@@ -268,7 +268,7 @@ def figures(by_row: Mapping[str, list[Line]]) -> list[report.Figure]:
     errors = [line["error"] for line in changed if line["found"] and line["error"]]
     seconds = [line["cpu_s"] for lines in by_row.values() for line in lines]
     ratio = "extended over refitted"
-    values = {
+    values: dict[str, tuple[list[float], Callable[..., Any], str]] = {
         f"{ratio}: largest at any horizon": ([max(one.values()) for one in errors], np.max, ".3f"),
         f"{ratio} after 1 s: median": (
             [one["1"] for one in errors if "1" in one],
@@ -319,8 +319,8 @@ def main(
     set-ups with two changes. champion: starts of it, 0 for none.
     """
     trials = [
-        Trial("matched", *flown, seed=seed)
-        for flown in product(SETUPS, ("full", "gentle"), [()], range(matched))
+        Trial("matched", setup, flown, (), number, seed)
+        for setup, flown, number in product(SETUPS, ("full", "gentle"), range(matched))
     ]
     changes = [(kind,) for kind in KINDS for _ in range(single)]
     kinds = [kind for kind in KINDS if kind != "expo"]  # it is made of the settings of the rates

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from benchmarks.real.crafts import CRAFTS
 from benchmarks.real.crazyflie import DATA, LINES, VARIABLE, crazyflie_part
-from benchmarks.real.section import draw, section
+from benchmarks.real.section import draw_errors, format_section
 from benchmarks.report import RESULTS, command, filled, write_json
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import png_of
@@ -39,8 +39,8 @@ def page() -> tuple[str, dict[str, bytes]]:
         measured = json.loads(record_path(name).read_text(encoding="utf-8"))
         parts.append(craft.part(measured))
         for number, (title, one) in enumerate(craft.diagnoses(measured).items()):
-            file, figure = f"real_{name}_{number}.png", draw(one)
-            parts += [f"### {title}" if title else "", section(one, file)]
+            file, figure = f"real_{name}_{number}.png", draw_errors(one)
+            parts += [f"### {title}" if title else "", format_section(one, file)]
             if figure is not None:
                 pictures[file] = png_of(figure)
     return "\n\n".join(part.strip("\n") for part in parts if part) + "\n", pictures

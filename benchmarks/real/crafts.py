@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks import report
 from benchmarks.real.black_boxes import base_steps, flown, linear_ones, posed, rows_of
 from benchmarks.real.crazyflie import AS_GOOD, FOLDER, MOST, SPACING_S, by_flight, flights
-from benchmarks.real.section import Record, diagnosed, imported, tested
+from benchmarks.real.section import Record, diagnose_log, import_mapped, test_model
 from benchmarks.report import table
 from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_sysid import FlightLog, import_log
@@ -52,9 +52,9 @@ def gecko(data: Path) -> Record:
 
     The second half of the flight is held out.
     """
-    found = imported(data / GECKO / GECKO_FILE, "betaflight", GECKO_MAPPING)
+    found = import_mapped(data / GECKO / GECKO_FILE, "betaflight", GECKO_MAPPING)
     held_out = found.log.time > 0.5 * (found.log.time[0] + found.log.time[-1])
-    diagnosis, record = diagnosed(found.log, found.nominal_model(), held_out)
+    diagnosis, record = diagnose_log(found.log, found.nominal_model(), held_out)
     log, base = posed(found.log), diagnosis.base._replace(effects=())
     with jax.enable_x64(True):
         windows = windows_of(found.log, held_out)
@@ -125,11 +125,11 @@ def nanobench(data: Path) -> Record:
     folds = []
     for judged in HALVES:
         held_out = np.isin(log.segment, [names.index(name) for name in judged.split()])
-        diagnosis, record = diagnosed(log, model, held_out)
+        diagnosis, record = diagnose_log(log, model, held_out)
         with jax.enable_x64(True):
             windows = make_windows(log, held_out, SPACING_S, MOST)
             models = {"refitted_base": diagnosis.base, "extended": diagnosis.extended}
-            results = {name: tested(one, windows) for name, one in models.items()}
+            results = {name: test_model(one, windows) for name, one in models.items()}
         ratios = by_flight(results, log.segment[windows.start])
         record["by_flight"] = {names[int(number)]: one for number, one in ratios.items()}
         folds.append(record)
@@ -192,7 +192,7 @@ def payload_flights(
     data: Path, names: Sequence[str], mass_kg: float
 ) -> tuple[FlightLog, ModelParameters]:
     """Return logs as one, and the nominal model of a mass."""
-    found = imported(
+    found = import_mapped(
         [data / name for name in names], "usd", PAYLOAD_MAPPING.format(mass_kg=mass_kg)
     )
     return found.log, found.nominal_model()
@@ -234,16 +234,16 @@ def payload(data: Path) -> Record:
         per_command = [
             np.median(log["f"][:, 2]) / np.median(log["u"][:, 3] + 1.0) for log in (known, judged)
         ]
-        model, of_model = diagnosed(known, in_proportion(nominal, per_command[0]))
+        model, of_model = diagnose_log(known, in_proportion(nominal, per_command[0]))
         reference = in_proportion(model.extended, per_command[0])
-        found, record = diagnosed(judged, reference)
+        found, record = diagnose_log(judged, reference)
         records[name] = record | {
             "model": of_model["diagnosis"]["causes"],
             "ratio": thrust_of(found.extended, judged) / thrust_of(reference, judged),
             "force_per_command_ratio": float(per_command[1] / per_command[0]),
         }
     logs = payload_flights(data, PAIRS[OWN_MODEL].judged, PAIRS[OWN_MODEL].judged_kg)
-    return records | {OWN_MODEL_RECORD: diagnosed(*logs)[1]}
+    return records | {OWN_MODEL_RECORD: diagnose_log(*logs)[1]}
 
 
 def payload_part(record: Record) -> str:
@@ -277,13 +277,13 @@ def crazyflie(data: Path) -> Record:
         flights(data / FOLDER, policies) for policies in (LEARNT, JUDGED)
     )
     log = joined([learnt, judged])
-    return diagnosed(log, model, np.arange(len(log)) >= len(learnt))[1]
+    return diagnose_log(log, model, np.arange(len(log)) >= len(learnt))[1]
 
 
 def betaflight(data: Path) -> Record:
     """Return the diagnosis of the Betaflight log; held out are the last of every four blocks."""
-    found = imported(data / BETAFLIGHT / "shortLog.BFL", "betaflight", QUAD)
-    return diagnosed(found.log, found.nominal_model())[1]
+    found = import_mapped(data / BETAFLIGHT / "shortLog.BFL", "betaflight", QUAD)
+    return diagnose_log(found.log, found.nominal_model())[1]
 
 
 class Craft(NamedTuple):

@@ -40,23 +40,23 @@ SPOKEN = (("attitude_rad", "0.25"), ("rates_rad_per_s", "0.25"), ("position_m", 
 WIDTH_IN, HEIGHT_IN = 2.6, 3.2
 
 
-def diagnosed(
+def diagnose_log(
     log: FlightLog, model: ModelParameters, held_out: np.ndarray | None = None
 ) -> tuple[Diagnosis, Record]:
     """Return a log's diagnosis, and a record of it: JSON values, number of rows, CPU time."""
     started = time.process_time()
-    found = diagnose(log, model, held_out)
-    return found, {
+    diagnosis = diagnose(log, model, held_out)
+    return diagnosis, {
         "num_rows": len(log),
         "cpu_s": time.process_time() - started,
         "jax": jax.__version__,
         "commit": commit_of_checkout(),
-        "sentence": verdict_of(found).text,
-        "diagnosis": found.as_json(),
+        "sentence": verdict_of(diagnosis).text,
+        "diagnosis": diagnosis.as_json(),
     }
 
 
-def imported(files: Path | Sequence[Path], kind: str, mapping: str) -> Imported:
+def import_mapped(files: Path | Sequence[Path], kind: str, mapping: str) -> Imported:
     """Return logs imported with a mapping that is given as text."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "mapping.toml"
@@ -67,7 +67,7 @@ def imported(files: Path | Sequence[Path], kind: str, mapping: str) -> Imported:
 _errors = jax.jit(prediction_errors)
 
 
-def tested(model: ModelParameters, windows: Windows) -> Tested:
+def test_model(model: ModelParameters, windows: Windows) -> Tested:
     """Return a model's errors on windows; inside ``jax.enable_x64(True)``."""
     model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
     parts = [np.asarray(_errors(model, chunk)) for chunk in chunks_of(windows)]
@@ -75,7 +75,7 @@ def tested(model: ModelParameters, windows: Windows) -> Tested:
     return Tested(errors.reshape(1, *errors.shape[:-1], len(QUANTITIES), 3), windows)
 
 
-def number(value: float | None, unit: str = "1") -> str:
+def format_number(value: float | None, unit: str = "1") -> str:
     """Return three digits, and the unit if there is one."""
     text = "none" if value is None or not np.isfinite(value) else f"{value:.3g}"
     return text if unit == "1" else f"{text} {unit}"
@@ -87,97 +87,105 @@ def in_degrees(key: str, value: float) -> tuple[float, str]:
     key: "attitude_rad", "rates_rad_per_s", ...
     """
     unit = key.split("_", 1)[1].replace("_per_", "/")
-    return (
-        (float(np.rad2deg(value)), unit.replace("rad", "deg"))
-        if unit.startswith("rad")
-        else (value, unit)
-    )
+    if unit.startswith("rad"):
+        return float(np.rad2deg(value)), unit.replace("rad", "deg")
+    return value, unit
 
 
-def paragraph(measured: Record) -> str:
+def describe(measured: Record) -> str:
     """Return what is wrong with the model, in words."""
-    found = measured["diagnosis"]
-    parts = [measured["sentence"], _values(found), _responses(found["half_response_s"])]
-    return " ".join(filter(None, [*parts, _flights(found["prediction"])]))
+    diagnosis = measured["diagnosis"]
+    parts = [
+        measured["sentence"],
+        _describe_values(diagnosis["causes"]),
+        _describe_responses(diagnosis["half_response_s"]),
+        _describe_flights(diagnosis["prediction"]),
+    ]
+    return " ".join(filter(None, parts))
 
 
-def _values(found: Record) -> str:
+def _describe_values(causes: list[Record]) -> str:
     texts = []
-    for cause in found["causes"]:
-        told = cause["parameters"]
-        told = {name: one for name, one in told.items() if name == "mean_factor"} or told
-        values = [
-            f"{name.replace('_', ' ')} {number(one['value'], one['unit'])}"
-            for name, one in told.items()
-        ]
-        if len(values) <= MOST_VALUES:
-            texts.append(f"{words_of(cause['effect'])}: {', '.join(values)}")
+    for cause in causes:
+        parameters = cause["parameters"]
+        if "mean_factor" in parameters:
+            parameters = {"mean_factor": parameters["mean_factor"]}
+        if len(parameters) <= MOST_VALUES:
+            values = ", ".join(
+                f"{name.replace('_', ' ')} {format_number(one['value'], one['unit'])}"
+                for name, one in parameters.items()
+            )
+            texts.append(f"{words_of(cause['effect'])}: {values}")
     return f"In numbers: {'; '.join(texts)}." if texts else ""
 
 
-def _responses(found: Mapping[str, Mapping[str, Record]]) -> str:
-    if not found:
+def _describe_responses(by_model: Mapping[str, Mapping[str, Record]]) -> str:
+    if not by_model:
         return ""
 
-    def time_of(one: Record) -> str:
-        high = (one["ci95"] or (None, None))[1]
-        half = None if high is None else high - one["time"]
-        if half is not None and half > one["time"]:
-            return "not determined"
-        return f"{1e3 * one['time']:.0f}" + ("" if half is None else f" ± {1e3 * half:.0f}")
+    def format_time(response: Record) -> str:
+        time_s = response["time"]
+        if response["ci95"] is None:
+            return f"{1e3 * time_s:.0f}"
+        half_s = response["ci95"][1] - time_s
+        return "not determined" if half_s > time_s else f"{1e3 * time_s:.0f} ± {1e3 * half_s:.0f}"
 
-    def times(model: str) -> str:
-        known = {stick: one for stick, one in found[model].items() if one["time"] is not None}
-        return ", ".join(f"{stick} {time_of(one)}" for stick, one in known.items())
+    def format_times(model: str) -> str:
+        return ", ".join(
+            f"{stick} {format_time(response)}"
+            for stick, response in by_model[model].items()
+            if response["time"] is not None
+        )
 
     return (
         "From a small step of the stick to half of the answer it takes, in ms: "
-        f"{times('extended')}; the model said {times('nominal')}."
+        f"{format_times('extended')}; the model said {format_times('nominal')}."
     )
 
 
-def _flights(prediction: Record) -> str:
-    errors, texts = prediction["errors"], []
+def _describe_flights(prediction: Record) -> str:
+    errors, texts, sentences = prediction["errors"], [], []
     for key, horizon in SPOKEN:
         if horizon in errors.get("extended", {}).get(key, {}):
-            pairs = [
-                in_degrees(key, errors[name][key][horizon])
-                for name in ("nominal", "refitted_base", "extended")
+            values = [
+                f"{in_degrees(key, errors[name][key][horizon])[0]:.3g}"
+                for name in ("extended", "nominal", "refitted_base")
             ]
-            nominal, base, own = (f"{value:.3g}" for value, _ in pairs)
-            what = key.split("_")[0]
+            unit, quantity = in_degrees(key, 0.0)[1], key.split("_")[0]
             texts.append(
-                f"{what} {own} {pairs[0][1]} after {horizon} s (nominal {nominal}, refitted {base})"
+                f"{quantity} {values[0]} {unit} after {horizon} s "
+                f"(nominal {values[1]}, refitted {values[2]})"
             )
-    said = f"Errors of free flight that was held out: {'; '.join(texts)}." if texts else ""
-    silent = [what for what, horizons in prediction["evidence"].items() if not horizons]
+    if texts:
+        sentences.append(f"Errors of free flight that was held out: {'; '.join(texts)}.")
+    silent = [quantity for quantity, horizons in prediction["evidence"].items() if not horizons]
     if silent:
-        said += (
-            f" Of {' and '.join(silent)}, a guess from the start alone, without commands, "
+        sentences.append(
+            f"Of {' and '.join(silent)}, a guess from the start alone, without commands, "
             "is as good."
         )
-    return said
+    return " ".join(sentences)
 
 
-def draw(measured: Record) -> Figure | None:
+def draw_errors(measured: Record) -> Figure | None:
     """Draw held-out errors of free flight over its length, a panel a quantity; None without any."""
     errors = measured["diagnosis"]["prediction"]["errors"]
     if not errors:
         return None
-    keys = list(errors["extended"])
-    figure = new_figure(max(WIDTH_IN * len(keys), 2 * WIDTH_IN), HEIGHT_IN)
-    for axes, key in zip(figure.subplots(1, len(keys), squeeze=False)[0], keys, strict=True):
-        unit = in_degrees(key, 0.0)[1]
+    by_quantity = errors["extended"]
+    figure = new_figure(max(WIDTH_IN * len(by_quantity), 2 * WIDTH_IN), HEIGHT_IN)
+    panels = figure.subplots(1, len(by_quantity), squeeze=False)[0]
+    for axes, (key, horizons) in zip(panels, by_quantity.items(), strict=True):
         for name, style in STYLES.items():
             by_horizon = errors.get(name, {}).get(key)
             if by_horizon:
-                values = [in_degrees(key, one)[0] for one in by_horizon.values()]
+                seconds = [*map(float, by_horizon)]
+                values = [in_degrees(key, value)[0] for value in by_horizon.values()]
                 label = name.replace("_", " ")
-                plain(axes).loglog(
-                    [*map(float, by_horizon)], values, markersize=3, label=label, **style
-                )
-        axes.set_title(f"{key.split('_')[0]} ({unit})", fontsize="small", loc="left")
-        axes.set_xticks([*map(float, errors["extended"][key])], [*errors["extended"][key]])
+                plain(axes).loglog(seconds, values, markersize=3, label=label, **style)
+        title = f"{key.split('_')[0]} ({in_degrees(key, 0.0)[1]})"
+        axes.set_title(title, fontsize="small", loc="left")
+        axes.set_xticks([*map(float, horizons)], [*horizons])
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter("{x:g}")
         axes.minorticks_off()
@@ -188,61 +196,59 @@ def draw(measured: Record) -> Figure | None:
     return figure
 
 
-def causes_table(found: Record) -> str:
+def causes_table(diagnosis: Record) -> str:
     """Return the causes with intervals, gains and what they may be confused with."""
     rows = []
-    for cause in (*found["causes"], *found["beyond_the_list"]):
-        values = "<br>".join(
-            f"{name} {number(one['value'], one['unit'])} ({' to '.join(map(number, one['ci95']))})"
+    for cause in (*diagnosis["causes"], *diagnosis["beyond_the_list"]):
+        values = [
+            f"{name} {format_number(one['value'], one['unit'])} ({_interval(one)})"
             for name, one in cause["parameters"].items()
-        )
-        values += (
-            f"<br>**not named; beyond the list: {cause['beyond']}**" if cause["beyond"] else ""
-        )
+        ]
+        if cause["beyond"]:
+            values.append(f"**not named; beyond the list: {cause['beyond']}**")
+        gains = [cause[key] for key in ("chi2_gain", "heldout_gain", "lambda", "lambda_sep")]
         rival = cause["closest_rival"]
-        against = f"no (closest: {rival})" if rival else "not tried"
-        gains = (cause["chi2_gain"], cause["heldout_gain"], cause["lambda"], cause["lambda_sep"])
-        alike = ", ".join(cause["equivalent"]) or against
-        rows.append([f"`{cause['effect']}`", values, *map(number, gains), alike])
+        none = f"no (closest: {rival})" if rival else "not tried"
+        equivalent = ", ".join(cause["equivalent"]) or none
+        name = f"`{cause['effect']}`"
+        rows.append([name, "<br>".join(values), *map(format_number, gains), equivalent])
     header = (
         "cause | values, 95 % intervals | chi2_gain | heldout_gain | lambda | lambda_sep | alike?"
     )
     return table(header, rows)
 
 
-def errors_table(found: Record) -> str:
+def _interval(estimate: Record) -> str:
+    return " to ".join(map(format_number, estimate["ci95"]))
+
+
+def errors_table(diagnosis: Record) -> str:
     """Return the errors of the models on held-out rows, of one step and of free flight."""
-    models, flights = found["error"], found["prediction"]["errors"]
-    columns = [*models, *(name for name in flights if name not in models)]
-    rows = [
-        [f"{channel}, one step, NRMSE"]
-        + [number(models.get(name, {}).get("one_step_nrmse", {}).get(channel)) for name in columns]
-        for channel in models["nominal"]["one_step_nrmse"]
-    ]
-    for quantity, by_horizon in flights.get("nominal", {}).items():
-        what, unit = quantity.split("_", 1)
-        rows += [
-            [f"{what} after {horizon} s, {unit.replace('_per_', '/')}"]
-            + [number(flights.get(name, {}).get(quantity, {}).get(horizon)) for name in columns]
-            for horizon in by_horizon
-        ]
-    return table(
-        ["rms error on held-out rows", *(name.replace("_", " ") for name in columns)], rows
-    )
+    one_step = {name: error["one_step_nrmse"] for name, error in diagnosis["error"].items()}
+    flights = diagnosis["prediction"]["errors"]
+    columns = [*dict.fromkeys([*one_step, *flights])]
+    rows = []
+    for channel in one_step["nominal"]:
+        cells = [format_number(one_step.get(name, {}).get(channel)) for name in columns]
+        rows.append([f"{channel}, one step, NRMSE", *cells])
+    for key, by_horizon in flights.get("nominal", {}).items():
+        quantity, unit = key.split("_", 1)
+        for horizon in by_horizon:
+            errors = [flights.get(name, {}).get(key, {}).get(horizon) for name in columns]
+            title = f"{quantity} after {horizon} s, {unit.replace('_per_', '/')}"
+            rows.append([title, *map(format_number, errors)])
+    heads = [name.replace("_", " ") for name in columns]
+    return table(["rms error on held-out rows", *heads], rows)
 
 
-def changed_table(found: Record) -> str:
+def changed_table(diagnosis: Record) -> str:
     """Return every parameter of the extended model that is not nominal."""
-    rows = [
-        [
-            f"`{one['name']}`",
-            number(one["nominal"], one["unit"]),
-            number(one["value"], one["unit"])
-            + (" (end of what is searched)" if one["is_at_bound"] else ""),
-            " to ".join(map(number, one["ci95"])),
-        ]
-        for one in found["changed"]
-    ]
+    rows = []
+    for one in diagnosis["changed"]:
+        nominal, value = (format_number(one[key], one["unit"]) for key in ("nominal", "value"))
+        if one["is_at_bound"]:
+            value += " (end of what is searched)"
+        rows.append([f"`{one['name']}`", nominal, value, _interval(one)])
     return table("parameter | nominal | extended | 95 % interval", rows)
 
 
@@ -251,29 +257,29 @@ def formulas_of(learned: Record) -> list[str]:
     return [one["formula"] for one in learned["law"]]
 
 
-def section(measured: Record, picture: str) -> str:
-    """Return what was found in one diagnosis; picture: the file of ``draw``."""
-    found = measured["diagnosis"]
-    left, learned = found["unexplained"]["times_sensor_noise"], found.get("learned")
-    shares = ", ".join(
-        f"{name} ({number(share)} times the sensor's noise)" for name, share in left.items()
-    )
-    small = ", ".join(f"`{cause['effect']}`" for cause in found["negligible"])
+def format_section(measured: Record, picture: str) -> str:
+    """Return what was found in one diagnosis; picture: the file of ``draw_errors``."""
+    diagnosis = measured["diagnosis"]
+    unexplained = [
+        f"{name} ({format_number(share)} times the sensor's noise)"
+        for name, share in diagnosis["unexplained"]["times_sensor_noise"].items()
+    ]
+    small = ", ".join(f"`{cause['effect']}`" for cause in diagnosis["negligible"])
+    learned = diagnosis.get("learned")
     cost = f"{measured['cpu_s']:.0f} CPU s, compilation included; commit {measured['commit']}"
+    has_flights = diagnosis["prediction"]["errors"]
     parts = [
-        paragraph(measured),
-        f"![Errors of free flight over its length]({picture})"
-        if found["prediction"]["errors"]
-        else "",
-        f"{measured['num_rows']} rows; verdict `{found['verdict']}`; "
-        f"motion `{found['motion']}`; {cost}.",
-        causes_table(found),
+        describe(measured),
+        f"![Errors of free flight over its length]({picture})" if has_flights else "",
+        f"{measured['num_rows']} rows; verdict `{diagnosis['verdict']}`; "
+        f"motion `{diagnosis['motion']}`; {cost}.",
+        causes_table(diagnosis),
         f"Significant, and too small to matter: {small}." if small else "",
-        errors_table(found),
+        errors_table(diagnosis),
         "Every parameter that changed:",
-        changed_table(found),
-        f"Unexplained: {shares or 'nothing'}.",
+        changed_table(diagnosis),
+        f"Unexplained: {', '.join(unexplained) or 'nothing'}.",
         f"Learnt beyond the list: {'; '.join(formulas_of(learned))}." if learned else "",
-        *found["warnings"],
+        *diagnosis["warnings"],
     ]
     return "\n\n".join(filter(None, parts))
