@@ -33,7 +33,8 @@ from flytrack_sysid import LogError, import_log, log_file
 from flytrack_sysid.importing import load_mapping
 from flytrack_sysid.log import log_of_states
 from flytrack_sysid.manoeuvres import MANOEUVRES
-from tests.support import black_boxes, foreign_logs
+from tests.support import black_boxes
+from tests.support.foreign_logs import WRITERS, flying, write_csv
 from tests.support.slow import slow_but
 from tests.support.written_logs import read_mapping
 
@@ -52,10 +53,8 @@ TOKENS = (
     b"9" * 5000,
 )
 SETTINGS = b"total_timesteps = 2e6\nhidden_sizes = [64, 64]\nlearning_rate = 3e-4\n"
-STATES, ACTIONS = (
-    np.tile(black_boxes.start(), (12, 1)),
-    np.random.default_rng(0).uniform(-1.0, 1.0, (12, 4)),
-)
+STATES = np.tile(black_boxes.start(), (12, 1))
+ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (12, 4))
 
 
 class Trap:
@@ -87,6 +86,20 @@ class Kind(NamedTuple):
         return path.read_bytes()
 
 
+def imported(kind: str, suffix: str, is_slow: bool = True, **options: Any) -> Kind:
+    """Return a kind of log that is imported, with the mapping beside the valid one."""
+    form, write = WRITERS[kind]
+
+    def save(path: Path) -> None:
+        write(path.parent, flying())[0].rename(path)
+
+    def load(path: Path) -> Any:
+        mapping = path.with_name("map.toml")
+        return import_log(path, form, mapping if mapping.exists() else None).log
+
+    return Kind(suffix, save, load, LogError, is_slow=is_slow, **options)
+
+
 def npz(arrays: dict[str, np.ndarray]) -> bytes:
     """Return arrays as a compressed archive."""
     content = io.BytesIO()
@@ -110,30 +123,22 @@ def hostile_arrays(content: bytes) -> list[bytes]:
         np.zeros(2**27, np.int8),
         np.full(8, 2**31 - 1, np.int32).view("<U1"),
     )
+    odd_arrays = [npz({**arrays, name: value}) for value in odd]
     header = npz(arrays).replace(b"'shape': (", b"'shape': (9")
     version = content.replace(b"\x93NUMPY\x01", b"\x93NUMPY\x02")
     unannounced = io.BytesIO()
     with zipfile.ZipFile(unannounced, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(f"{name}.npy", npy(arrays[name]) + bytes(2**28))
         archive.getinfo(f"{name}.npy").file_size = len(npy(arrays[name]))
-    odd_arrays = (npz({**arrays, name: value}) for value in odd)
     return [*odd_arrays, header, content + content, version, unannounced.getvalue()]
 
 
 def hostile_texts(content: bytes) -> list[bytes]:
     """Return texts that are very long, nested deeply, or have keys of very many parts."""
-    dots, nested = (
-        b"\n".join(b"a%d" % number + b".a" * 999 + b" = 1" for number in range(100)),
-        b"[" * 10**5,
-    )
-    return [
-        content + b" " * 2**26,
-        content + b"x" * 2**22,
-        nested,
-        b"a = " + nested,
-        dots,
-        b"9" * 10**5,
-    ]
+    dots = b"\n".join(b"a%d" % number + b".a" * 999 + b" = 1" for number in range(100))
+    nested, digits = b"[" * 10**5, b"9" * 10**5
+    long_texts = [content + b" " * 2**26, content + b"x" * 2**22]
+    return [*long_texts, nested, b"a = " + nested, dots, digits]
 
 
 def hostile_gzips(_: bytes) -> list[bytes]:
@@ -143,13 +148,6 @@ def hostile_gzips(_: bytes) -> list[bytes]:
         gzip.compress(b"\n" * 2**28, 1),
         gzip.compress(b"") * 100_000,
     ]
-
-
-def import_mapped(path: Path, form: str) -> Any:
-    """Return the log in a file of a format that needs a mapping."""
-    mapping = path.with_name(f"mapping_of_{form}.toml")
-    mapping.write_text(read_mapping(form))
-    return import_log(path, form, mapping).log
 
 
 def save_script(path: Path) -> None:
@@ -163,54 +161,40 @@ def save_log(path: Path) -> None:
     sysid.save_log(path, log_of_states([(STATES, ACTIONS)], 0.01))
 
 
+def save_packed(path: Path) -> None:
+    """Write a compressed CSV log."""
+    write_csv(path.parent, flying())
+    path.write_bytes(gzip.compress((path.parent / "a.csv").read_bytes(), mtime=0))
+
+
 TRACK = (TRACK_FOLDER / "flytrack.toml").read_bytes()
 REFERENCE = shipped_path("flytrack", "flying", "nominal").read_bytes()
-CSV = foreign_logs.foreign_csv()
 DRAGGED = nominal_parameters().with_effects(QuadraticDrag(0.1, 0.1, 0.2))
 save_drag = partial(save_model, model=DRAGGED, provenance={})
-load_csv, load_usd, load_bag = (partial(import_mapped, form=form) for form in ("csv", "usd", "bag"))
-load_ulog, load_blackbox, load_dataflash = (
-    partial(import_log, format=form) for form in ("ulog", "betaflight", "dataflash")
-)
+save_flight = partial(save_rollout, states=STATES, actions=ACTIONS)
+BLACK_BOX, POLICY = black_boxes.SHIPPED.read_bytes(), CHAMPION.read_bytes()
+MAPPING = read_mapping("every_unit").encode()
 KINDS = {
     "track": Kind(".toml", TRACK, load_track, TrackError, hostile_texts),
     "model": Kind(".json", save_drag, load_model, ModelFileError, hostile_texts),
-    "rollout": Kind(
-        ".npy", partial(save_rollout, states=STATES, actions=ACTIONS), load_rollout, RolloutError
-    ),
+    "rollout": Kind(".npy", save_flight, load_rollout, RolloutError),
     "flight log, .npz": Kind(".npz", save_log, sysid.load_log, LogError, hostile_arrays),
     "flight log, .csv": Kind(".csv", save_log, sysid.load_log, LogError, hostile_texts),
     "script": Kind(".npz", save_script, sysid.load_script, sysid.ScriptError, hostile_arrays),
     "reference": Kind(".npz", REFERENCE, load_reference, ReferenceFileError, hostile_arrays),
-    "import mapping": Kind(
-        ".toml", read_mapping("csv").encode(), load_mapping, LogError, hostile_texts
+    "import mapping": Kind(".toml", MAPPING, load_mapping, LogError, hostile_texts),
+    "imported CSV": imported("CSV", ".csv", False, hostile=hostile_texts),
+    "imported CSV, gzip": imported("CSV", ".csv.gz", False, hostile=hostile_gzips)._replace(
+        valid=save_packed
     ),
-    "imported CSV": Kind(".csv", CSV, load_csv, LogError, hostile_texts),
-    "imported CSV, gzip": Kind(
-        ".csv.gz", gzip.compress(CSV, mtime=0), load_csv, LogError, hostile_gzips
-    ),
-    "imported PX4 log": Kind(".ulg", foreign_logs.ulog(), load_ulog, LogError, is_slow=True),
-    "imported Betaflight log": Kind(
-        ".bbl", foreign_logs.betaflight(), load_blackbox, LogError, is_slow=True
-    ),
-    "imported ArduPilot log": Kind(
-        ".bin",
-        foreign_logs.small_dataflash(1.0 + 0.01 * np.arange(30)),
-        load_dataflash,
-        LogError,
-        is_slow=True,
-    ),
-    "imported uSD log": Kind("", foreign_logs.usd(), load_usd, LogError),
-    "imported bag": Kind(".mcap", foreign_logs.save_bag, load_bag, LogError, is_slow=True),
+    "imported PX4 log": imported("ULog", ".ulg"),
+    "imported Betaflight log": imported("blackbox", ".bbl"),
+    "imported ArduPilot log": imported("DataFlash", ".bin"),
+    "imported uSD log": imported("uSD", "", False),
+    "imported bag": imported("bag", ".mcap"),
     "training settings": Kind(".toml", SETTINGS, read_config_file, ConfigError, hostile_texts),
-    "checkpoint": Kind(CHAMPION.suffix, CHAMPION.read_bytes(), load_checkpoint, CheckpointError),
-    "black box": Kind(
-        ".bin",
-        black_boxes.SHIPPED.read_bytes(),
-        blackbox.load,
-        blackbox.BlackBoxError,
-        is_slow=True,
-    ),
+    "checkpoint": Kind(CHAMPION.suffix, POLICY, load_checkpoint, CheckpointError),
+    "black box": Kind(".bin", BLACK_BOX, blackbox.load, blackbox.BlackBoxError, is_slow=True),
 }
 SLOW = {"imported CSV, gzip", "black box"}  # seconds for the crafted files
 
@@ -284,17 +268,17 @@ def unpickled() -> list[str]:
 def test_damaged_and_hostile_files_are_loaded_or_refused(
     kind: str, tmp_path: Path, unpickled: list[str]
 ) -> None:
-    own, path, outcomes = KINDS[kind], tmp_path / f"a{KINDS[kind].suffix}", []
-    valid = own.content(tmp_path)
+    file_kind, outcomes = KINDS[kind], list[bool]()
+    path, valid = tmp_path / f"b{file_kind.suffix}", file_kind.content(tmp_path)
 
     def check(content: bytes) -> None:
         path.write_bytes(content)
         unpickled.clear()
-        outcomes.append(loaded_or_refused(own, path))
+        outcomes.append(loaded_or_refused(file_kind, path))
         assert not unpickled
 
     settings = hypothesis.settings(
-        max_examples=NUM_SLOW_FILES if own.is_slow else NUM_FILES,
+        max_examples=NUM_SLOW_FILES if file_kind.is_slow else NUM_FILES,
         deadline=None,
         database=None,
         derandomize=True,
@@ -302,7 +286,7 @@ def test_damaged_and_hostile_files_are_loaded_or_refused(
     )
     check(valid)
     assert outcomes == [True]
-    for content in own.hostile(valid):
+    for content in file_kind.hostile(valid):
         check(content)
     settings(hypothesis.given(damaged(valid))(check))()
     assert not all(outcomes)
@@ -318,28 +302,23 @@ def test_what_is_no_such_file_is_refused(
         "pickle": pickle.dumps(Trap()),
         "cut": KINDS[kind].content(tmp_path)[:40],
     }
-    paths = [
-        Path(name + KINDS[kind].suffix)
-        for name in ("missing", "folder", "pipe", "device", *contents)
-    ]
-    paths[1].mkdir()
-    os.mkfifo(paths[2])
-    paths[3].symlink_to("/dev/zero")
-    for path, content in zip(paths[4:], contents.values(), strict=True):
-        path.write_bytes(content)
-    for path in paths:
-        with pytest.raises(KINDS[kind].error, match=path.name):
-            KINDS[kind].load(path)
+    suffix = KINDS[kind].suffix
+    for name, content in contents.items():
+        Path(name + suffix).write_bytes(content)
+    Path(f"folder{suffix}").mkdir()
+    os.mkfifo(f"pipe{suffix}")
+    Path(f"device{suffix}").symlink_to("/dev/zero")
+    for name in (*contents, "folder", "pipe", "device", "missing"):
+        with pytest.raises(KINDS[kind].error, match=name + suffix):
+            KINDS[kind].load(Path(name + suffix))
 
 
 def test_compressed_logs_are_read_and_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(log_file, "PACKED_BYTES", 50_000)
-    text, mapping = CSV, tmp_path / "map.toml"
-    mapping.write_text(read_mapping("csv"))
-    (tmp_path / "a.csv").write_bytes(text)
-    expected = import_log(tmp_path / "a.csv", "csv", mapping).log
+    path, mapping = write_csv(tmp_path, flying())
+    expected, text = import_log(path, "csv", mapping).log, path.read_bytes()
     path = tmp_path / "a.csv.gz"
     path.write_bytes(gzip.compress(text[:100]) + gzip.compress(text[100:]) + bytes(100))
     assert (import_log(path, "csv", mapping).log["w"] == expected["w"]).all()

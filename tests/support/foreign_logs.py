@@ -1,6 +1,11 @@
-"""Writers of small valid logs in the formats that are imported: PX4, Betaflight, uSD, MCAP, CSV."""
+"""Writers of flights in the formats that are imported, each by its specification.
+
+What is written of a log is command, rates, specific force and voltage, and where the format has
+them, position, velocity and attitude.
+"""
 
 import json
+import re
 import struct
 import zlib
 from collections.abc import Callable, Iterable
@@ -8,107 +13,124 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from flytrack_sysid import FlightLog
+from tests.support.handout_plant import GRAVITY
 from tests.support.tables import table
 from tests.support.written_logs import read_mapping
 
-ULOG_TYPES = {"uint64_t": "Q", "float": "f", "bool": "?", "uint8_t": "B"}
-NUM_ROWS = 30
+FLIP = np.array([1.0, -1.0, -1.0])  # FLU to FRD; north, west, up to NED
+Rows = list[tuple[Any, ...]]
 
 
-class UlogWriter:
-    """A ULog file by PX4's specification: header, definitions, subscriptions, data."""
-
-    def __init__(self, parameters: dict[str, float]):
-        self.definitions = self.message("B", bytes(40)) + b"".join(
-            self.message("P", self.key(f"float {name}") + struct.pack("<f", value))
-            for name, value in parameters.items()
-        )
-        self.data = b""
-        self.num_topics = 0
-
-    @staticmethod
-    def message(kind: str, content: bytes) -> bytes:
-        return struct.pack("<Hc", len(content), kind.encode()) + content
-
-    @staticmethod
-    def key(text: str) -> bytes:
-        return struct.pack("<B", len(text)) + text.encode()
-
-    def add(
-        self,
-        name: str,
-        fields: list[tuple[str, str, int]],
-        rows: list[tuple[Any, ...]],
-        instance: int = 0,
-    ) -> None:
-        """Add a topic: fields are (type, name, array size or 0), rows flat, time in us first."""
-        fields = [("uint64_t", "timestamp", 0), *fields]
-        text = "".join(
-            f"{kind}{f'[{size}]' if size else ''} {field};" for kind, field, size in fields
-        )
-        if not instance:
-            self.definitions += self.message("F", f"{name}:{text}".encode())
-        pattern = "<" + "".join(ULOG_TYPES[kind] * max(size, 1) for kind, _, size in fields)
-        self.data += self.message(
-            "A", struct.pack("<BH", instance, self.num_topics) + name.encode()
-        )
-        for row in rows:
-            content = struct.pack("<H", self.num_topics) + struct.pack(pattern, *row)
-            self.data += self.message("D", content)
-        self.num_topics += 1
-
-    def content(self) -> bytes:
-        """Return the file."""
-        return b"ULog\x01\x12\x35" + struct.pack("<BQ", 1, 0) + self.definitions + self.data
-
-
-PARAMETERS = {"MC_ACRO_R_MAX": 720.0, "MC_ROLLRATE_MAX": 220.0, "MC_ACRO_P_MAX": 360.0}
-PARAMETERS |= {"MC_ACRO_Y_MAX": 90.0, "MC_YAWRATE_MAX": 180.0}
-STEP_US = 4000
-TIMES_US = 1_000_000 + STEP_US * np.arange(200)
-EAST = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # NED, FRD: nose east
-XYZ = [("float", "x", 0), ("float", "y", 0), ("float", "z", 0)]
-VXYZ = [("float", "vx", 0), ("float", "vy", 0), ("float", "vz", 0)]
-SETPOINT = [("float", "roll", 0), ("float", "pitch", 0), ("float", "yaw", 0)]
-
-
-def constant(values: tuple[float, ...], times: np.ndarray = TIMES_US) -> list[tuple[Any, ...]]:
-    """Return rows of the same values."""
-    return [(int(time), *values) for time in times]
-
-
-def topics() -> dict[str, tuple[list, list]]:
-    """Return fields and rows of the topics of a drone with its nose east, turning, pulling up."""
-    slow = TIMES_US[::5]
-    place = constant((1.0, 2.0, -3.0, 4.0, 5.0, -6.0), slow)
-    setpoints = constant(
-        (*np.deg2rad([360.0, 90.0, -45.0]), 0.0, 0.0, -0.75), slow
-    )  # half of the full stick
-    return {
-        "vehicle_angular_velocity": ([("float", "xyz", 3)], constant((0.1, 0.2, 0.3))),
-        "vehicle_acceleration": ([("float", "xyz", 3)], constant((0.5, 0.25, -9.75))),
-        "vehicle_attitude": ([("float", "q", 4)], constant(EAST, slow)),
-        "vehicle_local_position": ([*XYZ, *VXYZ], place),
-        "vehicle_rates_setpoint": ([*SETPOINT, ("float", "thrust_body", 3)], setpoints),
-        "battery_status": ([("float", "voltage_v", 0)], constant((16.25,), TIMES_US[::100])),
+def flying(num_rows: int = 30, step_s: float = 0.01, start_s: float = 1.0) -> FlightLog:
+    """Return a steady turn with the throttle rising."""
+    time = start_s + step_s * np.arange(num_rows)
+    channels = {
+        "u": np.column_stack([np.tile([0.5, -0.25, 0.25], (num_rows, 1)), 2 * time / time[-1] - 1]),
+        "w": np.tile(np.deg2rad([100.0, -50.0, 25.0]), (num_rows, 1)),
+        "f": np.tile(GRAVITY * np.array([0.5, -0.25, 1.0]), (num_rows, 1)),
+        "v_bat": np.full((num_rows, 1), 24.1),
     }
+    return FlightLog(time, channels, np.zeros(num_rows, int))
+
+
+def _rows(stamps: np.ndarray, *columns: np.ndarray) -> Rows:
+    """Return rows of a stamp and numbers."""
+    values = np.column_stack(columns).tolist()
+    return [(int(stamp), *row) for stamp, row in zip(stamps, values, strict=True)]
+
+
+# --- PX4 ------------------------------------------------------------------------------------------
+
+ULOG_TYPES = {"uint64_t": "Q", "float": "f", "bool": "?"}
+PX4_FULL_STICK_DEG_S = (720.0, 360.0, 180.0)
+PX4_PARAMETERS = {"MC_ACRO_R_MAX": 720.0, "MC_ROLLRATE_MAX": 220.0, "MC_ACRO_P_MAX": 360.0}
+PX4_PARAMETERS |= {"MC_ACRO_Y_MAX": 90.0, "MC_YAWRATE_MAX": 180.0}
+Topics = dict[str, tuple[Any, ...]]
+
+
+def ulog_message(kind: str, content: bytes) -> bytes:
+    """Return a message of a ULog file."""
+    return struct.pack("<Hc", len(content), kind.encode()) + content
+
+
+def ulog(topics: Topics, parameters: dict[str, float] = PX4_PARAMETERS) -> bytes:
+    """Return a PX4 log of topics: their fields but the time, and the rows of each instance."""
+    definitions, data, number = ulog_message("B", bytes(40)), b"", 0
+    for name, value in parameters.items():
+        key = f"float {name}".encode()
+        definitions += ulog_message("P", bytes([len(key)]) + key + struct.pack("<f", value))
+    for name, (fields, *instances) in topics.items():
+        fields = f"uint64_t timestamp;{fields};"
+        definitions += ulog_message("F", f"{name}:{fields}".encode())
+        types = re.findall(r"(\w+)(?:\[(\d+)\])? \w+;", fields)
+        pattern = "<H" + "".join(ULOG_TYPES[kind] * int(size or 1) for kind, size in types)
+        for instance, rows in enumerate(instances):
+            subscription = struct.pack("<BH", instance, number) + name.encode()
+            data += ulog_message("A", subscription)
+            data += b"".join(ulog_message("D", struct.pack(pattern, number, *row)) for row in rows)
+            number += 1
+    return b"ULog\x01\x12\x35" + struct.pack("<BQ", 1, 0) + definitions + data
+
+
+def ulog_topics(log: FlightLog) -> Topics:
+    """Return the topics of a flight: FRD and NED, all at the same times."""
+    stamps, level = np.round(1e6 * log.time), np.tile([1.0, 0.0, 0.0, 0.0], (len(log), 1))
+    attitude = log["q"] * [1.0, 1.0, -1.0, -1.0] if "q" in log else level
+    setpoints = log["u"][:, :3] * np.deg2rad(PX4_FULL_STICK_DEG_S) * FLIP
+    thrust_b = np.outer(-0.5 * (log["u"][:, 3] + 1.0), [0.0, 0.0, 1.0])
+    topics = {
+        "battery_status": ("float voltage_v", _rows(stamps, log["v_bat"])),
+        "vehicle_angular_velocity": ("float[3] xyz", _rows(stamps, log["w"] * FLIP)),
+        "vehicle_acceleration": ("float[3] xyz", _rows(stamps, log["f"] * FLIP)),
+        "vehicle_attitude": ("float[4] q", _rows(stamps, attitude)),
+    }
+    if "p" in log:
+        fields = "float x;float y;float z;float vx;float vy;float vz"
+        rows = _rows(stamps, log["p"] * FLIP, log["v"] * FLIP)
+        topics["vehicle_local_position"] = (fields, rows)
+    fields = "float roll;float pitch;float yaw;float[3] thrust_body"
+    topics["vehicle_rates_setpoint"] = (fields, _rows(stamps, setpoints, thrust_b))
+    return topics
+
+
+def write_ulog(folder: Path, log: FlightLog) -> tuple[Path, None]:
+    """Write a PX4 log."""
+    (folder / "a.ulg").write_bytes(ulog(ulog_topics(log)))
+    return folder / "a.ulg", None
+
+
+# --- Betaflight -----------------------------------------------------------------------------------
+
+BLACKBOX_HEADERS = table("blackbox_headers")
+# Of these headers: 5.108 x 200; 200 / (1 - 0.7); 100 / (1 - 0.8).
+BLACKBOX_FULL_STICK_DEG_S = (1021.6, 200.0 / 0.3, 500.0)
+BLACKBOX_NAMES = [
+    "loopIteration",
+    "time",
+    *(f"setpoint[{axis}]" for axis in range(4)),
+    "vbatLatest",
+]
+BLACKBOX_NAMES += [f"{sensor}[{axis}]" for sensor in ("gyroADC", "accSmooth") for axis in range(3)]
 
 
 def _variable_bytes(value: int, is_signed: bool) -> bytes:
     """Return a whole number as blackbox logs have it: zigzag if signed, seven bits a byte."""
     rest = (value << 1 if value >= 0 else (-value << 1) - 1) if is_signed else value
-    found = bytearray()
+    content = bytearray()
     while rest > 0x7F:
-        found.append(rest & 0x7F | 0x80)
+        content.append(rest & 0x7F | 0x80)
         rest >>= 7
-    return bytes([*found, rest])
+    return bytes([*content, rest])
 
 
-BLACKBOX_HEADERS = table("blackbox_headers")
-
-
-def blackbox(rows: np.ndarray, names: list[str], headers: dict[str, str]) -> bytes:
+def blackbox(
+    rows: np.ndarray,
+    names: list[str] = BLACKBOX_NAMES,
+    headers: dict[str, str] = BLACKBOX_HEADERS,
+) -> bytes:
     """Return a blackbox log of full frames only: rows (num_rows, len(names)) of whole numbers."""
     signed = [int(name not in ("loopIteration", "time")) for name in names]
     lines = {
@@ -120,74 +142,160 @@ def blackbox(rows: np.ndarray, names: list[str], headers: dict[str, str]) -> byt
         "Field I encoding": ",".join(str(1 - sign) for sign in signed),
         **headers,
     }
-    text = "".join(f"H {name}:{value}\n" for name, value in lines.items()).encode()
-    frames = b"".join(
-        b"I"
-        + b"".join(
-            _variable_bytes(int(value), bool(sign)) for value, sign in zip(row, signed, strict=True)
-        )
-        for row in rows
-    )
-    return text + frames + b"E\xffEnd of log\x00"
+    content = "".join(f"H {name}:{value}\n" for name, value in lines.items()).encode()
+    for row in rows.astype(int).tolist():
+        content += b"I"
+        content += b"".join(map(_variable_bytes, row, signed))
+    return content + b"E\xffEnd of log\x00"
 
 
-BLACKBOX_NAMES = [
-    "loopIteration",
-    "time",
-    *(f"setpoint[{axis}]" for axis in range(4)),
-    "vbatLatest",
-]
-BLACKBOX_NAMES += [f"{sensor}[{axis}]" for sensor in ("gyroADC", "accSmooth") for axis in range(3)]
+def blackbox_frames(log: FlightLog) -> np.ndarray:
+    """Return frames: setpoints and gyro in deg/s, accelerometer in 1/2048 g, in whole numbers."""
+    columns = [
+        np.arange(len(log)),
+        1e6 * log.time,
+        log["u"][:, :3] * BLACKBOX_FULL_STICK_DEG_S,
+        500.0 * (log["u"][:, 3] + 1.0),
+        100.0 * log["v_bat"],
+        np.rad2deg(log["w"]),
+        2048.0 / GRAVITY * log["f"],
+    ]
+    return np.round(np.column_stack(columns)).astype(int)
 
 
-def blackbox_frames(num_rows: int = 200) -> np.ndarray:
-    """Return frames of a steady turn, the throttle rising, at 2 kHz."""
-    row = [0, 0, 511, -333, 250, 0, 2410, 100, -50, 25, 1024, -512, 2048]
-    found, count = np.tile(row, (num_rows, 1)), np.arange(num_rows)
-    found[:, 0], found[:, 1], found[:, 5] = (
-        count,
-        5_000_000 + 500 * count,
-        np.linspace(0, 1000, num_rows),
-    )
-    return found
+def write_betaflight(folder: Path, log: FlightLog) -> tuple[Path, None]:
+    """Write a blackbox log."""
+    (folder / "a.bbl").write_bytes(blackbox(blackbox_frames(log)))
+    return folder / "a.bbl", None
 
 
-def usd_log(
-    events: dict[str, tuple[dict[str, str], np.ndarray]], version: int = 2, in_order: bool = True
+# --- ArduPilot ------------------------------------------------------------------------------------
+
+DATAFLASH_HEAD, DATAFLASH_FORMAT = b"\xa3\x95", 128
+# Types of values by their letter, as ``struct`` has them.
+DATAFLASH_TYPES = {"Q": "Q", "f": "f", "B": "B", "H": "H", "N": "16s", "Z": "64s", "n": "4s"}
+COPTER_PARAMETERS = {
+    "ACRO_RP_RATE": 360.0,
+    "ACRO_Y_RATE": 180.0,
+    "ATC_RATE_R_MAX": 500.0,
+    "FRAME_CLASS": 1.0,
+}
+COPTER_FULL_STICK_DEG_S = (500.0, 360.0, 180.0)
+# Of a message: types and names of its fields, of which the first is the time, us; and its rows.
+Messages = dict[str, tuple[str, str, Rows]]
+
+
+def dataflash(
+    messages: Messages,
+    parameters: dict[str, float] = COPTER_PARAMETERS,
+    text: str = "ArduCopter V4.5.1 (d4a1b2c3)",
 ) -> bytes:
+    """Return an ArduPilot log; messages are written one kind after the other."""
+    stored = [(0, name, value) for name, value in parameters.items()]
+    messages = {
+        "FMT": ("BBnNZ", "Type,Length,Name,Format,Columns", []),
+        "PARM": ("QNf", "TimeUS,Name,Value", stored),
+        "MSG": ("QZ", "TimeUS,Message", [(0, text)]),
+        **messages,
+    }
+
+    def pattern(types: str) -> str:
+        return "<" + "".join(DATAFLASH_TYPES[kind] for kind in types)
+
+    def packed(number: int, types: str, row: tuple[Any, ...]) -> bytes:
+        values = []
+        for kind, value in zip(types, row, strict=True):
+            is_text = isinstance(value, str)
+            values.append(value.encode() if is_text else value if kind == "f" else round(value))
+        return DATAFLASH_HEAD + bytes([number]) + struct.pack(pattern(types), *values)
+
+    formats, rows = b"", b""
+    for number, (name, (types, columns, values)) in enumerate(messages.items(), DATAFLASH_FORMAT):
+        size = 3 + struct.calcsize(pattern(types))
+        formats += packed(DATAFLASH_FORMAT, "BBnNZ", (number, size, name, types, columns))
+        rows += b"".join(packed(number, types, row) for row in values)
+    return formats + rows
+
+
+def dataflash_messages(log: FlightLog) -> Messages:
+    """Return the messages of a flight: FRD and NED, degrees, all at the same times."""
+    stamps, zero = np.round(1e6 * log.time), np.zeros(len(log))
+    setpoints = (log["u"][:, :3] * COPTER_FULL_STICK_DEG_S * FLIP).T
+    rates = np.rad2deg(log["w"] * FLIP).T
+    axes = [
+        column
+        for setpoint, rate in zip(setpoints, rates, strict=True)
+        for column in (setpoint, rate, zero)
+    ]
+    throttle = 0.5 * (log["u"][:, 3] + 1.0)
+    messages = {
+        "BAT": ("QBf", "TimeUS,Instance,Volt", _rows(stamps, zero, log["v_bat"])),
+        "IMU": (
+            "QBffffffBB",
+            "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,GH,AH",
+            _rows(stamps, zero, log["w"] * FLIP, log["f"] * FLIP, zero + 1.0, zero + 1.0),
+        ),
+    }
+    if "q" in log:
+        quat = log["q"] * [1.0, 1.0, -1.0, -1.0]
+        euler = Rotation.from_quat(quat, scalar_first=True).as_euler("ZYX", degrees=True)[:, ::-1]
+        messages["ATT"] = ("Qfff", "TimeUS,Roll,Pitch,Yaw", _rows(stamps, euler))
+        messages["XKQ"] = ("QBffff", "TimeUS,C,Q1,Q2,Q3,Q4", _rows(stamps, zero, quat))
+    if "p" in log:
+        rows = _rows(stamps, zero, log["v"] * FLIP, log["p"] * FLIP)
+        messages["XKF1"] = ("QBffffff", "TimeUS,C,VN,VE,VD,PN,PE,PD", rows)
+    columns = "TimeUS,RDes,R,ROut,PDes,P,POut,YDes,Y,YOut,ADes,A,AOut"
+    rows = _rows(stamps, *axes, zero, zero, throttle)
+    messages["RATE"] = ("Qffffffffffff", columns, rows)
+    return messages
+
+
+def write_dataflash(folder: Path, log: FlightLog) -> tuple[Path, None]:
+    """Write an ArduPilot log."""
+    (folder / "a.bin").write_bytes(dataflash(dataflash_messages(log)))
+    return folder / "a.bin", None
+
+
+# --- Formats whose columns a mapping names --------------------------------------------------------
+
+STICK_NAMES, SENSOR_NAMES = ("roll", "pitch", "yaw", "thrust"), ("p", "q", "r", "ax", "ay", "az")
+NAMES = (*STICK_NAMES, *SENSOR_NAMES, "volts")
+
+
+def _values(log: FlightLog) -> np.ndarray:
+    """Return columns of the names above, (num_rows, 11); rates in deg/s."""
+    return np.column_stack([log["u"], np.rad2deg(log["w"]), log["f"], log["v_bat"]])
+
+
+def write_mapping(folder: Path, clock: str = "", sticks: str = "", sensors: str = "") -> Path:
+    """Write a mapping of the columns, which have names with something before them."""
+    columns = read_mapping("columns").format(sticks=sticks, sensors=sensors)
+    (folder / "map.toml").write_text(clock + columns)
+    return folder / "map.toml"
+
+
+def usd_log(events: dict[str, tuple[dict[str, str], np.ndarray]], version: int = 2) -> bytes:
     """Return a Crazyflie's uSD log; each event has variables, and rows with the time in s first."""
     stamp, per_s = {1: ("I", 1e3), 2: ("Q", 1e6)}[version]
-    header, records = struct.pack("<BHH", 0xBC, version, len(events)), []
+    content, records = struct.pack("<BHH", 0xBC, version, len(events)), b""
     for number, (name, (variables, rows)) in enumerate(events.items()):
-        header += (
-            struct.pack("<H", number) + name.encode() + b"\0" + struct.pack("<H", len(variables))
-        )
-        header += b"".join(
-            f"{variable}({kind})".encode() + b"\0" for variable, kind in variables.items()
-        )
-        for time, *row in rows:
-            values = [
-                v if kind in "efd" else int(v)
-                for kind, v in zip(variables.values(), row, strict=True)
-            ]
-            content = struct.pack(
-                f"<H{stamp}{''.join(variables.values())}", number, round(time * per_s), *values
-            )
-            records.append((time, content))
-    records = sorted(records, key=lambda record: record[0]) if in_order else records
-    content = header + b"".join(content for _, content in records)
+        content += struct.pack("<H", number) + name.encode() + b"\0"
+        content += struct.pack("<H", len(variables))
+        content += b"".join(f"{name}({kind})\0".encode() for name, kind in variables.items())
+        pattern = f"<H{stamp}{''.join(variables.values())}"
+        for time, *row in rows.tolist():
+            kinds = zip(variables.values(), row, strict=True)
+            values = [value if kind in "fd" else int(value) for kind, value in kinds]
+            records += struct.pack(pattern, number, round(time * per_s), *values)
+    content += records
     return content + struct.pack("<I", zlib.crc32(content))
 
 
-def usd() -> bytes:
-    """Return a small uSD log that the mapping "usd" fits."""
-    variables = dict.fromkeys(("roll", "pitch", "yaw", "thrust", "gyro.x", "gyro.y"), "f") | {
-        "gyro.z": "h"
-    }
-    rows = np.tile((0.0, 0.5, -0.25, 0.1, 0.3, 10.0, -20.0, 30.0), (NUM_ROWS, 1))
-    rows[:, 0] = 1.0 + 0.01 * np.arange(NUM_ROWS)
-    slow = np.array([[0.9, 3900.0], [1.4, 3800.0]])
-    return usd_log({"fixedFrequency": (variables, rows), "battery": ({"pm.vbat": "H"}, slow)})
+def write_usd(folder: Path, log: FlightLog) -> tuple[Path, Path]:
+    """Write a uSD log."""
+    rows = np.column_stack([log.time, _values(log)])
+    (folder / "log00").write_bytes(usd_log({"fixedFrequency": (dict.fromkeys(NAMES, "f"), rows)}))
+    return folder / "log00", write_mapping(folder)
 
 
 def save_messages(path: Path, messages: Iterable[tuple[str, int, Any]]) -> None:
@@ -195,7 +303,7 @@ def save_messages(path: Path, messages: Iterable[tuple[str, int, Any]]) -> None:
     from mcap.writer import Writer
 
     with path.open("wb") as file:
-        writer, topics = Writer(file), {}
+        writer, topics = Writer(file), dict[str, int]()
         writer.start()
         schema = writer.register_schema("any", "jsonschema", b"{}")
         for topic, time_ns, content in messages:
@@ -206,214 +314,46 @@ def save_messages(path: Path, messages: Iterable[tuple[str, int, Any]]) -> None:
         writer.finish()
 
 
-def save_bag(path: Path) -> None:
-    """Write a small MCAP file that the mapping "bag" fits."""
-    rates = ({"x": 0.1 * row, "y": 0.0, "z": -0.1} for row in range(NUM_ROWS))
-    contents = ({"u": [0.5, -0.25, 0.1, 0.3], "w": rate} for rate in rates)
-    save_messages(path, (("/flight", row * 10**7, content) for row, content in enumerate(contents)))
-
-
-def ulog(tables: dict[str, tuple[list, list]] | None = None, parameters: Any = PARAMETERS) -> bytes:
-    """Return a PX4 log of topics: of a small one unless they are given."""
-    writer = UlogWriter(parameters)
-    for name, (fields, rows) in (topics() if tables is None else tables).items():
-        writer.add(name, fields, rows)
-    return writer.content()
-
-
-def betaflight() -> bytes:
-    """Return a small Betaflight log."""
-    return blackbox(blackbox_frames(NUM_ROWS), BLACKBOX_NAMES, BLACKBOX_HEADERS)
-
-
-def foreign_csv() -> bytes:
-    """Return a small CSV log that the mapping "csv" fits."""
-    names = ["ms", "ail", "ele", "rud", "thr", "p", "q", "r", "mv"]
-    rows = np.random.default_rng(3).normal(size=(NUM_ROWS, len(names)))
-    rows[:, 0], rows[:, 1:5], rows[:, -1] = 10.0 * np.arange(NUM_ROWS), 1500.0, 16_000.0
-    lines = [",".join(names), *(",".join(f"{value:.6g}" for value in row) for row in rows)]
-    return ("\n".join(lines) + "\n").encode()
-
-
-DATAFLASH_HEAD, DATAFLASH_FORMAT = b"\xa3\x95", 128
-# Of a type of value by its letter: that of ``struct``, and the factor of what is written.
-DATAFLASH_TYPES = {
-    "Q": ("Q", 1),
-    "f": ("f", 1),
-    "B": ("B", 1),
-    "H": ("H", 1),
-    "c": ("h", 100),
-    "N": ("16s", 1),
-}
-DATAFLASH_TYPES |= {"Z": ("64s", 1), "n": ("4s", 1), "b": ("b", 1)}
-COPTER_PARAMETERS = {
-    "ACRO_RP_RATE": 360.0,
-    "ACRO_Y_RATE": 180.0,
-    "ATC_RATE_R_MAX": 500.0,
-    "FRAME_CLASS": 1.0,
-}
-
-
-def dataflash(
-    messages: dict[str, tuple[str, str, list[tuple[Any, ...]]]],
-    parameters: dict[str, float] = COPTER_PARAMETERS,
-    text: str = "ArduCopter V4.5.1 (d4a1b2c3)",
-) -> bytes:
-    """Return an ArduPilot log by its specification.
-
-    Each message has types, names of fields, and rows.
-
-    The first value of a row is the time, us; messages are written one kind after the other.
-    """
-    known = {
-        "FMT": ("BBnNZ", "Type,Length,Name,Format,Columns", []),
-        "PARM": (
-            "QNf",
-            "TimeUS,Name,Value",
-            [(0, name, value) for name, value in parameters.items()],
-        ),
-        "MSG": ("QZ", "TimeUS,Message", [(0, text)]),
-        **messages,
-    }
-
-    def packed(number: int, types: str, row: tuple[Any, ...]) -> bytes:
-        pattern = "<" + "".join(DATAFLASH_TYPES[kind][0] for kind in types)
-        values = [
-            value.encode()
-            if isinstance(value, str)
-            else value * factor
-            if kind == "f"
-            else round(value * factor)
-            for kind, value, factor in zip(
-                types, row, (DATAFLASH_TYPES[kind][1] for kind in types), strict=True
-            )
-        ]
-        return DATAFLASH_HEAD + bytes([number]) + struct.pack(pattern, *values)
-
-    content, rows = b"", list[bytes]()
-    for number, (name, (types, columns, values)) in enumerate(
-        known.items(), start=DATAFLASH_FORMAT
-    ):
-        size = 3 + struct.calcsize("<" + "".join(DATAFLASH_TYPES[kind][0] for kind in types))
-        content += packed(DATAFLASH_FORMAT, "BBnNZ", (number, size, name, types, columns))
-        rows += [packed(number, types, row) for row in values]
-    return content + b"".join(rows)
-
-
-RATE_COLUMNS = "TimeUS,RDes,R,ROut,PDes,P,POut,YDes,Y,YOut,ADes,A,AOut"
-
-
-def small_dataflash(stamps_s: np.ndarray) -> bytes:
-    """Return an ArduPilot log of rates alone, with these stamps."""
-    rows = [
-        (round(1e6 * stamp_s), 180.0, 0.0, 0, 90.0, 0.0, 0, -45.0, float(row), 0, 0, 0, 0.6)
-        for row, stamp_s in enumerate(stamps_s)
-    ]
-    return dataflash({"RATE": ("Qffffffffffff", RATE_COLUMNS, rows)})
-
-
-def dataflash_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, None]:
-    """Write an ArduPilot log whose messages have these stamps."""
-    (folder / "a.bin").write_bytes(small_dataflash(stamps_s))
-    return folder / "a.bin", None
-
-
-# Logs of a drone that turns about z at as many deg/s as rows are before, so that rows can be told
-# apart.
-CLOCK_STICKS = (0.5, -0.25, 0.1, 0.3)
-
-
-def ulog_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, None]:
-    """Write a PX4 log whose topics all have these stamps."""
-    stamps_us = np.round(1e6 * stamps_s).astype(int)
-    turn = [(int(time), 0.0, 0.0, np.deg2rad(row)) for row, time in enumerate(stamps_us)]
-    setpoints = constant((*np.deg2rad([360.0, 90.0, -45.0]), 0.0, 0.0, -0.75), stamps_us)
-    tables = {
-        "vehicle_angular_velocity": ([("float", "xyz", 3)], turn),
-        "vehicle_attitude": ([("float", "q", 4)], constant(EAST, stamps_us)),
-        "vehicle_rates_setpoint": ([*SETPOINT, ("float", "thrust_body", 3)], setpoints),
-    }
-    (folder / "a.ulg").write_bytes(ulog(tables))
-    return folder / "a.ulg", None
-
-
-def betaflight_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, None]:
-    """Write a blackbox log with these stamps."""
-    rows = blackbox_frames(len(stamps_s))
-    rows[:, 1], rows[:, 9] = np.round(1e6 * stamps_s), np.arange(len(stamps_s))
-    rows[:, 5] = 500
-    (folder / "a.bbl").write_bytes(blackbox(rows, BLACKBOX_NAMES, BLACKBOX_HEADERS))
-    return folder / "a.bbl", None
-
-
-def _sticks_and_turn(stamps_s: np.ndarray) -> np.ndarray:
-    """Return rows of stamps, sticks and rates in deg/s, (num_rows, 8)."""
-    num_rows = len(stamps_s)
-    still, count = np.zeros(num_rows), np.arange(num_rows)
-    return np.column_stack([stamps_s, np.tile(CLOCK_STICKS, (num_rows, 1)), still, still, count])
-
-
-USD_NAMES = ("roll", "pitch", "yaw", "thrust", "gyro.x", "gyro.y", "gyro.z", "pm.vbat")
-
-
-def usd_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
-    """Write a uSD log with these stamps."""
-    rows = np.column_stack([_sticks_and_turn(stamps_s), np.full(len(stamps_s), 3900.0)])
-    events = {"fixedFrequency": (dict.fromkeys(USD_NAMES, "f"), rows)}
-    (folder / "log00").write_bytes(usd_log(events, in_order=False))
-    return folder / "log00", _with_mapping(folder, "usd")
-
-
-def bag_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
-    """Write an MCAP file of messages with these stamps, recorded at a steady rate."""
-    messages = []
-    for row, stamp_s in enumerate(stamps_s):
+def write_bag(folder: Path, log: FlightLog) -> tuple[Path, Path]:
+    """Write an MCAP file of messages with stamps, recorded at a steady rate."""
+    messages, step_ns = [], round(1e9 * np.median(np.diff(log.time)))
+    for row, (stamp_s, values) in enumerate(zip(log.time, _values(log), strict=True)):
         sec, nanosec = divmod(round(1e9 * stamp_s), 10**9)
-        header = {"stamp": {"sec": sec, "nanosec": nanosec}}
-        rates = {"x": 0.0, "y": 0.0, "z": np.deg2rad(row)}
-        messages.append(
-            ("/flight", row * 4_000_000, {"header": header, "u": CLOCK_STICKS, "w": rates})
-        )
+        content = {"header": {"stamp": {"sec": sec, "nanosec": nanosec}}}
+        content |= dict(zip(NAMES, values.tolist(), strict=True))
+        messages.append(("/flight", row * step_ns, content))
     save_messages(folder / "a.mcap", messages)
-    return folder / "a.mcap", _with_mapping(folder, "bag")
+    return folder / "a.mcap", write_mapping(folder, "", "/flight:", "/flight:")
 
 
-def csv_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
-    """Write a CSV file with these stamps."""
-    rows = _sticks_and_turn(stamps_s)
-    np.savetxt(
-        folder / "a.csv", rows, "%.9f", ",", header="t,roll,pitch,yaw,thrust,p,q,r", comments=""
-    )
-    return folder / "a.csv", _with_mapping(folder, "clock")
+def _save_csv(path: Path, names: Iterable[str], *columns: np.ndarray) -> None:
+    np.savetxt(path, np.column_stack(columns), "%.9f", ",", header=",".join(names), comments="")
 
 
-def csv_files_with_clock(folder: Path, stamps_s: np.ndarray) -> tuple[Path, Path]:
-    """Write two CSV files with these stamps, the second 0.5 ms earlier, in ms from 50 s on."""
-    rows, flight = _sticks_and_turn(stamps_s), folder / "flight"
+def write_csv(folder: Path, log: FlightLog) -> tuple[Path, Path]:
+    """Write a CSV file."""
+    _save_csv(folder / "a.csv", ["t", *NAMES], log.time, _values(log))
+    return folder / "a.csv", write_mapping(folder, '[time]\ncolumn = "t"\nunit = "s"\n')
+
+
+def write_csv_files(folder: Path, log: FlightLog) -> tuple[Path, Path]:
+    """Write two CSV files, that of the sticks 0.5 ms earlier, in ms from 50 s on."""
+    flight, values = folder / "flight", _values(log)
     flight.mkdir()
-    sticks = np.column_stack([1e3 * (rows[:, 0] - 50.0005), rows[:, 1:5]])
-    np.savetxt(
-        flight / "x_gyro_0.csv", rows[:, [0, 5, 6, 7]], "%.9f", ",", header="t,p,q,r", comments=""
-    )
-    np.savetxt(
-        flight / "x_rc_0.csv", sticks, "%.9f", ",", header="ms,roll,pitch,yaw,thrust", comments=""
-    )
-    return flight, _with_mapping(folder, "files")
+    _save_csv(flight / "x_gyro_0.csv", ["t", *NAMES[4:]], log.time, values[:, 4:])
+    sticks_ms = 1e3 * (log.time - 50.0005)
+    _save_csv(flight / "x_rc_0.csv", ["ms", *NAMES[:4]], sticks_ms, values[:, :4])
+    return flight, write_mapping(folder, read_mapping("files"), "rc:", "gyro:")
 
 
-def _with_mapping(folder: Path, name: str) -> Path:
-    """Copy a mapping of the tests into a folder."""
-    (folder / "map.toml").write_text(read_mapping(name))
-    return folder / "map.toml"
-
-
-# Of each kind of log: its format, and what writes it with given stamps.
-CLOCK_WRITERS: dict[str, tuple[str, Callable[[Path, np.ndarray], tuple[Path, Path | None]]]] = {
-    "ULog": ("ulog", ulog_with_clock),
-    "blackbox": ("betaflight", betaflight_with_clock),
-    "DataFlash": ("dataflash", dataflash_with_clock),
-    "uSD": ("usd", usd_with_clock),
-    "bag": ("bag", bag_with_clock),
-    "CSV": ("csv", csv_with_clock),
-    "CSV files": ("csv", csv_files_with_clock),
+# Of each kind of log: its format, and what writes a flight to a folder and returns the log and the
+# mapping to read it with.
+WRITERS: dict[str, tuple[str, Callable[[Path, FlightLog], tuple[Path, Path | None]]]] = {
+    "ULog": ("ulog", write_ulog),
+    "blackbox": ("betaflight", write_betaflight),
+    "DataFlash": ("dataflash", write_dataflash),
+    "uSD": ("usd", write_usd),
+    "bag": ("bag", write_bag),
+    "CSV": ("csv", write_csv),
+    "CSV files": ("csv", write_csv_files),
 }

@@ -19,11 +19,13 @@ def flight(
 ) -> FlightLog:
     """Return the log of a made-up flight; q, v and p may be written down late."""
     fine = np.arange(time[0] - 1.0, time[-1] + 1.0, 1e-3)
-    step = Rotation.from_rotvec(motion(1, 0.5 * (fine[1:] + fine[:-1])) * 1e-3)
-    quat = [Rotation.identity()]
-    for one in step:
-        quat.append(quat[-1] * one)
-    attitude = Rotation.concatenate(quat)
+    turns = motion(1, 0.5 * (fine[1:] + fine[:-1])) * 1e-3
+    attitude = Rotation.from_rotvec(np.concatenate([np.zeros((1, 3)), turns]))
+    distance = 1  # products of the last 1, 2, 4, ... turns, until they are of all
+    while distance < len(fine):
+        products = attitude[:-distance] * attitude[distance:]
+        attitude = Rotation.concatenate([attitude[:distance], products])
+        distance *= 2
     acc_w = motion(2, fine)
     vel_w = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5e-3 * (acc_w[1:] + acc_w[:-1]), axis=0)])
     pos_w = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5e-3 * (vel_w[1:] + vel_w[:-1]), axis=0)])

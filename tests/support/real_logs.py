@@ -1,10 +1,12 @@
 """Where the tests find measured flights."""
 
 import os
+from functools import cache
 from pathlib import Path
 
 import pytest
 
+from flytrack_sysid import Imported, import_log
 from tests.support.pages import ROOT
 
 VARIABLE = "FLYTRACK_SHARED_DATA"
@@ -17,3 +19,10 @@ def shared(name: str) -> Path:
     if not folder.is_dir():
         pytest.skip(f"no measured flights at {folder}; {VARIABLE} can name the folder of {name}")
     return folder
+
+
+@cache
+def import_shared(where: str, form: str, mapping: str | None = None) -> Imported:
+    """Return a measured flight, imported once; where: its folder and file."""
+    folder, _, file = where.partition("/")
+    return import_log(shared(folder) / file, form, mapping)

@@ -42,30 +42,31 @@ def motion(time: Any) -> Rotation:
 
 def messages() -> list[tuple[int, str, Any]]:
     """Return stamp, ns, topic and message at 50, 200 and 100 Hz over 5 s, in order of time."""
-    found = []
-    for topic, (_, step_ns) in KINDS.items():
+    stamped = []
+    for topic, (kind, step_ns) in KINDS.items():
         for stamp_ns in range(START_NS, START_NS + 5 * 10**9, step_ns):
             time = (stamp_ns - START_NS) * 1e-9
-            header = made("Header", made("Time", *divmod(stamp_ns, 10**9)), "")
+            zero = made("Vector3", 0.0, 0.0, 0.0)
             if topic == "/sticks":
                 axes = np.array([np.sin(time), 0.0, 0.0, 0.5], np.float32)
-                message = made("Joy", header, axes, np.zeros(0, np.int32))
+                content = (axes, np.zeros(0, np.int32))
             elif topic == "/twist":
-                turn = made("Vector3", 0.5 * np.cos(time), 0.0, 0.0)
-                message = made(
-                    "TwistStamped", header, made("Twist", made("Vector3", 0.0, 0.0, 0.0), turn)
-                )
+                content = (made("Twist", zero, made("Vector3", 0.5 * np.cos(time), 0.0, 0.0)),)
             else:
-                place = made("Point", time, 0.0, 1.0)
                 attitude = made("Quaternion", *motion(time).as_quat())
-                message = made("PoseStamped", header, made("Pose", place, attitude))
-            found.append((stamp_ns, topic, message))
-    return sorted(found, key=lambda one: one[0])
+                content = (made("Pose", made("Point", time, 0.0, 1.0), attitude),)
+            header = made("Header", made("Time", *divmod(stamp_ns, 10**9)), "")
+            message = made(kind.rpartition("/")[2], header, *content)
+            stamped.append((stamp_ns, topic, message))
+    return sorted(stamped, key=lambda entry: entry[0])
 
 
-def write_ros2(folder: Path, storage: str) -> Path:
+def write_ros2(folder: Path, storage: str, is_compressed: bool = False) -> Path:
     """Write a bag of ROS 2."""
-    with Writer(folder / "bag", version=9, storage_plugin=StoragePlugin[storage]) as writer:
+    unopened = Writer(folder / "bag", version=9, storage_plugin=StoragePlugin[storage])
+    if is_compressed:
+        unopened.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    with unopened as writer:
         topics = {
             topic: writer.add_connection(topic, kind, typestore=TYPES)
             for topic, (kind, _) in KINDS.items()
@@ -78,11 +79,10 @@ def write_ros2(folder: Path, storage: str) -> Path:
 
 def write_json(folder: Path) -> Path:
     """Write an MCAP file of JSON, without stamps."""
-    contents = (
-        (topic, stamp_ns, dataclasses.asdict(message)) for stamp_ns, topic, message in messages()
-    )
-    unstamped = ((topic, at, {**content, "header": None}) for topic, at, content in contents)
-    save_messages(folder / "flight.mcap", unstamped)
+    contents = []
+    for stamp_ns, topic, message in messages():
+        contents.append((topic, stamp_ns, {**dataclasses.asdict(message), "header": None}))
+    save_messages(folder / "flight.mcap", contents)
     return folder / "flight.mcap"
 
 
@@ -94,101 +94,70 @@ WRITERS = {
 }
 
 
-def test_a_bag_compressed_as_a_whole_is_told_and_the_command_named_makes_it_one_that_is_read(
-    tmp_path,
-):
-    storage = StoragePlugin.SQLITE3
-    unopened = Writer(tmp_path / "bag", version=9, storage_plugin=storage)
-    unopened.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
-    with unopened as writer:
-        topics = {
-            topic: writer.add_connection(topic, kind, typestore=TYPES)
-            for topic, (kind, _) in KINDS.items()
-        }
-        for stamp_ns, topic, message in messages():
-            writer.write(topics[topic], stamp_ns, TYPES.serialize_cdr(message, KINDS[topic][0]))
+@pytest.fixture
+def mapping(tmp_path: Path) -> Path:
+    """Return the path of the mapping."""
     (tmp_path / "map.toml").write_text(MAPPING)
+    return tmp_path / "map.toml"
+
+
+def test_the_command_named_for_a_bag_compressed_as_a_whole_makes_it_readable(tmp_path, mapping):
+    write_ros2(tmp_path, "SQLITE3", is_compressed=True)
     with pytest.raises(LogError, match=r"bag: compressed as a whole, .*: rosbags-convert") as error:
-        import_log(tmp_path / "bag", "bag", tmp_path / "map.toml")
-    assert "damaged" not in str(error.value)
+        import_log(tmp_path / "bag", "bag", mapping)
     program, *arguments = str(error.value).rpartition("first: ")[2].split()
     subprocess.run([Path(sys.executable).with_name(program), *arguments], check=True)
-    plain = import_log(tmp_path / "bag_plain", "bag", tmp_path / "map.toml").log
-    (tmp_path / "other").mkdir()
-    expected = import_log(
-        write_ros2(tmp_path / "other", "SQLITE3"), "bag", tmp_path / "map.toml"
-    ).log
-    np.testing.assert_array_equal(plain["w"], expected["w"])
+    assert len(import_log(tmp_path / "bag_plain", "bag", mapping).log) >= 990
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_what_was_written_is_read_back(tmp_path, kind):
-    (tmp_path / "map.toml").write_text(MAPPING)
-    found = import_log(WRITERS[kind](tmp_path), "bag", tmp_path / "map.toml", align=False)
-    log, time = found.log, found.log.time
-    assert len(log) >= 990 and np.diff(time) == pytest.approx(
-        0.005, abs=1e-6
-    )  # the rates' own rows
+def test_what_was_written_is_read_back(tmp_path, mapping, kind):
+    imported = import_log(WRITERS[kind](tmp_path), "bag", mapping, align=False)
+    log, time = imported.log, imported.log.time
+    assert len(log) >= 990
+    assert np.diff(time) == pytest.approx(0.005, abs=1e-6)  # the rates' own rows
     np.testing.assert_allclose(log["w"][:, 0], 0.5 * np.cos(time), atol=1e-6)
     np.testing.assert_allclose(log["p"][:, 0], time, atol=1e-6)  # interpolated
-    assert (
-        Rotation.from_quat(log["q"], scalar_first=True).inv() * motion(time)
-    ).magnitude().max() < 1e-4
-    np.testing.assert_allclose(
-        log["u"][:, 0], np.sin(np.floor(time / 0.02 + 1e-6) * 0.02), atol=1e-6
-    )  # held
-    is_told = any("times are those of their recording" in note for note in found.notes)
-    assert is_told == (kind == "MCAP of JSON") and log["u"][:, 3] == pytest.approx(0.5)
+    attitude = Rotation.from_quat(log["q"], scalar_first=True)
+    assert (attitude.inv() * motion(time)).magnitude().max() < 1e-4
+    held = np.sin(np.floor(time / 0.02 + 1e-6) * 0.02)
+    np.testing.assert_allclose(log["u"][:, 0], held, atol=1e-6)
+    assert log["u"][:, 3] == pytest.approx(0.5)
+    is_noted = "times are those of their recording" in " ".join(imported.notes)
+    assert is_noted == (kind == "MCAP of JSON")
 
 
-def test_what_lacks_a_topic_or_a_field_is_refused(tmp_path):
-    mapping, flight = tmp_path / "map.toml", write_json(tmp_path)
-    for path, old, new, message in (
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
         (
-            flight,
             "/twist:twist.angular.x",
             "/gyro:x",
             "topic /gyro: no messages; found /pose, /sticks, /tw",
         ),
-        (
-            flight,
-            "twist.angular.x",
-            "rate",
-            "topic /twist: field rate: not a number in messages of type any",
-        ),
-        (
-            flight,
-            "/sticks:axes[0]",
-            "roll",
-            r"map\.toml: command: found roll, expected topic:field",
-        ),
-    ):
-        mapping.write_text(MAPPING.replace(old, new, 1))
-        with pytest.raises(LogError, match=message):
-            import_log(path, "bag", mapping)
+        ("twist.angular.x", "rate", "topic /twist: field rate: not a number in messages of type"),
+        ("/sticks:axes[0]", "roll", r"map\.toml: command: found roll, expected topic:field"),
+    ],
+)
+def test_what_lacks_a_topic_or_a_field_is_refused(tmp_path, mapping, old, new, message):
+    mapping.write_text(MAPPING.replace(old, new, 1))
+    with pytest.raises(LogError, match=message):
+        import_log(write_json(tmp_path), "bag", mapping)
 
 
-def test_topics_of_other_epochs_are_put_together_by_their_recording(tmp_path):
+def test_topics_of_other_epochs_are_put_together_by_their_recording(tmp_path, mapping):
     """The pose counts from the boot of its sensor; the recorder has one clock for all."""
-    found = []
+    boot_ns = START_NS - 77 * 10**9
+    contents = []
     for stamp_ns, topic, message in messages():
-        content = dataclasses.asdict(message)
-        boot_ns = START_NS - 77 * 10**9 if topic == "/pose" else 0
-        sec, nanosec = divmod(stamp_ns - boot_ns, 10**9)
-        found.append(
-            (
-                topic,
-                stamp_ns + RECORDED_LATE_NS,
-                {**content, "header": {"stamp": {"sec": sec, "nanosec": nanosec}}},
-            )
-        )
-    save_messages(tmp_path / "flight.mcap", found)
-    (tmp_path / "map.toml").write_text(MAPPING)
-    imported = import_log(tmp_path / "flight.mcap", "bag", tmp_path / "map.toml", align=False)
+        sec, nanosec = divmod(stamp_ns - boot_ns * (topic == "/pose"), 10**9)
+        header = {"stamp": {"sec": sec, "nanosec": nanosec}}
+        content = {**dataclasses.asdict(message), "header": header}
+        contents.append((topic, stamp_ns + RECORDED_LATE_NS, content))
+    save_messages(tmp_path / "flight.mcap", contents)
+    imported = import_log(tmp_path / "flight.mcap", "bag", mapping, align=False)
     position_m = imported.log["p"][:, 0]  # 1 m/s
     assert position_m[0] < 0.0051  # the rounding of 77 s may cost the first row
     np.testing.assert_allclose(position_m - position_m[0], imported.log.time, atol=1e-5)
-    assert any(
-        f"stamps of q are {START_NS * 1e-9 - 77:+.6g} s before those of w" in note
-        for note in imported.notes
-    )
+    note = f"stamps of q are {START_NS * 1e-9 - 77:+.6g} s before those of w"
+    assert note in " ".join(imported.notes)

@@ -1,5 +1,6 @@
-"""ArduPilot's DataFlash logs: a made-up flight comes back in our frames."""
+"""ArduPilot's DataFlash logs: instances, other rates, full stick, and other vehicles."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -7,193 +8,109 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from flytrack_sysid import LogError, import_log
-from tests.support.foreign_logs import COPTER_PARAMETERS, RATE_COLUMNS, dataflash
-from tests.support.made_flight import GRAVITY, flight
+from flytrack_sysid import FlightLog, Imported, LogError, import_log
+from tests.support.foreign_logs import COPTER_PARAMETERS, Messages, dataflash, dataflash_messages
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed: pip install 'flytrack[logs]'")
 
-TURN = np.array([1.0, -1.0, -1.0])  # FRD to FLU, NED to north, west, up
-TIME_S = 0.0025 * np.arange(4800)
-START_US = 7_000_000
-TRUTH = flight(TIME_S)
-FULL_STICK_DEG_S = np.array([500.0, 360.0, 180.0])
-Messages = dict[str, tuple[str, str, list[tuple[Any, ...]]]]
+
+@pytest.fixture
+def messages(truth: FlightLog) -> Messages:
+    """Return the messages of 5 s of the made flight."""
+    return dataflash_messages(truth.select(slice(500)))
 
 
-def rows_of(every: int, *columns: Any) -> list[tuple[Any, ...]]:
-    """Return rows of stamps and columns; each of every so many samples."""
-    stamps_us = np.round(START_US + 1e6 * TIME_S)
-    table = np.column_stack(
-        [
-            stamps_us,
-            *(np.broadcast_to(column, (len(TIME_S), *np.shape(column)[1:])) for column in columns),
-        ]
+@pytest.fixture
+def read(tmp_path: Path) -> Callable[..., Imported]:
+    """Return the import of messages."""
+
+    def import_messages(messages: Messages, mapping: str = "", **options: Any) -> Imported:
+        (tmp_path / "a.bin").write_bytes(dataflash(messages, **options))
+        (tmp_path / "map.toml").write_text(mapping)
+        return import_log(tmp_path / "a.bin", "dataflash", tmp_path / "map.toml", align=False)
+
+    return import_messages
+
+
+def change(messages: Messages, name: str, **columns: Any) -> list[tuple[Any, ...]]:
+    """Return the rows of a message with other values in some columns."""
+    rows = np.array(messages[name][2])
+    for column, value in columns.items():
+        rows[:, messages[name][1].split(",").index(column)] = value
+    return [(int(row[0]), *row[1:].tolist()) for row in rows]
+
+
+def test_the_first_healthy_instance_is_used(truth, messages, read):
+    healthy, volts = change(messages, "IMU", I=1), change(messages, "BAT", Instance=1)
+    volts[100] = (*volts[100][:2], 0.0)  # one reading fails
+    broken = change(messages, "IMU", GyrX=0.0, GH=0)
+    messages["IMU"] = (*messages["IMU"][:2], broken + healthy + change(messages, "IMU", I=2, GH=0))
+    messages["BAT"] = (*messages["BAT"][:2], change(messages, "BAT", Volt=0.0) + volts)
+    del messages["RATE"][2][1::2]  # which leaves the IMU's rates as the faster ones
+    imported = read(messages)
+    rows = np.round(100.0 * imported.log.time).astype(int)
+    np.testing.assert_allclose(imported.log["w"], truth["w"][rows], atol=1e-5)
+    np.testing.assert_allclose(imported.log["v_bat"], truth["v_bat"][rows], atol=1e-5)
+    notes = " ".join(imported.notes)
+    assert "instance 1 of IMU is used, not 0 (not healthy), 2" in notes
+    assert "instance 1 of BAT is used, not 0 (not healthy)" in notes
+    assert "1 of 500 voltages of battery 1 are not above 0" in notes and "rates of IMU" in notes
+
+
+def test_angles_are_read_where_there_are_no_quaternions(truth, messages, read):
+    del messages["XKQ"]
+    log = read(messages).log
+    attitude, expected = (
+        Rotation.from_quat(quat, scalar_first=True) for quat in (log["q"], truth["q"][: len(log)])
     )
-    return [(int(row[0]), *row[1:].tolist()) for row in table[::every]]
+    assert np.max((attitude.inv() * expected).magnitude()) < 1e-4
 
 
-def messages() -> Messages:
-    """Return the messages of the made flight: NED and FRD, degrees."""
-    attitude = Rotation.from_quat(TRUTH["q"], scalar_first=True)
-    half = Rotation.from_rotvec([np.pi, 0.0, 0.0])
-    ned = half * attitude * half
-    quat, euler = ned.as_quat(scalar_first=True), ned.as_euler("ZYX", degrees=True)[:, ::-1]
-    rates = np.rad2deg(TRUTH["w"] * TURN)
-    setpoints = TRUTH["u"][:, :3] * FULL_STICK_DEG_S * TURN
-    zero = np.zeros(len(TIME_S))
-    columns = [zero] * 12
-    columns[0:9:3], columns[1:9:3] = list(setpoints.T), list(rates.T)
-    columns[11] = 0.5 * (TRUTH["u"][:, 3] + 1.0)
-    imu = (TRUTH["w"] * TURN, TRUTH["f"] * TURN)
-    imu_columns = "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,GH,AH"
-    instance = [(0, 0.0, 1.0), (1, 1.0, 1.0), (2, 1.0, 0.0)]  # the gyro of the first is broken
-    sensors = [
-        row
-        for number, good, scale in instance
-        for row in rows_of(
-            8, zero + number, *(scale * part for part in imu), zero + good, zero + 1.0
-        )
-    ]
-    volts = TRUTH["v_bat"][:, 0]
-    packs = rows_of(400, zero, zero) + rows_of(400, zero + 1, volts)
-    packs[len(packs) // 2 + 3] = (*packs[len(packs) // 2 + 3][:2], 0.0)  # one reading fails
-    motors = [1000.0 + 1000.0 * (0.15 + 0.8 * 0.25 * (number + 0 * zero)) for number in range(4)]
-    return {
-        "RATE": ("Qffffffffffff", RATE_COLUMNS, rows_of(1, *columns)),
-        "IMU": ("QBffffffBB", imu_columns, sensors),
-        "ATT": ("Qfff", "TimeUS,Roll,Pitch,Yaw", rows_of(8, euler)),
-        "XKQ": ("QBffff", "TimeUS,C,Q1,Q2,Q3,Q4", rows_of(8, zero, quat)),
-        "XKF1": (
-            "QBffffff",
-            "TimeUS,C,VN,VE,VD,PN,PE,PD",
-            rows_of(8, zero, TRUTH["v"] * TURN, TRUTH["p"] * TURN),
-        ),
-        "BAT": ("QBf", "TimeUS,Instance,Volt", packs),
-        "RCOU": ("QHHHH", "TimeUS,C1,C2,C3,C4", rows_of(8, *motors)),
-    }
+def test_motors_are_thrust_if_a_mapping_says_so(messages, read):
+    # Of the range of a motor, 0.15 to 0.95: 0, 1/4, 1/2 and 3/4.
+    rows = [(row[0], 1150, 1350, 1550, 1750) for row in messages["RATE"][2]]
+    messages["RCOU"] = ("QHHHH", "TimeUS,C1,C2,C3,C4", rows)
+    imported = read(messages, "[motors]\nas_thrust = true\n")
+    assert imported.log["u"][:, 3] == pytest.approx(2.0 * 0.375 - 1.0, abs=1e-3)
+    assert "a motor at its upper end in 0.00%" in " ".join(imported.notes)
 
 
-def write(path: Path, found: Messages, **options: Any) -> Path:
-    path.write_bytes(dataflash(found, **options))
-    return path
-
-
-@pytest.mark.parametrize("attitude", ["XKQ", "ATT"])
-def test_a_made_flight_comes_back(tmp_path: Path, attitude: str) -> None:
-    written = messages()
-    if attitude == "ATT":
-        del written["XKQ"]
-    found = import_log(write(tmp_path / "a.bin", written), "dataflash", align=False)
-    log = found.log
-    assert (
-        len(log) > 4700
-        and log.time[0] == 0.0
-        and np.diff(log.time) == pytest.approx(0.0025, abs=1e-6)
-    )
-    rows = np.round(log.time / 0.0025).astype(int)
-    tolerances = {
-        "u": 1e-6,
-        "w": 1e-6,
-        "f": 0.3,
-        "v": 0.02,
-        "p": 0.01,
-        "v_bat": 0.02,
-    }  # interpolated at 50 Hz; the battery ends 1 s earlier
-    for name, tolerance in tolerances.items():
-        np.testing.assert_allclose(log[name], TRUTH[name][rows], atol=tolerance, err_msg=name)
-    turned = Rotation.from_quat(log["q"], scalar_first=True).inv() * Rotation.from_quat(
-        TRUTH["q"][rows], scalar_first=True
-    )
-    assert np.max(turned.magnitude()) < 0.01
-    assert found.problems == () and found.craft.max_rate_deg_s == pytest.approx(
-        tuple(FULL_STICK_DEG_S)
-    )
-    said = " ".join(found.notes)
-    assert "instance 1 of IMU is used, not 0 (not healthy), 2" in said
-    assert "instance 1 of BAT is used, not 0 (not healthy)" in said
-    assert "1 of 12 voltages of battery 1 are not above 0" in said and "rates of RATE" in said
-    assert "a motor at its upper end in 0.00%" in said
-
-
-def test_frames_agree_by_the_motion(tmp_path: Path) -> None:
-    """Rates turn the attitude; turned specific force less gravity is the velocity's derivative."""
-    log = import_log(write(tmp_path / "a.bin", messages()), "dataflash", align=False).log
-    attitude = Rotation.from_quat(log["q"], scalar_first=True)
-    step_s = np.diff(log.time)[:, None]
-    turns = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / step_s
-    accelerations = np.diff(log["v"], axis=0) / step_s
-    forces = attitude.apply(log["f"])[:-1] - np.array([0.0, 0.0, GRAVITY])
-    for axis in range(3):
-        assert np.corrcoef(turns[:, axis], log["w"][:-1, axis])[0, 1] > 0.99
-        assert np.corrcoef(accelerations[:, axis], forces[:, axis])[0, 1] > 0.95
-
-
-def test_rates_of_the_imu_where_it_is_faster_and_motors_as_thrust(tmp_path: Path) -> None:
-    written = messages()
-    written["RATE"] = (*written["RATE"][:2], written["RATE"][2][::16])
-    (tmp_path / "map.toml").write_text("[motors]\nas_thrust = true\n")
-    found = import_log(
-        write(tmp_path / "a.bin", written), "dataflash", tmp_path / "map.toml", align=False
-    )
-    assert np.diff(found.log.time) == pytest.approx(0.02) and "rates of IMU" in " ".join(
-        found.notes
-    )
-    assert found.log["u"][:, 3] == pytest.approx(
-        2.0 * 0.375 - 1.0, abs=1e-3
-    )  # the mean of 0, 1/4, 1/2, 3/4
-
-
-def test_setpoints_past_full_stick_raise_it(tmp_path: Path) -> None:
-    written = messages()
-    rows = written["RATE"][2]
+def test_setpoints_past_full_stick_raise_it(messages, read):
+    rows = messages["RATE"][2]
     rows[100] = (rows[100][0], 777.0, *rows[100][2:])
-    found = import_log(write(tmp_path / "a.bin", written), "dataflash", align=False)
-    assert (
-        found.craft.max_rate_deg_s == pytest.approx((777.0, 360.0, 180.0))
-        and found.log["u"].max() == 1.0
-    )
-    assert any(
-        "RDes reaches 777 deg/s: full stick is that, not 500" in note for note in found.notes
-    )
+    imported = read(messages)
+    assert imported.craft.max_rate_deg_s == pytest.approx((777.0, 360.0, 180.0))
+    assert imported.log["u"].max() == 1.0
+    assert "RDes reaches 777 deg/s: full stick is that, not 500" in " ".join(imported.notes)
 
 
 @pytest.mark.parametrize(
-    ("change", "options", "message"),
+    ("absent", "options", "message"),
     [
-        (("RATE",), {}, r"a\.bin: message RATE: missing or without R, P, .*found ATT, BAT, IMU"),
+        ("RATE", {}, "message RATE: missing or without R, P, .*found ATT, BAT, IMU"),
         (
-            (),
+            "",
             {"parameters": {"ACRO_RP_RATE": 360.0}},
-            r"a\.bin: parameters ACRO_Y_RATE, .*so full stick is unknown",
+            "parameters ACRO_Y_RATE, .*so full stick is unknown",
         ),
         (
-            (),
+            "",
             {"text": "ArduPlane V4.5.7"},
-            r"a\.bin: found a log of ArduPlane V4\.5\.7, expected one of ArduCopter",
+            r"found a log of ArduPlane V4\.5\.7, expected one of ArduCopter",
         ),
         (
-            (),
+            "",
             {"parameters": {**COPTER_PARAMETERS, "Q_ENABLE": 1.0}},
-            r"a\.bin: found a log of a quadplane",
+            "found a log of a quadplane",
         ),
-        ((), None, r"a\.bin: damaged|a\.bin: message RATE: missing"),
     ],
 )
-def test_other_logs_are_refused(
-    tmp_path: Path, change: tuple[str, ...], options: Any, message: str
-) -> None:
-    written = {name: content for name, content in messages().items() if name not in change}
-    path = write(tmp_path / "a.bin", written, **(options or {}))
-    if options is None:
-        path.write_bytes(path.read_bytes()[:300])
-    with pytest.raises(LogError, match=message):
-        import_log(path, "dataflash")
+def test_other_logs_are_refused(messages, read, absent, options, message):
+    messages.pop(absent, None)
+    with pytest.raises(LogError, match=rf"a\.bin: {message}"):
+        read(messages, **options)
 
 
-def test_another_airframe_is_told(tmp_path: Path) -> None:
-    parameters = {**COPTER_PARAMETERS, "FRAME_CLASS": 2.0}
-    found = import_log(write(tmp_path / "a.bin", messages(), parameters=parameters), "dataflash")
-    assert any(
-        "found a hexacopter (FRAME_CLASS 2), not a quadcopter" in note for note in found.notes
-    )
+def test_another_airframe_is_noted(messages, read):
+    notes = read(messages, parameters={**COPTER_PARAMETERS, "FRAME_CLASS": 2.0}).notes
+    assert "found a hexacopter (FRAME_CLASS 2), not a quadcopter" in " ".join(notes)
