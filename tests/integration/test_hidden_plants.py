@@ -81,30 +81,24 @@ def test_an_accelerometer_off_the_centre_feels_the_turn() -> None:
 
 @pytest.mark.parametrize("motion", hidden.MOTIONS)
 def test_a_flight_controller_shapes_the_sticks_before_the_lag(motion: str) -> None:
-    def settled(stick: float, **effects: dict[str, float]) -> np.ndarray:
-        plant = HiddenDrone(
-            replace(base(**effects), motion=motion), START, np.random.default_rng(0)
-        )
-        for _ in range(200):
-            plant.step((stick, -stick, stick, -0.2))
-        return plant.felt.rates_b / np.radians([618.0, -618.0, 120.0])
+    def at_full_stick(num_steps: int, **effects: dict[str, float]) -> HiddenDrone:
+        truth = replace(base(**effects), motion=motion)
+        plant = HiddenDrone(truth, START, np.random.default_rng(0))
+        for _ in range(num_steps):
+            plant.step((1.0, 1.0, 1.0, -0.2))
+        return plant
 
     lost = {"roll": 0.2, "pitch": 0.1, "yaw": 0.05}
-    np.testing.assert_allclose(settled(1.0, rate_saturation=lost), [0.8, 0.9, 0.95])
-    np.testing.assert_allclose(
-        settled(0.5, rate_expo=lost), 0.5 - 0.375 * np.array([0.2, 0.1, 0.05])
-    )
-    # Of a step by the whole stick: the setpoint rises evenly, and the lag follows it tau later.
+    rates_b = at_full_stick(200, rate_saturation=lost).felt.rates_b
+    full_rates = np.radians([618.0, 618.0, 120.0])
+    np.testing.assert_allclose(rates_b / full_rates, [0.8, 0.9, 0.95])
+    # The setpoint rises evenly, and the lag follows it tau later.
     slow = {"roll_s": 0.3, "pitch_s": 0.2, "yaw_s": 0.4}
-    plant = HiddenDrone(
-        replace(base(rate_slew_limit=slow), motion=motion), START, np.random.default_rng(0)
-    )
-    for _ in range(18):
-        plant.step((1.0, 1.0, 1.0, -0.2))
     tau, times_s = np.array(base().tau[:3]), np.array(list(slow.values()))
     late_s = tau if motion == "fine" else 0.01 / np.expm1(0.01 / tau)  # a step asks for its end
     expected = (0.18 + late_s * np.expm1(-0.18 / tau)) / times_s
-    np.testing.assert_allclose(plant.applied[:3], expected, rtol=1e-4)
+    applied = at_full_stick(18, rate_slew_limit=slow).applied
+    np.testing.assert_allclose(applied[:3], expected, rtol=1e-4)
 
 
 @pytest.fixture(scope="module")

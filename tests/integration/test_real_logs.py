@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_sysid import Imported, diagnose, import_log
 from flytrack_sysid.importing.units import GRAVITY
 from flytrack_sysid.plausibility import summed_turns, windows_of
-from tests.support.real_logs import CRAZYFLIE, shared
+from tests.support.real_logs import CRAZYFLIE, import_shared, shared
 
 pytestmark = pytest.mark.slow
 WINDOW_S = 0.3
@@ -125,7 +125,7 @@ def test_torques_of_motors_show_the_rotation_that_follows(tmp_path, number, from
 
 
 def test_px4():
-    check(import_log(shared("px4_h520") / "3DRFlight_1.ulg", "ulog"), 0.99, 0.02)
+    check(import_shared("px4_h520/3DRFlight_1.ulg", "ulog"), 0.99, 0.02)
 
 
 # --- The diagnosis of a Crazyflie -----------------------------------------------------------------

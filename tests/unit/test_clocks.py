@@ -17,16 +17,21 @@ from tests.support.hidden_flights import scripted
 from tests.support.made_flight import TIME_S, flight, noisy
 
 
+def rms(errors: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
+
+
 def test_clock_offsets_between_sensors_are_found_and_corrected(truth):
     late_s = (0.023, -0.012, 0.031)
-    aligned, found = clocks.align_clocks(noisy(flight(TIME_S, *late_s), seed=1))
-    assert [(one.channel, one.reference) for one in found] == [("q", "w"), ("v", "f"), ("p", "v")]
-    for one, expected in zip(found, late_s, strict=True):
-        assert abs(one.offset_s - expected) < 4.0 * one.sigma_s + 1e-4, one.describe()
-        assert one.sigma_s < 1.5e-3 and one.verdict == "corrected"
+    aligned, offsets = clocks.align_clocks(noisy(flight(TIME_S, *late_s), seed=1))
+    pairs = [(offset.channel, offset.reference) for offset in offsets]
+    assert pairs == [("q", "w"), ("v", "f"), ("p", "v")]
+    for offset, expected in zip(offsets, late_s, strict=True):
+        assert abs(offset.offset_s - expected) < 4.0 * offset.sigma_s + 1e-4, offset.describe()
+        assert offset.sigma_s < 1.5e-3 and offset.verdict == "corrected"
     rows = np.searchsorted(TIME_S, aligned.time - 1e-6)
     for name, bound in (("q", 0.004), ("v", 0.03), ("p", 0.008)):
-        assert np.sqrt(np.mean((aligned[name] - truth[name][rows]) ** 2)) < bound, name
+        assert rms(aligned[name] - truth[name][rows]) < bound, name
 
 
 def test_outliers_do_not_move_an_offset(truth):
@@ -36,13 +41,16 @@ def test_outliers_do_not_move_an_offset(truth):
         rows = rng.choice(len(log), 20, replace=False)
         log[name][rows] += size * rng.standard_normal((20, log[name].shape[1]))
     log["q"][:] /= np.linalg.norm(log["q"], axis=1, keepdims=True)
-    found = clocks.align_clocks(log)[1][0]
-    assert abs(found.offset_s - 0.023) < 4.0 * found.sigma_s and found.sigma_s < 1.5e-3
+    offset = clocks.align_clocks(log)[1][0]
+    assert abs(offset.offset_s - 0.023) < 4.0 * offset.sigma_s and offset.sigma_s < 1.5e-3
 
 
 def test_standard_errors_are_those_of_other_draws_of_the_noise(truth):
-    found = [one for seed in range(4) for one in clocks.align_clocks(noisy(truth, seed))[1]]
-    scores = np.array([one.offset_s / one.sigma_s for one in found])
+    scores = []
+    for seed in range(4):
+        for offset in clocks.align_clocks(noisy(truth, seed))[1]:
+            scores.append(offset.offset_s / offset.sigma_s)
+    scores = np.array(scores)
     assert len(scores) == 12 and 0.5 < scores.std() < 1.6 and np.mean(np.abs(scores) > 3.0) < 0.1
 
 
@@ -50,15 +58,16 @@ def test_clocks_that_agree_are_left_and_lag_of_the_plant_is_no_offset(truth):
     later = FlightLog(
         truth.time, {**truth.channels, "u": np.roll(truth["u"], 20, axis=0)}, truth.segment
     )
-    aligned, found = clocks.align_clocks(truth)
-    assert all(one.verdict == "not significant, left" and abs(one.offset_s) < 1e-3 for one in found)
+    aligned, offsets = clocks.align_clocks(truth)
+    assert {offset.verdict for offset in offsets} == {"not significant, left"}
+    assert max(abs(offset.offset_s) for offset in offsets) < 1e-3
     np.testing.assert_array_equal(aligned["q"], truth["q"])
-    assert clocks.align_clocks(later)[1] == found
+    assert clocks.align_clocks(later)[1] == offsets
 
 
 def test_clocks_of_a_drone_at_rest_or_too_short_are_not_compared(truth):
     rest = FlightLog(truth.time, {**truth.channels, "w": 0.0 * truth["w"] + 0.1}, truth.segment)
-    assert "not compared: correlation" in clocks.align_clocks(rest)[1][0].verdict
+    assert clocks.align_clocks(rest)[1][0].verdict.startswith("not compared: ")
     short = clocks.align_clocks(truth.select(slice(500)))[1]
     assert [one.verdict for one in short] == ["not compared: less than 10 s without a gap"] * 3
 
@@ -71,10 +80,10 @@ def test_velocity_and_position_come_on_the_clock_of_the_attitude() -> None:
     truth = flight(TIME_S, LATE_S, LATE_S, LATE_S)
     for late_s in (0.0, 0.02):
         logged = noisy(flight(TIME_S, LATE_S, LATE_S + late_s, LATE_S + late_s), seed=1)
-        found, is_kept, notes = on_one_clock(logged)
-        assert len(found) == is_kept.sum() and len(notes) == 2 * (late_s > 0.0), notes
+        log, is_kept, notes = on_one_clock(logged)
+        assert len(log) == is_kept.sum() and len(notes) == 2 * (late_s > 0.0), notes
         for name, bound in (("v", 0.03), ("p", 0.01)):
-            assert np.sqrt(np.mean((found[name] - truth[name][is_kept]) ** 2)) < bound, name
+            assert rms(log[name] - truth[name][is_kept]) < bound, name
 
 
 def test_commands_stamped_after_the_turns_they_cause_are_put_before_them() -> None:
@@ -84,15 +93,13 @@ def test_commands_stamped_after_the_turns_they_cause_are_put_before_them() -> No
         starts = np.cumsum(truth.is_start())
         source = np.maximum(np.arange(len(truth)) - rows, np.searchsorted(starts, starts))
         late = replace(truth, channels={**truth.channels, "u": truth["u"][source]})
-        found, is_kept, notes = with_causal_commands(late, plant.model())
-        assert len(found) == is_kept.sum() and len(notes) == (rows == 20)
+        log, is_kept, notes = with_causal_commands(late, plant.model())
+        assert len(log) == is_kept.sum() and len(notes) == (rows == 20)
         if notes:
             assert "the clock of the commands was about" in notes[0]
-            off = [
-                np.abs(found["u"] - np.roll(truth["u"], -by, axis=0)[is_kept]).mean()
-                for by in range(-4, 5)
-            ]
-            assert min(off) < 0.1 * np.abs(found["u"]).mean()
+            shifted = [np.roll(truth["u"], -by, axis=0)[is_kept] for by in range(-4, 5)]
+            errors = [np.abs(log["u"] - commands).mean() for commands in shifted]
+            assert min(errors) < 0.1 * np.abs(log["u"]).mean()
 
 
 def test_lateness_is_found_where_there_is_one() -> None:

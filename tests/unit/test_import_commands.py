@@ -44,7 +44,8 @@ def read(folder: Path, mapping: str, columns: dict[str, np.ndarray] | None = Non
 
 
 def test_attitude_setpoints_become_rates_by_given_gains(tmp_path):
-    columns, imported = flight(), read(tmp_path, WITH_GAINS)
+    columns, imported = flight(), read(tmp_path, f"{WITH_GAINS}voltage_v = [14, 16.8]\n")
+    assert imported.log.stated_voltage_v == (14.0, 16.8)
     errors = np.deg2rad(columns["sr"]) - columns["r"], -np.deg2rad(columns["sp"]) - columns["p"]
     for axis, error in enumerate(errors):
         expected = np.clip(GAINS[axis] * error / np.deg2rad(300.0), -1.0, 1.0)
@@ -115,14 +116,13 @@ def test_tii_ratm_columns_become_a_flight(tmp_path):
     """By the published header and a row written by hand; the dataset's own rows are not at hand."""
     mapping = load_mapping("tii_ratm")
     turn = Rotation.from_euler("ZYX", [0.5, 0.2, -0.1])
-    names = dict.fromkeys(column for channel in mapping.channels for column in channel.columns)
-    table = {name: np.zeros(200) for name in names}
-    table["elapsed_time"] = 0.002 * np.arange(200)
-    for number, value in enumerate(turn.as_matrix().T.ravel()):  # by columns
-        table[f"drone_rot[{number}]"] = np.full(200, value)
-    for name, value in (("roll", 1750), ("pitch", 1500), ("yaw", 1750), ("thrust", 1250)):
-        table[f"channels_{name}"] = np.full(200, float(value))
-    table["accel_z"], table["vbat"] = np.full(200, 9.81), np.full(200, 24.0)
-    log = read(tmp_path, 'extends = "tii_ratm"\n', table).log
+    values = {column: 0.0 for channel in mapping.channels for column in channel.columns}
+    matrix = turn.as_matrix().T.ravel()  # by columns
+    values |= {f"drone_rot[{number}]": value for number, value in enumerate(matrix)}
+    values |= {"channels_roll": 1750, "channels_pitch": 1500, "channels_yaw": 1750}
+    values |= {"channels_thrust": 1250, "accel_z": 9.81, "vbat": 24.0}
+    columns = {name: np.full(200, float(value)) for name, value in values.items()}
+    columns["elapsed_time"] = 0.002 * np.arange(200)
+    log = read(tmp_path, 'extends = "tii_ratm"\n', columns).log
     assert log["u"][0] == pytest.approx([0.5, 0.0, -0.5, -0.5])  # yaw to the right is negative
     np.testing.assert_allclose(log["q"][0], turn.as_quat(scalar_first=True), atol=1e-6)

@@ -39,7 +39,8 @@ def test_a_flight_comes_back(kind: str, truth: FlightLog, tmp_path: Path) -> Non
     path, mapping = write(tmp_path, replace(truth, time=truth.time + 1.0))
     imported = import_log(path, form, mapping, align=False)
     log, rows = imported.log, np.searchsorted(truth.time, imported.log.time - 1e-6)
-    assert imported.problems == () and len(log) >= len(truth) - 1
+    assert imported.problems == () and log.origin == "measured"
+    assert len(log) >= len(truth) - 1
     assert set(log.channels) == {"u", "w", "f", "v_bat"} | ATTITUDE_AND_PLACE.get(kind, set())
     for name, values in log.channels.items():
         tolerance = RESOLUTION.get(kind, {}).get(name, 1e-5)

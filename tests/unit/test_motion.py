@@ -58,13 +58,13 @@ def reference(model: ModelParameters) -> tuple[np.ndarray, ...]:
 
     Those of a hidden plant in parts of 0.05 ms; its motion is that of SciPy's integrator.
     """
-    own_effects = {effects.effect_of(one).name: one._asdict() for one in model.effects}
-    own = (tuple(map(float, one)) for one in (TAU, COEFFS, FULL_RATES))
-    truth = Truth(*own, DRAIN, MASS, GRAVITY, own_effects, motion="fine", step_s=COMMAND_S)
+    laws = {effects.effect_of(law).name: law._asdict() for law in model.effects}
+    arrays = (tuple(map(float, values)) for values in (TAU, COEFFS, FULL_RATES))
+    truth = Truth(*arrays, DRAIN, MASS, GRAVITY, laws, motion="fine", step_s=COMMAND_S)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(drone, "LONGEST_PART_S", 5e-5)
-        found = flown_in_floats(truth, held_commands(), LOW_START)
-    return tuple(found[name] for name in "pvqf")
+        flight = flown_in_floats(truth, held_commands(), LOW_START)
+    return tuple(flight[name] for name in "pvqf")
 
 
 def errors(model: ModelParameters, dt: float, exact: tuple[np.ndarray, ...]) -> np.ndarray:
@@ -72,8 +72,8 @@ def errors(model: ModelParameters, dt: float, exact: tuple[np.ndarray, ...]) -> 
     every = round(COMMAND_S / dt)
     states, _, forces_b = (rows[every - 1 :: every] for rows in flown(model, dt, AT_REST))
     quats = states[:, 9:13] * np.sign(np.sum(states[:, 9:13] * exact[2], axis=1, keepdims=True))
-    found = (states[:, :3], states[:, 3:6], quats, forces_b)
-    return np.array([np.abs(one - other).max() for one, other in zip(found, exact, strict=True)])
+    measured = (states[:, :3], states[:, 3:6], quats, forces_b)
+    return np.array([np.abs(ours - true).max() for ours, true in zip(measured, exact, strict=True)])
 
 
 # Largest errors of position, m, velocity, m/s, attitude and specific force, m/s^2, at steps of 10
@@ -129,20 +129,3 @@ def test_late_readings_are_those_of_a_moment_within_a_step(late_ms):
     then = np.arange(3, len(gyro)) * 10 + 9 - late_ms
     for found, true in ((gyro[3:], true_gyro[then]), (felt[3:], true_felt[then])):
         assert np.abs(found - true).max() < 0.002 * np.abs(np.diff(true, axis=0)).max()
-
-
-@pytest.mark.parametrize("motion", Motion)
-def test_a_step_is_differentiable_and_batched(motion):
-    def height(tau: jax.Array, stick: jax.Array) -> jax.Array:
-        model = PLAIN._replace(tau=tau, motion=motion)
-        return move(
-            unpack(jnp.asarray(START)), (), Action(0.1, 0.2, 0.3, stick), 0.01, model
-        ).after.vel_w.z
-
-    with jax.enable_x64(True):
-        sticks = jnp.array([-0.5, 0.5])
-        slopes = jax.vmap(jax.grad(height), (None, 0))(jnp.asarray(TAU), sticks)
-        moved = jax.vmap(height, (None, 0))(jnp.asarray(TAU).at[3].add(1e-6), sticks)
-        before = jax.vmap(height, (None, 0))(jnp.asarray(TAU), sticks)
-        slopes, expected = np.asarray(slopes[:, 3]), np.asarray((moved - before) / 1e-6)
-    np.testing.assert_allclose(slopes, expected, rtol=1e-3)

@@ -25,16 +25,21 @@ def logs() -> dict[str, FlightLog]:
     return {"clean": clean, "noisy": measure(exact, 1.0, GRAVITY, np.random.default_rng(9))}
 
 
+def changed(channel: str, change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    return lambda log: replace(log, channels={**log.channels, channel: change(log[channel])})
+
+
 def scaled(channel: str, factor: float | list[float]) -> Change:
-    return lambda log: replace(
-        log, channels={**log.channels, channel: log[channel] * np.array(factor)}
-    )
+    return changed(channel, lambda values: values * np.array(factor))
 
 
-def constant(channel: str, values: list[float]) -> Change:
-    return lambda log: replace(
-        log, channels={**log.channels, channel: np.tile(values, (len(log), 1))}
-    )
+def constant(channel: str, row: list[float]) -> Change:
+    return changed(channel, lambda values: np.tile(row, (len(values), 1)))
+
+
+def rolled(step: int) -> Change:
+    """Return a change of the order of a quaternion's numbers."""
+    return changed("q", lambda values: np.roll(values, step, axis=1))
 
 
 def columns(channel: str) -> str:
@@ -55,11 +60,7 @@ WRONG = {
     "v_bat in tenths": (scaled("v_bat", 10.0), "v_bat", "looks like tenths of V$"),
     "f in g": (scaled("f", 1 / GRAVITY), columns("f"), "looks like g$"),
     "f with z down": (scaled("f", [1.0, -1.0, -1.0]), "f_z", "pointed down"),
-    "a with gravity": (
-        lambda log: replace(log, channels={**log.channels, "a": log["a"] + UPWARDS}),
-        "a_z",
-        "gravity looks left in",
-    ),
+    "a with gravity": (changed("a", lambda acc: acc + UPWARDS), "a_z", "gravity looks left in"),
     "commands stuck": (constant("u", [0.0] * 4), columns("u"), "look stuck"),
     "too few seconds": (
         lambda log: log.select(log.time < 0.06),
@@ -78,8 +79,8 @@ def test_wrong_log_is_named_and_only_that(logs, name, wrong):
         check_plausible(log)
         return
     change, where, text = WRONG[wrong]
-    if where[0] == "a" and "a" not in log:
-        return
+    if where == "a_z" and "a" not in log:
+        pytest.skip("no accelerations are measured")
     log = change(log)
     (problem,) = find_problems(log)
     assert problem.startswith(f"flight.csv: {where}: found ")
@@ -90,32 +91,24 @@ def test_wrong_log_is_named_and_only_that(logs, name, wrong):
 FRD = Rotation.from_rotvec([np.pi, 0.0, 0.0])
 
 
-def turned(channel: str, change: Callable[[Rotation], Rotation]) -> Change:
-    """Return a change of an attitude."""
+def turned(change: Callable[[Rotation], Rotation]) -> Change:
+    """Return a change of the attitude."""
 
-    def apply(log: FlightLog) -> FlightLog:
-        quat = change(Rotation.from_quat(log[channel], scalar_first=True)).as_quat(
-            scalar_first=True
-        )
-        return replace(log, channels={**log.channels, channel: quat})
+    def apply(quat: np.ndarray) -> np.ndarray:
+        return change(Rotation.from_quat(quat, scalar_first=True)).as_quat(scalar_first=True)
 
-    return apply
-
-
-def in_order(step: int) -> Change:
-    """Return a change of the order of a quaternion's numbers."""
-    return lambda log: replace(log, channels={**log.channels, "q": np.roll(log["q"], step, axis=1)})
+    return changed("q", apply)
 
 
 # One wrong word in a mapping -> the channel that is named, and how it agrees.
 MISREAD = {
-    "wxyz read as xyzw": (in_order(1), "q", "if q is read as wxyz"),
-    "xyzw read as wxyz": (in_order(-1), "q", "if q is read as xyzw"),
-    "q inverted": (turned("q", Rotation.inv), "q", "if q is inverted"),
-    "q in frd": (turned("q", lambda one: one * FRD), "q", "if q has its body axes turned"),
-    "q in ned": (turned("q", lambda one: FRD * one), "q", "if q has its world turned"),
+    "wxyz read as xyzw": (rolled(1), "q", "if q is read as wxyz"),
+    "xyzw read as wxyz": (rolled(-1), "q", "if q is read as xyzw"),
+    "q inverted": (turned(Rotation.inv), "q", "if q is inverted"),
+    "q in frd": (turned(lambda quat: quat * FRD), "q", "if q has its body axes turned"),
+    "q in ned": (turned(lambda quat: FRD * quat), "q", "if q has its world turned"),
     "q in frd and ned": (
-        turned("q", lambda one: FRD * one * FRD),
+        turned(lambda quat: FRD * quat * FRD),
         "q",
         "if q has body axes and world turned",
     ),
@@ -142,17 +135,15 @@ def test_channels_that_contradict_each_other_are_read_right(name, noise, truth):
 
 def test_right_logs_of_any_noise_contradict_nothing(truth):
     """210 logs of 10 s: 7 parts of a flight with 30 noises each, of 0.1 to 10 times the usual."""
-    rng, num_wrong = np.random.default_rng(5), 0
+    rng = np.random.default_rng(5)
     for seed in range(210):
         start = 150 * (seed % 7)
         log, factor = truth.select(slice(start, start + 1000)), 10.0 ** rng.uniform(-1.0, 1.0)
         shaken = noisy(log, seed)
         channels = {name: log[name] + factor * (shaken[name] - log[name]) for name in log.channels}
         channels["q"] /= np.linalg.norm(channels["q"], axis=1, keepdims=True)
-        num_wrong += any(
-            "contradict" in one for one in find_problems(replace(log, channels=channels))
-        )
-    assert num_wrong == 0
+        problems = find_problems(replace(log, channels=channels))
+        assert "contradict" not in " ".join(problems), seed
 
 
 def test_all_problems_are_listed(logs):
@@ -160,12 +151,8 @@ def test_all_problems_are_listed(logs):
     for wrong in ("t in ms", "w in deg/s", "v_bat in mV", "f in g"):
         log = WRONG[wrong][0](log)
     problems = find_problems(log)
-    assert [problem.split(": ")[1] for problem in problems] == [
-        "t",
-        columns("w"),
-        columns("f"),
-        "v_bat",
-    ]
+    named = ["t", columns("w"), columns("f"), "v_bat"]
+    assert [problem.split(": ")[1] for problem in problems] == named
     with pytest.raises(LogError) as error:
         check_plausible(log)
     assert str(error.value).splitlines() == problems
