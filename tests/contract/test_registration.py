@@ -129,28 +129,34 @@ def test_identical_seeds_fly_identically_in_another_process(env_ids):
 
 @pytest.mark.parametrize("env_id", slow_but(BASE, ENVIRONMENTS))
 def test_gradients_are_those_of_finite_differences_and_detached_unless_asked_for(env_id):
-    """In float64, in every action of the first of three steps in free flight, away from gates."""
+    """In float64, in the first of three actions and the first speed, away from every gate."""
     env, params = gymnax.make(env_id)
     attached = env.with_transition_gradients()
     assert attached.transition_gradients_enabled and not env.transition_gradients_enabled
     drone = drone_at((14.0, 12.0, 3.0), (3.0, -2.0, 1.0), applied=Action(0.1, -0.1, 0.2, 0.0))
     weights = np.random.default_rng(2).normal(size=env.observation_space(params).shape)
+
+    def as_float64(leaf):
+        return leaf.astype(float) if leaf.dtype == np.float32 else leaf
+
+    def value(env, action_and_speed):
+        action, speed = action_and_speed[:4], action_and_speed[4]
+        moving = drone._replace(vel_w=drone.vel_w._replace(y=speed))
+        state = jax.tree.map(as_float64, env.begin(moving, 0, params, jnp.uint32(11)))
+
+        def advance(flown, command):
+            observation, flown, reward, *_ = env.step_env(None, flown, command, params)
+            return flown, (observation, env.transition_gradients_enabled * reward)
+
+        commands = jnp.stack([action, jnp.full(4, 0.2), jnp.full(4, -0.1)])
+        observations, rewards = jax.lax.scan(advance, state, commands)[1]
+        return weights @ observations.sum(axis=0) + 10.0 * rewards.sum()
+
     with jax.enable_x64(True):
-        state = jax.tree.map(
-            lambda leaf: leaf.astype(float) if leaf.dtype == np.float32 else leaf,
-            env.begin(drone, 0, params, jnp.uint32(11)),
-        )
-
-        def value(env, action):
-            flown = state
-            for command in (action, jnp.full(4, 0.2), jnp.full(4, -0.1)):
-                observation, flown, reward, *_ = env.step_env(None, flown, command, params)
-            return weights @ observation + 10.0 * env.transition_gradients_enabled * reward
-
-        action, shifts = np.array([0.2, -0.3, 0.1, 0.4]), 1e-6 * np.eye(4)
-        detached = jax.jit(jax.grad(partial(value, env)))(action)
-        gradient = jax.jit(jax.grad(partial(value, attached)))(action)
-        evaluate = jax.jit(partial(value, attached))
-        numeric = [(evaluate(action + s) - evaluate(action - s)) / 2e-6 for s in shifts]
+        start, shifts = np.array([0.2, -0.3, 0.1, 0.4, -2.0]), 1e-6 * np.eye(5)
+        detached = jax.jit(jax.grad(partial(value, env)))(start)
+        evaluate = jax.jit(jax.value_and_grad(partial(value, attached)))
+        gradient = evaluate(start)[1]
+        numeric = [(evaluate(start + s)[0] - evaluate(start - s)[0]) / 2e-6 for s in shifts]
     assert not np.asarray(detached).any() and np.abs(numeric).min() > 1e-6
     assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-5)

@@ -35,9 +35,6 @@ def step_path(folder, updates):
 def test_checkpoints_are_written_at_the_steps_asked_for(whole):
     names = {"final.safetensors"} | {step_path(whole[0], updates).name for updates in (0, 2, 4, 6)}
     assert {path.name for path in whole[0].iterdir()} == names
-    training = load_checkpoint(whole[0] / "final.safetensors").training
-    for part in ("opt_state", "env_state", "observation", "episodes", "key"):
-        assert any(part in name for name in training), part
 
 
 @pytest.mark.parametrize("updates", slow_but([2], [0, 2, 6]))

@@ -3,6 +3,7 @@
 from functools import cache
 
 import jax.numpy as jnp
+from scipy.spatial.transform import Rotation
 
 from flytrack_env.env import FlyTrack
 from flytrack_env.plants import Plant
@@ -43,6 +44,12 @@ def track_of_row(distances):
     gates = tuple(Gate(i, (x, 0.0, 2.0), FACING_X, 1.0, 1.5, 2.7) for i, x in enumerate(distances))
     low, high = (min(distances) - 100.0, -50.0, 0.0), (max(distances) + 100.0, 50.0, 50.0)
     return Track("row", gates, (min(distances) - 5.0, 0.0, 2.0), (1.0, 0.0, 0.0, 0.0), low, high)
+
+
+def direction_of_flight(gate):
+    """Return the direction in which a gate is flown through, world, from its own data."""
+    attitude = Rotation.from_quat(gate.quaternion, scalar_first=True)
+    return gate.direction * attitude.as_matrix()[:, 1]
 
 
 @cache

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.resets import LAST_SEGMENT_FRACTION, SIDEWAYS_FRACTION, ResetParams
 from flytrack_env.state import pack
 from flytrack_env.tracks import load_track
+from tests.support.coasting import direction_of_flight
 
 NUM_STARTS = 4096
 
@@ -57,14 +58,13 @@ def course_curves(track):
     It leaves and meets the gates along their directions of flight, with tangents as long as the
     gates are apart.
     """
-    centres = np.array([gate.position for gate in track.gates])
-    axes = [Rotation.from_quat(g.quaternion, scalar_first=True).as_matrix() for g in track.gates]
-    forward = np.array([g.direction * a[:, 1] for g, a in zip(track.gates, axes, strict=True)])
     curves = []
-    for i in range(len(centres)):
-        ends = [i - 1, i]
-        length = np.linalg.norm(centres[i] - centres[i - 1])
-        curves.append(CubicHermiteSpline([0.0, 1.0], centres[ends], length * forward[ends]))
+    for index, gate in enumerate(track.gates):
+        ends = [track.gates[index - 1], gate]
+        centres = np.array([end.position for end in ends])
+        length = np.linalg.norm(centres[1] - centres[0])
+        tangents = [length * direction_of_flight(end) for end in ends]
+        curves.append(CubicHermiteSpline([0.0, 1.0], centres, tangents))
     return curves
 
 
