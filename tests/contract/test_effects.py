@@ -195,8 +195,8 @@ def test_rates_of_a_start_stay_while_its_sticks_are_held(effect):
     drone, parameters = random_drone(5), inside_ranges(effect, 0.5)
     drone = drone._replace(rates_b=steady_rates(drone, ALL_NEUTRAL.with_effects(parameters)))
     assert np.abs(drone.rates_b).max() > 0.1 and np.isfinite(drone.rates_b).all()
-    found = flown(parameters, np.tile(drone.applied, (3, 1)), drone)[:, RATES]
-    assert_allclose(found, np.tile(drone.rates_b, (3, 1)), rtol=2e-3, atol=1e-5)
+    rates_b = flown(parameters, np.tile(drone.applied, (3, 1)), drone)[:, RATES]
+    assert_allclose(rates_b, np.tile(drone.rates_b, (3, 1)), rtol=2e-3, atol=1e-5)
 
 
 steady_rates = jax.jit(start_rates)

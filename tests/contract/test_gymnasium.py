@@ -112,8 +112,8 @@ def assert_same(a, b):
     elif a is None or b is None:
         assert a is b
     elif a.dtype == object:
-        for one, other in zip(a, b, strict=True):
-            assert_same(one, other)
+        for left, right in zip(a, b, strict=True):
+            assert_same(left, right)
     else:
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
         assert a.flags.writeable
@@ -202,8 +202,8 @@ def test_copies_fly_on_alike_and_apart(is_vector):
     env.step(action)
     copies = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
     flown = np.stack([*(env.step(action)[0] for _ in range(3)), env.reset()[0]])
-    for other in copies:
-        again = np.stack([*(other.step(action)[0] for _ in range(3)), other.reset()[0]])
+    for copied in copies:
+        again = np.stack([*(copied.step(action)[0] for _ in range(3)), copied.reset()[0]])
         assert_array_equal(again, flown)
 
 

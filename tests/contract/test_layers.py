@@ -24,16 +24,16 @@ def files_of(name):
 
 def imports_of(path):
     """Return every dotted name that a file imports, anywhere in it, with its line."""
-    found = []
+    imports = []
     package = path.relative_to(ROOT).parent.parts
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            found += [(alias.name, node.lineno) for alias in node.names]
+            imports += [(alias.name, node.lineno) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             above = package[: len(package) - node.level + 1] if node.level else ()
             base = ".".join([*above, *([node.module] if node.module else [])])
-            found += [(f"{base}.{alias.name}", node.lineno) for alias in node.names]
-    return found
+            imports += [(f"{base}.{alias.name}", node.lineno) for alias in node.names]
+    return imports
 
 
 MODULES = files_of(PACKAGE)

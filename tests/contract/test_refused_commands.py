@@ -53,8 +53,8 @@ def folder(tmp_path_factory):
     np.save(folder / "pickled.npy", np.array([[None, None]] * 3, object), allow_pickle=True)
     log = excited(HandoutPlant())
     wrong = replace(log, channels={**log.channels, "w": np.rad2deg(log["w"])})
-    for name, one in (("log", log), ("degrees", wrong), ("short", log.select(slice(50)))):
-        save_log(folder / f"{name}.npz", one)
+    for name, content in (("log", log), ("degrees", wrong), ("short", log.select(slice(50)))):
+        save_log(folder / f"{name}.npz", content)
     save_model(folder / "model.json", nominal_parameters(), {})
     for every in ("x", 0):
         learnt_from = {

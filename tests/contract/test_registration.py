@@ -120,8 +120,10 @@ def digest(env_id):
 def test_identical_seeds_fly_identically_in_another_process(env_ids):
     code = f"from tests.contract.test_registration import digest; print(*map(digest, {env_ids!r}))"
     here = [digest(env_id) for env_id in env_ids]
-    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert other.stdout.strip().splitlines()[-1].split() == here
+    elsewhere = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert elsewhere.stdout.strip().splitlines()[-1].split() == here
 
 
 # --- Gradients ----------------------------------------------------------------------------------

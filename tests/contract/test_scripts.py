@@ -35,7 +35,9 @@ def test_every_manoeuvre_can_be_flown_and_says_how():
     script = made()
     check_script(script)
     assert script.kinds == tuple(name for name in MANOEUVRES for _ in range(FLIGHTS_PER_MANOEUVRE))
-    assert all(one.how.endswith(".") and len(one.how) > 20 for one in MANOEUVRES.values())
+    assert all(
+        manoeuvre.how.endswith(".") and len(manoeuvre.how) > 20 for manoeuvre in MANOEUVRES.values()
+    )
     assert FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S == LANES_PER_MANOEUVRE * LANE_S
     flights = script.commands.reshape(-1, FLIGHT_STEPS * 4)
     assert len(np.unique(np.hstack([script.starts, flights]), axis=0)) == len(flights), (
@@ -44,8 +46,8 @@ def test_every_manoeuvre_can_be_flown_and_says_how():
 
 
 def test_hover_of_a_model():
-    found = collect(HandoutPlant(), script=made("headings"))
-    assert np.abs(found["v"]).max() < 1.0, "it hovers"
+    log = collect(HandoutPlant(), script=made("headings"))
+    assert np.abs(log["v"]).max() < 1.0, "it hovers"
     model = nominal_parameters()
     assert hover_action(model._replace(m=1e3)) == 1.0, "no thrust holds it"
     assert hover_action(model._replace(thrust_coeffs=20.0 * np.eye(6)[0])) == -1.0, "any does"
@@ -54,10 +56,10 @@ def test_hover_of_a_model():
 def test_a_script_comes_back_the_same(tmp_path):
     script = made("speeds", "spins")
     save_script(tmp_path / "flight.npz", script)
-    found = load_script(tmp_path / "flight.npz")
-    assert found.kinds == script.kinds
-    assert_array_equal(found.starts, script.starts)
-    assert_array_equal(found.commands, script.commands)
+    loaded = load_script(tmp_path / "flight.npz")
+    assert loaded.kinds == script.kinds
+    assert_array_equal(loaded.starts, script.starts)
+    assert_array_equal(loaded.commands, script.commands)
     again = tmp_path / "again.npz"
     save_script(again, script)
     assert again.read_bytes() == (tmp_path / "flight.npz").read_bytes()
@@ -107,10 +109,10 @@ def test_a_diagnosis_asks_for_flights(tmp_path):
     path.write_text(
         json.dumps(asked(("gyro_scale", "spins"), ("wind", "headings"), ("imu_offset", "spins")))
     )
-    found = next_flight(path, nominal_parameters())
-    assert found.reasons == {"headings": ("wind",), "spins": ("gyro_scale", "imu_offset")}
-    assert found.script.kinds == ("headings",) * 8 + ("spins",) * 8
-    text = found.describe()
+    planned = next_flight(path, nominal_parameters())
+    assert planned.reasons == {"headings": ("wind",), "spins": ("gyro_scale", "imu_offset")}
+    assert planned.script.kinds == ("headings",) * 8 + ("spins",) * 8
+    text = planned.describe()
     assert "spins: to settle gyro_scale, imu_offset" in text and MANOEUVRES["spins"].how in text
 
 

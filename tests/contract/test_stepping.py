@@ -51,9 +51,9 @@ def test_with_x64_a_flight_is_the_same(env_id):
     keys, actions, params = inputs(env)
     expected = jax.jit(flight(env))(keys, actions, params)
     with jax.enable_x64(True):
-        found = jax.jit(flight(env))(keys, actions.astype(float), params)
-    for leaf, one in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
-        np.testing.assert_allclose(leaf, one, rtol=1e-5, atol=1e-5)
+        flown = jax.jit(flight(env))(keys, actions.astype(float), params)
+    for leaf, expected_leaf in zip(*map(jax.tree.leaves, (flown, expected)), strict=True):
+        np.testing.assert_allclose(leaf, expected_leaf, rtol=1e-5, atol=1e-5)
 
 
 @OVER_IDS

@@ -33,7 +33,9 @@ ROWS = {"commanded": 8, "applied": 4}
 def test_every_public_wrapper_is_tried():
     exported = [getattr(wrappers, name) for name in wrappers.__all__]
     public = {
-        one for one in exported if isinstance(one, type) and issubclass(one, wrappers.Wrapper)
+        export
+        for export in exported
+        if isinstance(export, type) and issubclass(export, wrappers.Wrapper)
     }
     assert public - {wrappers.Wrapper} < {type(make(FlyTrack())) for make in MAKERS.values()}
 
@@ -44,7 +46,7 @@ def reasons_against(name, inside):
         return ["the step inside has five values already"] * (inside[-1:] == ("legacy",))
     if name == "log":
         return []
-    if any(other in OTHER_STEP for other in inside):
+    if any(inner in OTHER_STEP for inner in inside):
         return [
             "found (LegacyStep|LogWrapper) inside, expected FlyTrack or a wrapper that acts before"
         ]

@@ -49,7 +49,9 @@ def test_the_suite_is_what_its_seed_draws(tmp_path):
     for again, task in zip(*suites, strict=True):
         assert all(again[name] == task[name] for name in ("id", "track", "optimal_lap_s"))
         assert jax.tree.structure(again["craft"]) == jax.tree.structure(task["craft"])
-        crafts = [np.array(jax.tree.leaves(one["craft"]), float) for one in (again, task)]
+        crafts = [
+            np.array(jax.tree.leaves(suite_task["craft"]), float) for suite_task in (again, task)
+        ]
         assert_allclose(*crafts, rtol=1e-14)
     suite = load_suite("v1")
     assert sum(task.craft is not None for task in suite.tasks) == 8 and len(suite.tasks) == 12
@@ -58,14 +60,16 @@ def test_the_suite_is_what_its_seed_draws(tmp_path):
 def test_a_result_repeats_and_is_verified_and_a_forged_one_is_not(small, tmp_path, capsys):
     out, command = tmp_path / "result.json", ["bench", "--policy", CENTRED, "--suite", str(small)]
     main([*command, "--out", str(out)])
-    found = json.loads(out.read_text())
+    result = json.loads(out.read_text())
     suite = load_suite(small)
     again = run(suite, [load_policy(CENTRED)], suite.tasks)
-    assert {**found, "cpu_s": 0} == json.loads(json.dumps({**again, "cpu_s": 0}))
-    assert all(one["success"] == 0.0 for ones in found["tasks"].values() for one in ones)
+    assert {**result, "cpu_s": 0} == json.loads(json.dumps({**again, "cpu_s": 0}))
+    assert all(
+        flight["success"] == 0.0 for flights in result["tasks"].values() for flight in flights
+    )
     main([*command, "--verify", str(out)])
-    found["tasks"]["flytrack"][0] |= {"success": 1.0, "flying_lap_s": 3.9}
-    out.write_text(json.dumps(found))
+    result["tasks"]["flytrack"][0] |= {"success": 1.0, "flying_lap_s": 3.9}
+    out.write_text(json.dumps(result))
     with pytest.raises(SystemExit, match="1"):
         main([*command, "--verify", str(out)])
     assert "flytrack, policy 0" in capsys.readouterr().out
@@ -96,12 +100,12 @@ def test_no_more_data_is_flown_than_allowed(small):
 
 def test_the_interval_covers_the_spread_of_seeds():
     flown = {str(task): [{"score": value} for value in row] for task, row in enumerate(SPREAD)}
-    found = results.summary(flown, "score")
-    assert found["interquartile_mean"] == pytest.approx(
+    summary = results.summary(flown, "score")
+    assert summary["interquartile_mean"] == pytest.approx(
         np.sort(SPREAD, axis=None)[3:9].mean(), abs=1e-6
     )
-    low, high = found["ci95"]
-    assert low < found["interquartile_mean"] < high and 0.02 < high - low < 0.2
+    low, high = summary["ci95"]
+    assert low < summary["interquartile_mean"] < high and 0.02 < high - low < 0.2
     assert results.summary({"one": [{"score": 0.5}]}, "score")["ci95"] is None
 
 
@@ -120,7 +124,7 @@ def test_a_policy_is_trained_again_on_the_model_of_the_plant_that_was_diagnosed(
     monkeypatch.setattr(retrain, "train_policy", train)
     task = suite.tasks[1]
     data = Data(task, suite, seconds=20.0)
-    found = retrain.diagnose_and_retrain(data, champion)
-    assert data.seconds_left == 0.0 and found.checkpoint is not None
+    policy = retrain.diagnose_and_retrain(data, champion)
+    assert data.seconds_left == 0.0 and policy.checkpoint is not None
     (model,) = trained
     assert_allclose(model.tau[:3], task.craft.tau[:3], atol=0.005)

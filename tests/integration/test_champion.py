@@ -66,14 +66,14 @@ def test_a_policy_gets_faster_and_is_not_changed_itself():
     env, reports = simulated_env(champion), []
     slower = jax.tree.map(lambda leaf: leaf * (1.0 - OFF), champion.params)
     kept = jax.tree.map(np.array, slower)
-    found = polish(
+    polished = polish(
         env,
         Policy(champion.network, slower),
         0,
         SHORT,
         report=lambda *counts: reports.append(counts),
     )
-    before, after = (first_lap_s(env, champion.network, params) for params in (slower, found))
+    before, after = (first_lap_s(env, champion.network, params) for params in (slower, polished))
     assert after < before - 0.005
     jax.tree.map(np.testing.assert_array_equal, slower, kept)
     assert reports[-1] == (SHORT.updates, SHORT.updates)
@@ -90,6 +90,6 @@ def test_a_policy_that_does_not_race_is_refused():
 
 def test_a_decayed_state_is_the_same_with_less_gradient():
     tree = {"value": jnp.float32(3.0), "count": jnp.int32(2)}
-    found = decay_gradient(tree, 0.9)
-    assert float(found["value"]) == 3.0 and found["count"] is tree["count"]
+    decayed = decay_gradient(tree, 0.9)
+    assert float(decayed["value"]) == 3.0 and decayed["count"] is tree["count"]
     assert jax.grad(lambda x: decay_gradient(x, 0.9) ** 2)(3.0) == pytest.approx(0.9 * 6.0)

@@ -191,10 +191,10 @@ def test_ids_that_draw_models_fly_the_one_that_is_given(checkpoint):
     params = checkpoint_env.with_model_as_given(env.default_params)
     env.check_params(params)
     ranges, given = params.wrappers[DomainRandomization.key], env.default_params.model
-    found = sample_model(jnp.uint32(5), given, ranges)
-    assert type(found.effects[0]) is LinearDrag and len(found.effects) == 1
+    drawn = sample_model(jnp.uint32(5), given, ranges)
+    assert type(drawn.effects[0]) is LinearDrag and len(drawn.effects) == 1
     chex.assert_trees_all_close(
-        found._replace(tau=np.stack(found.tau)), given, rtol=1e-6, atol=1e-6
+        drawn._replace(tau=np.stack(drawn.tau)), given, rtol=1e-6, atol=1e-6
     )
     plain = make("FlyTrackNoisy-v0").default_params
     assert checkpoint_env.with_model_as_given(plain) is plain

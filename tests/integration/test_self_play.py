@@ -34,11 +34,11 @@ def test_a_widened_policy_gives_new_rows_no_weight():
 
 
 def test_each_member_of_a_pool_flies_its_share_of_the_races():
-    other = jax.tree.map(lambda leaf: 0.5 * leaf, START.params)
-    pool = jax.tree.map(lambda *leaves: np.stack(leaves), START.params, other)
+    weaker = jax.tree.map(lambda leaf: 0.5 * leaf, START.params)
+    pool = jax.tree.map(lambda *leaves: np.stack(leaves), START.params, weaker)
     seen = np.asarray(jax.random.normal(jax.random.key(0), (6, 29)))
     actions = make_pool_opponent(START.network, pool).act(pool, seen)
-    for share, params in ((slice(0, 3), START.params), (slice(3, 6), other)):
+    for share, params in ((slice(0, 3), START.params), (slice(3, 6), weaker)):
         expected = START.network.act(params, (), seen[share])[1]
         assert_allclose(actions[share], expected, atol=1e-6)
 

@@ -67,21 +67,23 @@ FAST = [path for path in SHIPPED if path.stem.startswith("flytrack_nominal")]
 
 @pytest.mark.parametrize("path", slow_but(FAST, SHIPPED), ids=lambda path: path.stem)
 def test_its_commands_fly_in_the_simulator(path):
-    found = references.load_reference(path)
-    track = load_track(found.track)
-    assert path.stem == f"{found.track}_{found.model_name}_{found.kind}"
+    reference = references.load_reference(path)
+    track = load_track(reference.track)
+    assert path.stem == f"{reference.track}_{reference.model_name}_{reference.kind}"
     assert (
-        found.track_sha256 == references.track_digest(track)
-        and found.found["status"] == "Solve_Succeeded"
+        reference.track_sha256 == references.track_digest(track)
+        and reference.found["status"] == "Solve_Succeeded"
     )
-    flown = replay(found, track)
-    assert time_optimal.is_verified(found, flown)
-    assert flown.time_s == pytest.approx(found.time_s, abs=1e-4)
+    flown = replay(reference, track)
+    assert time_optimal.is_verified(reference, flown)
+    assert flown.time_s == pytest.approx(reference.time_s, abs=1e-4)
     assert flown.drift_m < 1e-3, "half of the clearance"
-    before, behind = found.states[-2:]
-    end = before + (found.time_s / found.dt_s % 1.0) * (behind - before)
-    start = time_optimal.start_state(track, found.found["battery_v"])
-    first, wanted = (end, found.states[0]) if found.kind == "flying" else (found.states[0], start)
+    before, behind = reference.states[-2:]
+    end = before + (reference.time_s / reference.dt_s % 1.0) * (behind - before)
+    start = time_optimal.start_state(track, reference.found["battery_v"])
+    first, wanted = (
+        (end, reference.states[0]) if reference.kind == "flying" else (reference.states[0], start)
+    )
     assert_allclose(first[POSITION], wanted[POSITION], atol=5e-3)
     assert_allclose(first[VELOCITY], wanted[VELOCITY], atol=5e-3)
 
@@ -118,12 +120,12 @@ def test_a_damaged_file_is_refused(changes, reason, tmp_path):
 
 
 def test_a_saved_reference_comes_back(tmp_path):
-    found, path = references.shipped_reference("flytrack", "flying"), tmp_path / "lap.npz"
-    references.save_reference(path, found)
-    again = references.load_reference(path)
-    assert_array_equal(again.states, found.states)
-    assert_array_equal(again.commands, found.commands)
-    assert (again.time_s, again.found) == (found.time_s, found.found)
+    reference, path = references.shipped_reference("flytrack", "flying"), tmp_path / "lap.npz"
+    references.save_reference(path, reference)
+    loaded = references.load_reference(path)
+    assert_array_equal(loaded.states, reference.states)
+    assert_array_equal(loaded.commands, reference.commands)
+    assert (loaded.time_s, loaded.found) == (reference.time_s, reference.found)
 
 
 @pytest.mark.slow

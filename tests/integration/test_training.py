@@ -91,8 +91,8 @@ def test_another_machine_or_software_is_a_warning(whole, caplog):
     checkpoint = newest_intact(whole[0])
     check_same_run(checkpoint, checkpoint.meta)
     assert caplog.text == ""
-    other = {"software": {"jax": "0.1.0"}, "machine": {"threads": 1000}}
-    check_same_run(checkpoint._replace(meta=checkpoint.meta | other), checkpoint.meta)
+    changes = {"software": {"jax": "0.1.0"}, "machine": {"threads": 1000}}
+    check_same_run(checkpoint._replace(meta=checkpoint.meta | changes), checkpoint.meta)
     for message in (
         "software.jax: found '0.1.0'",
         "machine.threads: found 1000",

@@ -27,10 +27,12 @@ def make_trainer():
 
 def assert_same_end(path, expected):
     """Compare every array, and the description but for the time it took."""
-    found, wanted = load_checkpoint(path), load_checkpoint(expected)
-    jax.tree.map(np.testing.assert_array_equal, found.params, wanted.params)
-    assert found.training.keys() == wanted.training.keys()
-    for name, array in wanted.training.items():
-        assert found.training[name].tobytes() == array.tobytes(), name
-    metas = [{n: v for n, v in one.meta.items() if n != "seconds"} for one in (found, wanted)]
+    checkpoint, reference = load_checkpoint(path), load_checkpoint(expected)
+    jax.tree.map(np.testing.assert_array_equal, checkpoint.params, reference.params)
+    assert checkpoint.training.keys() == reference.training.keys()
+    for name, array in reference.training.items():
+        assert checkpoint.training[name].tobytes() == array.tobytes(), name
+    metas = [
+        {n: v for n, v in each.meta.items() if n != "seconds"} for each in (checkpoint, reference)
+    ]
     assert metas[0] == metas[1]

@@ -51,8 +51,8 @@ def test_round_trip(path, params):
     assert checkpoint.config == CONFIG
     assert (checkpoint.env_id, checkpoint.track) == ("FlyTrack-v0", "flytrack")
     for name, array in TRAINING.items():
-        found = checkpoint.training[name]
-        assert (found.dtype, found.shape, found.tobytes()) == (
+        loaded = checkpoint.training[name]
+        assert (loaded.dtype, loaded.shape, loaded.tobytes()) == (
             array.dtype,
             array.shape,
             array.tobytes(),

@@ -67,7 +67,7 @@ def test_laws_are_those_of_hidden_plants_in_plain_floats(names):
     """Alone and together, by equations that were written twice."""
     rng = np.random.default_rng(8)
     drawn = {name: hidden.draw_effect(name, rng, hidden.EFFECTS[name].high) for name in names}
-    values = {name: CHOSEN.get(name, own) for name, own in drawn.items()}
+    values = {name: CHOSEN.get(name, fields) for name, fields in drawn.items()}
     truth = replace(hidden.draw_base(rng), effects=values)
     commands = np.concatenate([held(5, thrust=LOW_START.thrust_stick), random_sticks(100)])
     expected = flown_in_floats(truth, commands)
@@ -75,14 +75,16 @@ def test_laws_are_those_of_hidden_plants_in_plain_floats(names):
     drone = unpack(state_of(HiddenDrone(truth, LOW_START, rng)).astype(np.float32))
     if "quadratic_drag" in values:  # theirs is never shared between the axes
         values["quadratic_drag"] |= {"shared": 0.0}
-    parameters = tuple(effects.BY_NAME[name].parameters(**own) for name, own in values.items())
-    found = flown(parameters, commands, drone, model_of(truth))
+    parameters = tuple(
+        effects.BY_NAME[name].parameters(**fields) for name, fields in values.items()
+    )
+    rows = flown(parameters, commands, drone, model_of(truth))
     for columns, theirs in (
         (slice(21), expected["x"]),
         (slice(21, 24), rates_b),
         (slice(24, 27), force_b),
     ):
-        assert_allclose(found[5:, columns], theirs[5:], rtol=2e-4, atol=5e-4)
+        assert_allclose(rows[5:, columns], theirs[5:], rtol=2e-4, atol=5e-4)
 
 
 # --- Forces ---------------------------------------------------------------------------------------
@@ -102,8 +104,8 @@ def force_of(parameters, thrust=-1.0, model=NOMINAL, **fields):
     ],
 )
 def test_quadratic_drag_multiplies_each_axis_by_the_whole_speed(vel_w, quat, expected):
-    found = force_of(effects.QuadraticDrag(0.1, 0.2, 0.3), model=NO_THRUST, vel_w=vel_w, quat=quat)
-    assert_allclose(found, expected, atol=2e-5)
+    force = force_of(effects.QuadraticDrag(0.1, 0.2, 0.3), model=NO_THRUST, vel_w=vel_w, quat=quat)
+    assert_allclose(force, expected, atol=2e-5)
 
 
 def lift_ratio(parameters, **fields):
@@ -122,11 +124,11 @@ def test_ground_effect_is_cheeseman_and_bennetts_from_two_radii_on():
     radius = 0.2
     for height in (2 * radius, 4 * radius, 20 * radius):
         theirs = 1.0 / (1.0 - (radius / (4 * height)) ** 2)
-        found = lift_ratio(effects.GroundEffect(1 / 16, radius), pos_w=(0.0, 0.0, height))
-        assert found - 1.0 == pytest.approx(theirs - 1.0, rel=0.25)
+        ratio = lift_ratio(effects.GroundEffect(1 / 16, radius), pos_w=(0.0, 0.0, height))
+        assert ratio - 1.0 == pytest.approx(theirs - 1.0, rel=0.25)
     for height, expected in ((0.0, 1.2), (radius, 1.1)):
-        found = lift_ratio(effects.GroundEffect(0.2, radius), pos_w=(0.0, 0.0, height))
-        assert found == pytest.approx(expected, rel=1e-4)
+        ratio = lift_ratio(effects.GroundEffect(0.2, radius), pos_w=(0.0, 0.0, height))
+        assert ratio == pytest.approx(expected, rel=1e-4)
 
 
 # --- Commands, lags and rates ---------------------------------------------------------------------
@@ -144,13 +146,15 @@ def test_a_delay_of_whole_steps_shifts_each_channel_by_its_own_and_none_is_early
     steps,
 ):
     drone, commands = random_drone(3), random_commands(3, 20)
-    found = flown(effects.CommandDelay(steps * DT, 3 * DT, -3 * DT), commands, drone)[
+    applied = flown(effects.CommandDelay(steps * DT, 3 * DT, -3 * DT), commands, drone)[
         :, APPLIED_ACTION
     ]
-    for channel, own in enumerate((steps, steps, steps + 3, max(steps - 3, 0))):
-        before = np.tile(np.stack(drone.applied), (own, 1))  # what was commanded before the flight
+    for channel, late_steps in enumerate((steps, steps, steps + 3, max(steps - 3, 0))):
+        before = np.tile(
+            np.stack(drone.applied), (late_steps, 1)
+        )  # what was commanded before the flight
         shifted = flown((), np.concatenate([before, commands])[:20], drone)[:, APPLIED_ACTION]
-        assert_allclose(found[:, channel], shifted[:, channel], rtol=1e-4, atol=1e-4)
+        assert_allclose(applied[:, channel], shifted[:, channel], rtol=1e-4, atol=1e-4)
 
 
 # --- Sensors --------------------------------------------------------------------------------------
@@ -210,13 +214,13 @@ def test_late_sensors_read_the_past(steps):
 def test_late_poses_are_those_of_the_past(steps):
     """Before the flight the drone is taken to have been where it starts."""
     drone, commands = random_drone(3), random_commands(3, 20)
-    found = flown(effects.MocapLatency(steps * DT), commands, drone)
+    rows = flown(effects.MocapLatency(steps * DT), commands, drone)
     start = np.concatenate([drone.pos_w, drone.vel_w, drone.quat])
-    then = past(found[:, [*range(6), *range(9, 13)]], start, steps)
+    then = past(rows[:, [*range(6), *range(9, 13)]], start, steps)
     then[:, 6:] /= np.linalg.norm(then[:, 6:], axis=1, keepdims=True)
-    signs = np.sign(np.sum(then[:, 6:] * found[:, 33:37], axis=1, keepdims=True))
-    assert_reads(found[:, 27:33], then[:, :6])
-    assert_reads(signs * found[:, 33:37], then[:, 6:])
+    signs = np.sign(np.sum(then[:, 6:] * rows[:, 33:37], axis=1, keepdims=True))
+    assert_reads(rows[:, 27:33], then[:, :6])
+    assert_reads(signs * rows[:, 33:37], then[:, 6:])
 
 
 # --- What the environment shows of the gyro -------------------------------------------------------

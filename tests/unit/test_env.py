@@ -63,8 +63,8 @@ def test_parameters_can_differ_between_environments(env, params):
     @jax.jit
     @jax.vmap
     def sideways_force(mass):
-        other = params.replace(model=params.model._replace(m=mass))
-        return mass * env.drone(env.step_env(None, state, jnp.zeros(4), other)[1]).acc_w.x
+        changed = params.replace(model=params.model._replace(m=mass))
+        return mass * env.drone(env.step_env(None, state, jnp.zeros(4), changed)[1]).acc_w.x
 
     forces = sideways_force(jnp.array([0.5, 1.0, 2.0]))
     assert abs(forces[0]) > 0.1

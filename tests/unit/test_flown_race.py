@@ -54,17 +54,17 @@ def test_race_is_the_environments_number_by_number(shift):
     """Flown aside by up to 2 m: gates are passed, touched and missed."""
     states, _ = ghost_rollout(REFERENCES, 900)
     states[:, POSITION] += np.linspace(0.0, 1.0, 900)[:, None] * (0.0, shift, 0.0)
-    found = follow_race(states[:, POSITION], TRACK, first_gate=0)
+    race = follow_race(states[:, POSITION], TRACK, first_gate=0)
     races, _ = fly_recorded(states, 0)
-    assert_array_equal(found.gate, races.gate_index)
-    assert_array_equal(found.laps, races.laps)
-    assert_allclose(found.lap_time_s, races.lap_time_s, atol=1e-5)
-    assert_allclose(found.lap_start_s, races.lap_start_s, atol=1e-5)
+    assert_array_equal(race.gate, races.gate_index)
+    assert_array_equal(race.laps, races.laps)
+    assert_allclose(race.lap_time_s, races.lap_time_s, atol=1e-5)
+    assert_allclose(race.lap_start_s, races.lap_start_s, atol=1e-5)
     centres = np.stack(races.gate.centre, axis=-1)
     distance = np.linalg.norm(states[:, POSITION] - centres, axis=1)
-    assert_allclose(found.gate_distance_m, distance, rtol=1e-5)
-    assert len(found.passes) == races.gates_passed[-1]
-    assert shift < 2.0 or len(found.passes) < 17  # the ghost's, which flies on
+    assert_allclose(race.gate_distance_m, distance, rtol=1e-5)
+    assert len(race.passes) == races.gates_passed[-1]
+    assert shift < 2.0 or len(race.passes) < 17  # the ghost's, which flies on
 
 
 def test_step_after_the_last_state_is_extrapolated():
@@ -74,12 +74,14 @@ def test_step_after_the_last_state_is_extrapolated():
     lap = whole.passes[7]
     cut = states[: lap.row]
     without = follow_race(cut[:, POSITION], TRACK)
-    found = follow_race(cut[:, POSITION], TRACK, last_vel_w=cut[-1, VELOCITY])
-    assert len(without.passes) == 7 and len(found.passes) == 8
-    assert found.passes[7].row == len(cut) and found.passes[7].lap == 1
-    assert found.passes[7].lap_time_s == pytest.approx(REFERENCES["standing"].time_s, abs=2e-4)
-    for one, other in zip(found[:5], without[:5], strict=True):
-        assert_array_equal(one, other)
+    extrapolated = follow_race(cut[:, POSITION], TRACK, last_vel_w=cut[-1, VELOCITY])
+    assert len(without.passes) == 7 and len(extrapolated.passes) == 8
+    assert extrapolated.passes[7].row == len(cut) and extrapolated.passes[7].lap == 1
+    assert extrapolated.passes[7].lap_time_s == pytest.approx(
+        REFERENCES["standing"].time_s, abs=2e-4
+    )
+    for field, expected in zip(extrapolated[:5], without[:5], strict=True):
+        assert_array_equal(field, expected)
 
 
 ENDS = {  # the first gate, at (12.5, 2, 1.35), is flown towards -x
@@ -110,12 +112,12 @@ def test_end_is_the_environments(end):
 def test_first_gate_is_the_tracks_near_its_start_else_the_one_passed_first():
     states, _ = ghost_rollout(REFERENCES, 900)
     later = follow_race(states[200:, POSITION], TRACK)
-    assert [one.gate for one in later.passes[:3]] == [4, 5, 6] and later.gate[0] == 4
+    assert [gate_pass.gate for gate_pass in later.passes[:3]] == [4, 5, 6] and later.gate[0] == 4
     missed = states[:388].copy()  # past gate 0 and on through all others: that lap has not begun
     near = np.abs(missed[:, POSITION] - TRACK.gates[0].position).max(axis=1) < 4.0
     missed[near, 1] += 4.0
-    found = follow_race(missed[:, POSITION], TRACK)
-    assert found.passes == () and found.is_miss.sum() == 1 and set(found.gate) == {0}
+    race = follow_race(missed[:, POSITION], TRACK)
+    assert race.passes == () and race.is_miss.sum() == 1 and set(race.gate) == {0}
 
 
 @pytest.mark.parametrize(
@@ -130,7 +132,7 @@ def test_two_gates_in_one_step_each_have_their_time_and_end(shift_m, end):
     race = follow_race(states[:, POSITION], track, last_vel_w=states[-1, VELOCITY])
     assert why_ended(states, track, race) == end
     num_passed = 1 + (shift_m == 0.0)
-    passed = [(one.time_s, one.pos_w[0]) for one in race.passes]
+    passed = [(gate_pass.time_s, gate_pass.pos_w[0]) for gate_pass in race.passes]
     assert_allclose(passed, [(0.0925, 2.0), (0.0975, 2.1)][:num_passed], atol=1e-5)
 
 

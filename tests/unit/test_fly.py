@@ -147,8 +147,8 @@ def test_in_a_race_the_opponent_goes_its_own_way_and_is_hit(session):
     assert_allclose(race.ghost_state(), GHOST.flying.state_at(flight.log.time_s - STANDING.time_s))
     assert "to the time-optimal opponent" in race.notes()
     assert GHOST.lap_begin_s(2) == STANDING.time_s + GHOST.flying.gate_times_s[-1]
-    still = GHOST.first._replace(state_at=lambda time_s: np.r_[start_w, np.zeros(18)])
-    race = Session(TRACK, MODEL, GHOST._replace(first=still), is_race=True)
+    hovering = GHOST.first._replace(state_at=lambda time_s: np.r_[start_w, np.zeros(18)])
+    race = Session(TRACK, MODEL, GHOST._replace(first=hovering), is_race=True)
     race.fly(UP)
     assert race.flights[0].ended == "collision"
 

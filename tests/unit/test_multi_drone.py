@@ -104,7 +104,8 @@ def test_drones_far_apart_fly_as_alone():
 def test_no_collision_passes_between_two_steps(direction, other_direction, offset, moment):
     """Two drones at 30 m/s that touch at some moment of the step do not get past each other."""
     moves = [
-        0.3 * np.array(one) / max(np.linalg.norm(one), 1e-3) for one in (direction, other_direction)
+        0.3 * np.array(heading) / max(np.linalg.norm(heading), 1e-3)
+        for heading in (direction, other_direction)
     ]
     # At that moment, within a diameter.
     apart = 0.29 * np.array(offset) / max(np.linalg.norm(offset), 1.0)
@@ -117,9 +118,9 @@ def test_no_collision_passes_between_two_steps(direction, other_direction, offse
 
 
 def test_who_runs_into_the_other_is_out():
-    still, fast = Path(Vec3(0.4, 0, 0), Vec3(0.4, 0, 0)), Path(Vec3(0, 0, 0), Vec3(0.3, 0, 0))
-    assert is_put_out(fast, still, RAMMER) and not is_put_out(still, fast, RAMMER)
-    assert is_put_out(still, fast, BOTH)
+    hovering, fast = Path(Vec3(0.4, 0, 0), Vec3(0.4, 0, 0)), Path(Vec3(0, 0, 0), Vec3(0.3, 0, 0))
+    assert is_put_out(fast, hovering, RAMMER) and not is_put_out(hovering, fast, RAMMER)
+    assert is_put_out(hovering, fast, BOTH)
     ahead = Path(Vec3(0.5, 0, 0), Vec3(0.81, 0, 0))
     assert not is_put_out(fast, ahead, BOTH)
 
@@ -168,7 +169,10 @@ def test_opponents_are_seen_nearest_first_in_the_gate_frame():
 
 def test_ranks_are_by_progress_and_those_that_are_out_come_last():
     field = [standing(0, 2.5), standing(0, 4.0, True), standing(0, 3.0), standing(0, 1.0, True)]
-    ranks = [int(rank_of(one, [other for other in field if other is not one])) for one in field]
+    ranks = [
+        int(rank_of(drone, [opponent for opponent in field if opponent is not drone]))
+        for drone in field
+    ]
     assert ranks == [2, 3, 1, 4]
 
 

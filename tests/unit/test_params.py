@@ -54,8 +54,12 @@ def test_ends_of_ranges_pass_and_what_lies_beyond_is_refused(name):
 def test_every_number_of_the_parameters_has_a_range():
     parts = ("model", "reset", "reward")
     fields = {f"{part}.{name}" for part in parts for name in getattr(PARAMS, part)._fields}
-    own = {field.name for field in dataclasses.fields(EnvParams)} - {*parts, "course", "wrappers"}
-    assert set(RANGES) == (fields | own) - {"model.battery", "model.effects", "model.motion"}
+    direct = {field.name for field in dataclasses.fields(EnvParams)} - {
+        *parts,
+        "course",
+        "wrappers",
+    }
+    assert set(RANGES) == (fields | direct) - {"model.battery", "model.effects", "model.motion"}
 
 
 def test_courses_that_cannot_be_flown():

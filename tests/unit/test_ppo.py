@@ -142,7 +142,7 @@ def test_gae_equals_the_definition():
     batch = ppo.Batch(
         (), None, None, None, jnp.asarray(value), jnp.asarray(reward), jnp.asarray(done)
     )
-    found = ppo.generalized_advantages(batch, jnp.asarray(last_value), gamma, lam)
+    advantages = ppo.generalized_advantages(batch, jnp.asarray(last_value), gamma, lam)
     next_value = np.concatenate([value[1:], last_value[None]])
     delta = reward + gamma * next_value * ~done - value
     for env in range(3):
@@ -153,7 +153,7 @@ def test_gae_equals_the_definition():
                 weight *= gamma * lam
                 if done[step, env]:
                     break
-            assert found[start, env] == pytest.approx(total, abs=1e-5)
+            assert advantages[start, env] == pytest.approx(total, abs=1e-5)
 
 
 @pytest.mark.parametrize("size", [64, 4096, 96])

@@ -30,14 +30,14 @@ def columns(array):
 
 
 def test_axes_turned_vectors_and_products_are_those_of_rotations(quats):
-    own, others = Quaternion(*columns(quats)), np.roll(quats, 7, axis=0)
-    axes = np.stack([np.stack(axis, -1) for axis in own.axes()], axis=-1)
+    left, right = Quaternion(*columns(quats)), np.roll(quats, 7, axis=0)
+    axes = np.stack([np.stack(axis, -1) for axis in left.axes()], axis=-1)
     assert_allclose(axes, rotations(quats).as_matrix(), atol=1e-6)
     vectors = np.random.default_rng(1).normal(size=(NUM_CASES, 3))
-    rotated = np.stack(own.rotate(Vec3(*columns(vectors))), -1)
+    rotated = np.stack(left.rotate(Vec3(*columns(vectors))), -1)
     assert_allclose(rotated, rotations(quats).apply(vectors), atol=5e-6)
-    product = np.stack(own.multiply(Quaternion(*columns(others))), -1)
-    expected = (rotations(quats) * rotations(others)).as_quat(scalar_first=True)
+    product = np.stack(left.multiply(Quaternion(*columns(right))), -1)
+    expected = (rotations(quats) * rotations(right)).as_quat(scalar_first=True)
     sign = np.sign(np.sum(product * expected, axis=1, keepdims=True))
     assert_allclose(product, sign * expected, atol=1e-6)
 

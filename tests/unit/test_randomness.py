@@ -23,11 +23,11 @@ def normals():
 
 @pytest.mark.parametrize("name", ["position_0", "rates_2"])
 def test_draws_are_standard_normal(normals, name):
-    found = normals[name]
-    assert abs(found.mean()) < 5e-3 and found.std() == pytest.approx(1.0, abs=5e-3)
-    assert abs(stats.skew(found)) < 0.02 and abs(stats.kurtosis(found)) < 0.03
+    draws = normals[name]
+    assert abs(draws.mean()) < 5e-3 and draws.std() == pytest.approx(1.0, abs=5e-3)
+    assert abs(stats.skew(draws)) < 0.02 and abs(stats.kurtosis(draws)) < 0.03
     # The steps of the byte sums, 0.007 wide, are in the distance.
-    assert stats.kstest(found, "norm").statistic < 4e-3
+    assert stats.kstest(draws, "norm").statistic < 4e-3
 
 
 def test_names_and_steps_are_independent(normals):

@@ -15,9 +15,9 @@ from tests.support.tables import table
 
 def make_transition(before=None, after=None, **fields):
     """Return a still transition 5 m before a gate, with some parts replaced."""
-    still = {"num_passed": 0, "offset": 0.5, "is_terminated": False}
+    quiet = {"num_passed": 0, "offset": 0.5, "is_terminated": False}
     drones = [drone_at(**{"position": (-4.0, 2.0, 3.0), **(d or {})}) for d in (before, after)]
-    events = jax.tree.map(jnp.asarray, {**still, **fields})
+    events = jax.tree.map(jnp.asarray, {**quiet, **fields})
     return Transition(*drones, gate_centre_w=Vec3(*map(jnp.float32, (1.0, 2.0, 3.0))), **events)
 
 

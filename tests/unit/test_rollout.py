@@ -21,9 +21,9 @@ def test_round_trip_is_exact(tmp_path, steps):
     states, actions = make_flight(steps)
     save_rollout(tmp_path / "flight", states, actions)
     assert [path.name for path in tmp_path.iterdir()] == ["flight"]
-    for found, expected in zip(load_rollout(tmp_path / "flight"), (states, actions), strict=True):
-        assert_array_equal(found, expected)
-        assert found.dtype == np.float32
+    for array, expected in zip(load_rollout(tmp_path / "flight"), (states, actions), strict=True):
+        assert_array_equal(array, expected)
+        assert array.dtype == np.float32
     rows = np.load(tmp_path / "flight", allow_pickle=False)
     assert_array_equal(rows, np.hstack([states, actions]))
 

@@ -108,9 +108,9 @@ def test_one_kernel_is_the_same_function_and_prunes_what_it_does_not_read(dtype)
             lambda f: lambda *args: jax.jvp(f, args, tangents),
             lambda f: jax.grad(lambda *args: f(*args)[0].sum(), argnums=(0, 1)),
         ):
-            found, expected = (jax.jit(transform(f))(*given) for f in (one_kernel(swing), swing))
-            jax.tree.map(partial(assert_allclose, rtol=1e-6), found, expected)
-            assert jax.tree.leaves(found)[0].dtype == dtype
+            result, expected = (jax.jit(transform(f))(*given) for f in (one_kernel(swing), swing))
+            jax.tree.map(partial(assert_allclose, rtol=1e-6), result, expected)
+            assert jax.tree.leaves(result)[0].dtype == dtype
 
 
 def test_what_is_no_simple_operation_stays_outside_of_one_kernel():
@@ -164,31 +164,31 @@ reset = partial(reset_if_ended, begin)
 def test_only_ended_environments_change(monkeypatch, switch, size, share):
     monkeypatch.setenv(SWITCH, switch)
     batch = make_batch(size, share)
-    found, expected = (
-        jax.jit(jax.vmap(one, in_axes=(0, None)))(batch, 1000.0)
-        for one in (one_kernel(reset), reset_or_keep)
+    result, expected = (
+        jax.jit(jax.vmap(function, in_axes=(0, None)))(batch, 1000.0)
+        for function in (one_kernel(reset), reset_or_keep)
     )
-    jax.tree.map(assert_array_equal, found, expected)
+    jax.tree.map(assert_array_equal, result, expected)
 
 
 def test_a_batch_of_batches_and_parameters_of_each():
     batch = make_batch(24, 0.3)
     nested = jax.tree.map(lambda leaf: leaf.reshape(4, 6, *leaf.shape[1:]), batch)
-    found, expected = (
+    result, expected = (
         (
-            jax.jit(jax.vmap(jax.vmap(one, (0, None)), (0, None)))(nested, 5.0),
-            jax.jit(jax.vmap(one))(batch, 1.0 * jnp.arange(24)),
+            jax.jit(jax.vmap(jax.vmap(function, (0, None)), (0, None)))(nested, 5.0),
+            jax.jit(jax.vmap(function))(batch, 1.0 * jnp.arange(24)),
         )
-        for one in (reset, reset_or_keep)
+        for function in (reset, reset_or_keep)
     )
-    jax.tree.map(assert_array_equal, found, expected)
+    jax.tree.map(assert_array_equal, result, expected)
 
 
 def test_gradient_flows_through_what_did_not_end():
     def total(rows):
         batch = Ended(jnp.array([True, False, True]), ([rows], rows), jnp.zeros(3, jnp.uint32))
         reset = partial(reset_if_ended, lambda seed, _: ([seed * 1.0], seed * 1.0))
-        (found,), _ = jax.vmap(one_kernel(reset), in_axes=(0, None))(batch, None)
-        return (found**2).sum()
+        (shown,), _ = jax.vmap(one_kernel(reset), in_axes=(0, None))(batch, None)
+        return (shown**2).sum()
 
     assert_allclose(jax.grad(total)(jnp.array([3.0, 4.0, 5.0])), [0.0, 8.0, 0.0])

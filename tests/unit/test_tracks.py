@@ -131,8 +131,8 @@ def test_every_demand_has_a_break():
 
 def test_the_unbroken_ring_is_feasible_but_by_limits_of_ones_own():
     assert tracks.find_problems(RING) == ()
-    found = tracks.find_problems(RING, tracks.Limits(min_opening=1.51))
-    assert len(found) == NUM_GATES and {problem.demand for problem in found} == {"opening"}
+    problems = tracks.find_problems(RING, tracks.Limits(min_opening=1.51))
+    assert len(problems) == NUM_GATES and {problem.demand for problem in problems} == {"opening"}
 
 
 def test_default_clearances_are_what_starts_need():

@@ -53,8 +53,8 @@ def test_handouts_function_records_the_numbers_that_it_is_given(tmp_path):
     expected |= dict(zip(("speed", "angular_speed"), speeds, strict=True))
     grid = [(step, step * 10_000_000) for step in range(100)]
     for path, values in expected.items():
-        found = handout.series(f"/plots/{path}", "Scalars:scalars")
-        assert_allclose(found, values, rtol=1e-12, err_msg=path)
+        plotted = handout.series(f"/plots/{path}", "Scalars:scalars")
+        assert_allclose(plotted, values, rtol=1e-12, err_msg=path)
         assert sorted(handout.times[f"/plots/{path}"]) == grid, path
     assert handout.app_id == "test_app" and handout.timelines == {"step", "sim_time"}
 
@@ -63,8 +63,8 @@ def test_handouts_function_records_the_numbers_that_it_is_given(tmp_path):
 def test_gates_alone_are_flown_as_the_flight_passes_them(tmp_path, is_back):
     """The handout's rows do not tell the direction of flight."""
     states = STATES[::-1].copy() if is_back else STATES
-    found = record(tmp_path, list(zip(states, ACTIONS, strict=True)))
-    vectors = found.once("/world/gates/direction", "Arrows3D:vectors")
+    recording = record(tmp_path, list(zip(states, ACTIONS, strict=True)))
+    vectors = recording.once("/world/gates/direction", "Arrows3D:vectors")
     forward = np.stack(build_course(TRACK).gates.forward, axis=-1)
     assert_allclose(vectors, -forward if is_back else forward, atol=1e-6)
 
@@ -80,11 +80,11 @@ def test_nan_outside_the_pose_is_a_gap_and_rounded_quaternions_are_normalised(tm
     sequence = with_state(slice(9, 13), 0.5004)
     sequence[2][0][3] = np.nan
     before = rr.get_data_recording()
-    found = record(tmp_path, sequence, np.zeros((0, 8)))
+    recording = record(tmp_path, sequence, np.zeros((0, 8)))
     assert rr.get_data_recording() is before  # the caller's own
-    speed = found.series("/plots/speed", "Scalars:scalars")
+    speed = recording.series("/plots/speed", "Scalars:scalars")
     assert np.isnan(speed).tolist() == [False, False, True]
-    rotation = found.series("/world/drone", "Transform3D:quaternion")[2]
+    rotation = recording.series("/world/drone", "Transform3D:quaternion")[2]
     assert_allclose(rotation, np.full(4, 0.5), atol=1e-7)
 
 
@@ -147,10 +147,10 @@ def test_passes_laps_events_and_table_are_the_races(tmp_path):
     recording = Recording(tmp_path / "two.rrd")
     rows = recording.rows["/world/passes", "Points3D:positions"]
     assert [step for step, _ in recording.times["/world/passes"]] == [
-        one.row for one in RACE.passes
+        gate_pass.row for gate_pass in RACE.passes
     ]
     for count, points in enumerate(rows, start=1):
-        assert_allclose(points, [one.pos_w for one in RACE.passes[:count]], rtol=1e-6)
+        assert_allclose(points, [gate_pass.pos_w for gate_pass in RACE.passes[:count]], rtol=1e-6)
     first, lap = RACE.passes[0], RACE.passes[7]
     assert [step for step, _ in recording.times["/world/laps"]] == [lap.row]
     assert recording.rows["/world/laps", "Points3D:labels"] == [[f"lap 1: {lap.lap_time_s:.3f} s"]]
