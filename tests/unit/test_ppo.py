@@ -145,15 +145,11 @@ def test_gae_equals_the_definition():
     advantages = ppo.generalized_advantages(batch, jnp.asarray(last_value), gamma, lam)
     next_value = np.concatenate([value[1:], last_value[None]])
     delta = reward + gamma * next_value * ~done - value
-    for env in range(3):
-        for start in range(6):
-            total, weight = 0.0, 1.0
-            for step in range(start, 6):
-                total += weight * delta[step, env]
-                weight *= gamma * lam
-                if done[step, env]:
-                    break
-            assert advantages[start, env] == pytest.approx(total, abs=1e-5)
+    for start in range(6):
+        is_same_episode = np.cumprod(np.vstack([np.ones(3), ~done[start:-1]]), axis=0)
+        weights = (gamma * lam) ** np.arange(6 - start)[:, None] * is_same_episode
+        total = (weights * delta[start:]).sum(axis=0)
+        assert_allclose(advantages[start], total, atol=1e-5)
 
 
 @pytest.mark.parametrize("size", [64, 4096, 96])
