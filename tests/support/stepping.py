@@ -77,7 +77,14 @@ def _by_shard_map(fly, keys, actions, params, mesh):
     return jax.jit(jax.shard_map(fly, mesh=mesh, **specs))(keys, actions, params)
 
 
-WAYS = (_by_named_sharding, _by_shard_map)
+def _by_pmap(fly, keys, actions, params, mesh):
+    keys, actions = (leaf.reshape(NUM_DEVICES, -1, *leaf.shape[1:]) for leaf in (keys, actions))
+    begun, steps = jax.pmap(fly, in_axes=(0, 0, None))(keys, actions, params)
+    begun = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), begun)
+    return begun, jax.tree.map(lambda leaf: jnp.concatenate(list(leaf), axis=1), steps)
+
+
+WAYS = (_by_named_sharding, _by_shard_map, _by_pmap)
 
 
 def main(env_ids):
