@@ -32,11 +32,8 @@ from flytrack_sysid.prediction_windows import HORIZONS_S, Windows
 from flytrack_sysid.record import fill_gaps
 from flytrack_sysid.split import held_out_rows
 
-LONG_S, PAST_RATES_S, SHORT = (
-    0.3,
-    0.05,
-    3,
-)  # of commands, of rates; SHORT: which part of the commands
+LONG_S, PAST_RATES_S = 0.3, 0.05  # of commands, of rates
+SHORT = 3  # the latest commands are those of LONG_S / SHORT
 RIDGE = 1e-3  # in units of the regressors' variance
 WIDTH, EPOCHS, PATIENCE, MINIBATCH, RATE = 16, 200, 15, 256, 3e-3
 GRAVITY = np.array([0.0, 0.0, 9.80665])
@@ -58,33 +55,31 @@ class Rows(NamedTuple):
     is_held_out: np.ndarray
 
 
-Answer = Callable[[Rows], np.ndarray]
+BlackBox = Callable[[Rows], np.ndarray]
 
 
 def base_steps(model: ModelParameters, log: FlightLog) -> np.ndarray:
     """Return the base's rates and specific force after a step from every row, body frame."""
     after = predict(model, fill_gaps(log)).after
-    turned = Rotation.from_quat(log["q"], scalar_first=True)
-    return np.c_[columns(after.rates_b), turned.inv().apply(columns(after.acc_w) + GRAVITY)]
+    to_body = Rotation.from_quat(log["q"], scalar_first=True).inv()
+    return np.c_[columns(after.rates_b), to_body.apply(columns(after.acc_w) + GRAVITY)]
 
 
 def rows_of(log: FlightLog, model: ModelParameters) -> Rows:
     """Return the rows of a log without gaps."""
-    step_s, base = float(np.median(usual_step(log))), base_steps(model, log)
-    long, past_rates = _past(step_s)
-    starts = np.flatnonzero(log.is_start())
-    first = np.repeat(starts, np.diff(np.append(starts, len(log))))
-    now = np.flatnonzero(
-        (np.arange(len(log)) - first >= long - 1) & np.append(~log.is_start()[1:], False)
-    )
-    turned = Rotation.from_quat(log["q"][now], scalar_first=True).inv()
+    step_s, is_start = float(np.median(usual_step(log))), log.is_start()
+    num_commands, num_rates = _past(step_s)
+    age = np.arange(len(log)) - np.maximum.accumulate(np.where(is_start, np.arange(len(log)), 0))
+    has_next = np.append(~is_start[1:], False)
+    now = np.flatnonzero((age >= num_commands - 1) & has_next)
+    to_body = Rotation.from_quat(log["q"][now], scalar_first=True).inv()
     acc_w = (log["v"][now + 1] - log["v"][now]) / step_s
     return Rows(
-        commands=log["u"][now[:, None] + np.arange(1 - long, 1)],
-        past_rates_b=log["w"][now[:, None] + np.arange(1 - past_rates, 1)],
-        vel_b=turned.apply(log["v"][now]),
-        base=base[now],
-        target=np.c_[log["w"][now + 1], turned.apply(acc_w + GRAVITY)],
+        commands=log["u"][now[:, None] + np.arange(1 - num_commands, 1)],
+        past_rates_b=log["w"][now[:, None] + np.arange(1 - num_rates, 1)],
+        vel_b=to_body.apply(log["v"][now]),
+        base=base_steps(model, log)[now],
+        target=np.c_[log["w"][now + 1], to_body.apply(acc_w + GRAVITY)],
         is_held_out=held_out_rows(log)[now],
     )
 
@@ -94,18 +89,18 @@ def _past(step_s: float) -> tuple[int, int]:
     return round(LONG_S / step_s), round(PAST_RATES_S / step_s)
 
 
-def posed(log: FlightLog) -> FlightLog:
+def with_pose(log: FlightLog) -> FlightLog:
     """Return the log with attitude and velocity; level and at rest if it has none."""
     level = {"q": np.tile([1.0, 0.0, 0.0, 0.0], (len(log), 1)), "v": np.zeros((len(log), 3))}
     return replace(log, channels=level | dict(log.channels))
 
 
-def _latest(rows: Rows) -> np.ndarray:
-    return rows.commands[:, -(rows.commands.shape[1] // SHORT) :]
-
-
 def _flat(values: np.ndarray) -> np.ndarray:
     return values.reshape(len(values), -1)
+
+
+def _latest(rows: Rows) -> np.ndarray:
+    return _flat(rows.commands[:, -(rows.commands.shape[1] // SHORT) :])
 
 
 def _fir(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
@@ -114,30 +109,34 @@ def _fir(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _arx(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
-    own = np.c_[_flat(_latest(rows)), _flat(rows.past_rates_b)]
-    return own, np.c_[own, rows.vel_b]
+    regressors = np.c_[_latest(rows), _flat(rows.past_rates_b)]
+    return regressors, np.c_[regressors, rows.vel_b]
 
 
-def linear(rows: Rows, regressors: Callable[[Rows], tuple[np.ndarray, np.ndarray]]) -> Answer:
+def _fit_ridge(inputs: np.ndarray, outputs: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a ridge regression with an offset, as a function of inputs."""
+    mean, spread = inputs.mean(axis=0), inputs.std(axis=0) + 1e-9
+
+    def scale(inputs: np.ndarray) -> np.ndarray:
+        return np.c_[(inputs - mean) / spread, np.ones(len(inputs))]
+
+    scaled = scale(inputs)
+    damping = RIDGE * len(inputs) * np.diag([*np.ones(len(mean)), 1e-9])
+    slopes = np.linalg.solve(scaled.T @ scaled + damping, scaled.T @ outputs)
+    return lambda inputs: scale(inputs) @ slopes
+
+
+def fit_linear(rows: Rows, regressors: Callable[[Rows], tuple[np.ndarray, np.ndarray]]) -> BlackBox:
     """Return a ridge regression of rates and of force, each on its own regressors."""
-    fits = []
-    for known, wanted in zip(
-        regressors(rows), (rows.target[:, :3], rows.target[:, 3:]), strict=True
-    ):
-        mean, spread = known.mean(axis=0), known.std(axis=0) + 1e-9
-        scaled = np.c_[(known - mean) / spread, np.ones(len(known))]
-        damping = RIDGE * len(known) * np.diag([*np.ones(len(mean)), 1e-9])
-        slopes = np.linalg.solve(scaled.T @ scaled + damping, scaled.T @ wanted)
-        fits.append((mean, spread, slopes))
+    of_rates, of_force = regressors(rows)
+    rates = _fit_ridge(of_rates, rows.target[:, :3])
+    force = _fit_ridge(of_force, rows.target[:, 3:])
 
-    def answer(other: Rows) -> np.ndarray:
-        parts = [
-            np.c_[(known - mean) / spread, np.ones(len(known))] @ slopes
-            for known, (mean, spread, slopes) in zip(regressors(other), fits, strict=True)
-        ]
-        return np.concatenate(parts, axis=1)
+    def black_box(rows: Rows) -> np.ndarray:
+        of_rates, of_force = regressors(rows)
+        return np.c_[rates(of_rates), force(of_force)]
 
-    return answer
+    return black_box
 
 
 class _Network(nn.Module):
@@ -147,83 +146,92 @@ class _Network(nn.Module):
         return nn.Dense(6, kernel_init=nn.initializers.zeros)(hidden)
 
 
-def network(rows: Rows) -> Answer:
-    """Return the base with a network for what it leaves, stopped early by every fourth block."""
+def fit_network(rows: Rows) -> BlackBox:
+    """Return the base with a network for its residual, stopped early by every fourth block."""
 
-    def inputs_of(some: Rows) -> np.ndarray:
-        return np.c_[_flat(_latest(some)), some.base, some.vel_b]
+    def inputs_of(rows: Rows) -> np.ndarray:
+        return np.c_[_latest(rows), rows.base, rows.vel_b]
 
-    known, left = inputs_of(rows), rows.target - rows.base
-    mean, spread, size = known.mean(axis=0), known.std(axis=0) + 1e-9, left.std(axis=0)
-    known, left = ((known - mean) / spread).astype(np.float32), (left / size).astype(np.float32)
-    module, chain = _Network(), optax.adam(RATE)
-    weights = module.init(jax.random.key(0), known[:1])
-
-    @jax.jit
-    def loss(weights: Any, inputs: jax.Array, wanted: jax.Array) -> jax.Array:
-        return jnp.mean(optax.huber_loss(module.apply(weights, inputs), wanted))
+    inputs, residual = inputs_of(rows), rows.target - rows.base
+    mean, spread, size = inputs.mean(axis=0), inputs.std(axis=0) + 1e-9, residual.std(axis=0)
+    inputs = ((inputs - mean) / spread).astype(np.float32)
+    residual = (residual / size).astype(np.float32)
+    module, optimizer = _Network(), optax.adam(RATE)
+    weights = module.init(jax.random.key(0), inputs[:1])
 
     @jax.jit
-    def update(weights: Any, memory: Any, inputs: jax.Array, wanted: jax.Array) -> tuple[Any, Any]:
-        change, memory = chain.update(jax.grad(loss)(weights, inputs, wanted), memory)
+    def loss(weights: Any, inputs: jax.Array, residual: jax.Array) -> jax.Array:
+        return jnp.mean(optax.huber_loss(module.apply(weights, inputs), residual))
+
+    @jax.jit
+    def update(weights: Any, memory: Any, inputs: jax.Array, residual: jax.Array) -> Any:
+        gradient = jax.grad(loss)(weights, inputs, residual)
+        change, memory = optimizer.update(gradient, memory)
         return optax.apply_updates(weights, change), memory
 
-    rng, memory = np.random.default_rng(0), chain.init(weights)
-    learnt, best, lowest, waited = np.flatnonzero(~rows.is_held_out), weights, np.inf, 0
+    rng, memory = np.random.default_rng(0), optimizer.init(weights)
+    is_held_out = rows.is_held_out
+    trained, best, lowest, waited = np.flatnonzero(~is_held_out), weights, np.inf, 0
     for _ in range(EPOCHS):
-        for part in np.split(rng.permutation(learnt), np.arange(MINIBATCH, len(learnt), MINIBATCH))[
-            :-1
-        ]:
-            weights, memory = update(weights, memory, known[part], left[part])
-        now = float(loss(weights, known[rows.is_held_out], left[rows.is_held_out]))
-        best, lowest, waited = (weights, now, 0) if now < lowest else (best, lowest, waited + 1)
+        edges = np.arange(MINIBATCH, len(trained), MINIBATCH)
+        for batch in np.split(rng.permutation(trained), edges)[:-1]:
+            weights, memory = update(weights, memory, inputs[batch], residual[batch])
+        error = float(loss(weights, inputs[is_held_out], residual[is_held_out]))
+        best, lowest, waited = (weights, error, 0) if error < lowest else (best, lowest, waited + 1)
         if waited > PATIENCE:
             break
     apply = jax.jit(module.apply)
 
-    def answer(other: Rows) -> np.ndarray:
-        scaled = ((inputs_of(other) - mean) / spread).astype(np.float32)
-        return other.base + size * np.asarray(apply(best, scaled), float)
+    def black_box(rows: Rows) -> np.ndarray:
+        scaled = ((inputs_of(rows) - mean) / spread).astype(np.float32)
+        return rows.base + size * np.asarray(apply(best, scaled), float)
 
-    return answer
+    return black_box
 
 
-def linear_ones(rows: Rows) -> Mapping[str, Answer]:
+def fit_linear_boxes(rows: Rows) -> Mapping[str, BlackBox]:
     """Return the linear black boxes by name; of logs with rates alone, too."""
-    return {"fir": linear(rows, _fir), "arx": linear(rows, _arx)}
+    return {"fir": fit_linear(rows, _fir), "arx": fit_linear(rows, _arx)}
 
 
-def flown(answer: Answer, windows: Windows, base: np.ndarray) -> Tested:
+def fly_windows(black_box: BlackBox, windows: Windows, base: np.ndarray) -> Tested:
     """Return a black box's errors on windows of a log.
 
     base: ``base_steps`` of all rows of the log.
     """
     record, first = windows.record, windows.first_free - 1
     step_s = float(np.median(record.step_s))
-    long, past_rates = _past(step_s)
-    past = [windows.gyro_b[first - age] for age in range(past_rates)][::-1]
-    turned = Rotation.from_quat(record.quat[first], scalar_first=True)
+    num_commands, num_rates = _past(step_s)
+    rates_b = [windows.gyro_b[row] for row in range(first - num_rates + 1, first + 1)]
+    attitude = Rotation.from_quat(record.quat[first], scalar_first=True)
     vel_w, pos_w = record.vel_w[first], record.pos_w[first]
-    seen = []
+    errors = []
     for row in range(first, windows.ends[-1]):
-        own = np.minimum(windows.start + row - first, len(base) - 1)
+        in_log = np.minimum(windows.start + row - first, len(base) - 1)
         rows = Rows(
-            commands=record.command[row + 1 - long : row + 1].swapaxes(0, 1),
-            past_rates_b=np.stack(past[-past_rates:], axis=1),
-            vel_b=turned.inv().apply(vel_w),
-            base=base[own],
-            target=np.zeros((len(own), 6)),
-            is_held_out=np.zeros(len(own), bool),
+            commands=record.command[row + 1 - num_commands : row + 1].swapaxes(0, 1),
+            past_rates_b=np.stack(rates_b[-num_rates:], axis=1),
+            vel_b=attitude.inv().apply(vel_w),
+            base=base[in_log],
+            target=np.zeros((len(in_log), 6)),
+            is_held_out=np.zeros(len(in_log), bool),
         )
-        found = answer(rows)
-        acc_w = turned.apply(found[:, 3:]) - GRAVITY
+        after = black_box(rows)
+        acc_w = attitude.apply(after[:, 3:]) - GRAVITY
         pos_w, vel_w = pos_w + (vel_w + 0.5 * acc_w * step_s) * step_s, vel_w + acc_w * step_s
-        turned = turned * Rotation.from_rotvec(0.5 * (past[-1] + found[:, :3]) * step_s)
-        past.append(found[:, :3])
+        turn_b = 0.5 * (rates_b[-1] + after[:, :3]) * step_s
+        attitude = attitude * Rotation.from_rotvec(turn_b)
+        rates_b.append(after[:, :3])
         if row + 1 in windows.ends:
             measured = Rotation.from_quat(record.quat[row + 1], scalar_first=True)
-            levels = ((windows.gyro_b, past[-1]), (record.vel_w, vel_w), (record.pos_w, pos_w))
-            turn = (turned.inv() * measured).as_rotvec()
-            seen.append(np.stack([turn, *(one[row + 1] - now for one, now in levels)], axis=1))
-    assert len(seen) == len(HORIZONS_S)
-    return Tested(np.where(windows.counts[..., None], np.stack(seen), 0.0)[None], windows)
+            errors.append(
+                [
+                    (attitude.inv() * measured).as_rotvec(),
+                    windows.gyro_b[row + 1] - rates_b[-1],
+                    record.vel_w[row + 1] - vel_w,
+                    record.pos_w[row + 1] - pos_w,
+                ]
+            )
+    assert len(errors) == len(HORIZONS_S)
+    by_window = np.stack(errors).swapaxes(1, 2)
+    return Tested(np.where(windows.counts[..., None], by_window, 0.0)[None], windows)

@@ -8,8 +8,21 @@ import jax
 import numpy as np
 
 from benchmarks import report
-from benchmarks.real.black_boxes import base_steps, flown, linear_ones, posed, rows_of
-from benchmarks.real.crazyflie import AS_GOOD, FOLDER, MOST, SPACING_S, by_flight, flights
+from benchmarks.real.black_boxes import (
+    base_steps,
+    fit_linear_boxes,
+    fly_windows,
+    rows_of,
+    with_pose,
+)
+from benchmarks.real.crazyflie import (
+    AS_GOOD,
+    FOLDER,
+    MAX_WINDOWS,
+    SPACING_S,
+    error_ratios,
+    load_flights,
+)
 from benchmarks.real.section import Record, diagnose_log, import_mapped, test_model
 from benchmarks.report import table
 from flytrack_env.dynamics import ModelParameters, collective_thrust
@@ -21,8 +34,8 @@ from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES, make_windo
 
 BETAFLIGHT = "betaflight_acro_log"
 # Every third policy, by its number, is for judging.
-LEARNT = ("48", "49", "52", "53", "67", "68", "70", "71")
-JUDGED = ("50", "66", "69")
+TRAINING = ("48", "49", "52", "53", "67", "68", "70", "71")
+HELD_OUT = ("50", "66", "69")
 QUAD, GECKO_MAPPING = (
     Path(__file__).with_name("mappings").joinpath(f"{name}.toml").read_text(encoding="utf-8")
     for name in ("betaflight", "gecko")
@@ -42,7 +55,10 @@ SECONDS = 17.0  # of each flight: the shortest lasts 18 s
 STANDARD, UPGRADED = "cf_lee_standard", "cf_lee_upgraded"
 PAYLOAD_MAPPING = 'extends = "crazyflie_lee"\n\n[rows]\nevery = 2\n\n[craft]\nmass_kg = {mass_kg}\n'
 # Whose logs are also diagnosed by the model that is imported with them; and what that is called.
-OWN_MODEL, OWN_MODEL_RECORD = "between series", "logs 202 and 203, by the imported model"
+IMPORTED_MODEL, IMPORTED_MODEL_RECORD = (
+    "between series",
+    "logs 202 and 203, by the imported model",
+)
 WITHIN = 0.05
 UNWANTED = ("linear_drag", "quadratic_drag", "rotor_drag", "wind")
 
@@ -52,21 +68,21 @@ def gecko(data: Path) -> Record:
 
     The second half of the flight is held out.
     """
-    found = import_mapped(data / GECKO / GECKO_FILE, "betaflight", GECKO_MAPPING)
-    held_out = found.log.time > 0.5 * (found.log.time[0] + found.log.time[-1])
-    diagnosis, record = diagnose_log(found.log, found.nominal_model(), held_out)
-    log, base = posed(found.log), diagnosis.base._replace(effects=())
+    flight = import_mapped(data / GECKO / GECKO_FILE, "betaflight", GECKO_MAPPING)
+    log = flight.log
+    held_out = log.time > 0.5 * (log.time[0] + log.time[-1])
+    diagnosis, record = diagnose_log(log, flight.nominal_model(), held_out)
+    base, posed = diagnosis.base._replace(effects=()), with_pose(log)
     with jax.enable_x64(True):
-        windows = windows_of(found.log, held_out)
+        windows = windows_of(log, held_out)
         assert windows is not None
-        steps, boxes = base_steps(base, log), linear_ones(rows_of(log.select(~held_out), base))
-        for name, answer in boxes.items():
-            rates = flown(answer, windows, steps).rms()[0, :, QUANTITIES.index("rates")]
-            by_horizon = dict(
-                zip(map("{:g}".format, HORIZONS_S), rates.round(6).tolist(), strict=True)
-            )
+        steps, rows = base_steps(base, posed), rows_of(posed.select(~held_out), base)
+        for name, black_box in fit_linear_boxes(rows).items():
+            rms = fly_windows(black_box, windows, steps).rms()[0, :, QUANTITIES.index("rates")]
+            horizons = [f"{horizon:g}" for horizon in HORIZONS_S]
+            by_horizon = dict(zip(horizons, rms.round(6).tolist(), strict=True))
             record["diagnosis"]["prediction"]["errors"][name] = {"rates_rad_per_s": by_horizon}
-    return record | {"best_linear_rad_per_s": best_linear(found.log, held_out)}
+    return record | {"best_linear_rad_per_s": best_linear(log, held_out)}
 
 
 def best_linear(log: FlightLog, held_out: np.ndarray) -> float:
@@ -74,37 +90,37 @@ def best_linear(log: FlightLog, held_out: np.ndarray) -> float:
 
     No linear model of whatever order that is driven by the setpoints can do better but by chance.
     """
-    back, ahead = (round(one / float(np.median(usual_step(log)))) for one in (BEFORE_S, AFTER_S))
+    step_s = float(np.median(usual_step(log)))
+    back, ahead = round(BEFORE_S / step_s), round(AFTER_S / step_s)
     rows = np.arange(back, len(log) - ahead)
-    known = log["u"][rows[:, None] + np.arange(-back, ahead + 1), :3].reshape(len(rows), -1)
-    known, is_judged = np.c_[known, np.ones(len(rows))], held_out[rows]
-    damping = RIDGE * np.diag(np.square(known[~is_judged]).sum(axis=0) + 1e-9)
-    inner = known[~is_judged].T @ known[~is_judged] + damping
-    slopes = np.linalg.solve(inner, known[~is_judged].T @ log["w"][rows[~is_judged]])
-    left = log["w"][rows[is_judged]] - known[is_judged] @ slopes
-    return float(np.sqrt(np.square(left).sum(axis=1).mean()))
+    setpoints = log["u"][rows[:, None] + np.arange(-back, ahead + 1), :3].reshape(len(rows), -1)
+    inputs, is_held_out = np.c_[setpoints, np.ones(len(rows))], held_out[rows]
+    trained, rates = inputs[~is_held_out], log["w"][rows]
+    damping = RIDGE * np.diag(np.square(trained).sum(axis=0) + 1e-9)
+    slopes = np.linalg.solve(trained.T @ trained + damping, trained.T @ rates[~is_held_out])
+    residuals = rates[is_held_out] - inputs[is_held_out] @ slopes
+    return float(np.sqrt(np.square(residuals).sum(axis=1).mean()))
 
 
 def gecko_part(record: Record) -> str:
     """Return the figures, and the errors of all models."""
-    found = record["diagnosis"]["prediction"]["errors"]
-    errors = {name: one["rates_rad_per_s"] for name, one in found.items()}
-    degrees = {
-        name: [f"{np.rad2deg(value):.3g}" for value in one.values()] for name, one in errors.items()
-    }
-    rows = [[name.replace("_", " "), *cells] for name, cells in degrees.items()]
+    by_model = record["diagnosis"]["prediction"]["errors"]
+    rates = {name: errors["rates_rad_per_s"] for name, errors in by_model.items()}
+    rows = [
+        [name.replace("_", " "), *(f"{np.rad2deg(error):.3g}" for error in errors.values())]
+        for name, errors in rates.items()
+    ]
     figures = []
     for name, target in TARGETS.items():
-        ratio = errors["extended"][HORIZON] / errors[name][HORIZON]
+        ratio = rates["extended"][HORIZON] / rates[name][HORIZON]
         label = f"extended over {name.replace('_', ' ')} after {HORIZON} s"
         figures.append(report.Figure(label, f"at most {target:g}", f"{ratio:.2f}", 1))
+    heads = ["body rates, rms, deg/s, after", *(f"{horizon:g} s" for horizon in HORIZONS_S)]
     return report.filled(
         "real_gecko",
         figures=report.figures_table(figures),
         best_linear=np.rad2deg(record["best_linear_rad_per_s"]),
-        errors=table(
-            ["body rates, rms, deg/s, after", *(f"{one:g} s" for one in HORIZONS_S)], rows
-        ),
+        errors=table(heads, rows),
         mapping=GECKO_MAPPING,
     )
 
@@ -118,50 +134,46 @@ def nanobench(data: Path) -> Record:
     the flights and judged on the other, so that every flight is held out once.
     """
     names = " ".join(HALVES).split()
-    found = import_log([data / NANOBENCH / f"{name}.csv.gz" for name in names], "csv", NANOBENCH)
-    starts = found.log.time[found.log.is_start()]
-    log = found.log.select(found.log.time - starts[found.log.segment] < SECONDS)
-    model = found.nominal_model()
+    files = [data / NANOBENCH / f"{name}.csv.gz" for name in names]
+    flight = import_log(files, "csv", NANOBENCH)
+    starts_s = flight.log.time[flight.log.is_start()]
+    log = flight.log.select(flight.log.time - starts_s[flight.log.segment] < SECONDS)
     folds = []
-    for judged in HALVES:
-        held_out = np.isin(log.segment, [names.index(name) for name in judged.split()])
-        diagnosis, record = diagnose_log(log, model, held_out)
+    for half in HALVES:
+        held_out = np.isin(log.segment, [names.index(name) for name in half.split()])
+        diagnosis, record = diagnose_log(log, flight.nominal_model(), held_out)
         with jax.enable_x64(True):
-            windows = make_windows(log, held_out, SPACING_S, MOST)
-            models = {"refitted_base": diagnosis.base, "extended": diagnosis.extended}
-            results = {name: test_model(one, windows) for name, one in models.items()}
-        ratios = by_flight(results, log.segment[windows.start])
-        record["by_flight"] = {names[int(number)]: one for number, one in ratios.items()}
+            windows = make_windows(log, held_out, SPACING_S, MAX_WINDOWS)
+            base, extended = (
+                test_model(model, windows) for model in (diagnosis.base, diagnosis.extended)
+            )
+        ratios = error_ratios(base, extended, log.segment[windows.start])
+        record["by_flight"] = {names[int(number)]: cells for number, cells in ratios.items()}
         folds.append(record)
     return {"folds": folds}
 
 
 def nanobench_part(record: Record) -> str:
     """Return how each held-out flight is predicted."""
-    rows, every = [], []
-    for name, ratios in sorted(
-        pair for fold in record["folds"] for pair in fold["by_flight"].items()
-    ):
+    rows, parts = [], []
+    by_flight = {name: one for fold in record["folds"] for name, one in fold["by_flight"].items()}
+    for name, ratios in sorted(by_flight.items()):
         cells = np.array(ratios)
-        known = cells[cells > 0.0]
-        every.append(known)
-        half_s = cells[HORIZONS_S.index(0.5)]
-        worse = f"{np.sum(known > AS_GOOD)} of {len(known)}"
-        rows.append([name, *(f"{one:.2f}" for one in (*half_s, known.max())), worse])
-    cells = np.concatenate(every)
+        parts.append(cells[cells > 0.0])
+        values = [*cells[HORIZONS_S.index(0.5)], parts[-1].max()]
+        num_worse = f"{np.sum(parts[-1] > AS_GOOD)} of {len(parts[-1])}"
+        rows.append([name, *(f"{value:.2f}" for value in values), num_worse])
+    cells = np.concatenate(parts)
+    figures = [
+        report.share_figure("cells of at most 1.00", "100 %", (cells <= AS_GOOD).tolist()),
+        report.Figure("median", "at most 1.00", f"{np.median(cells):.2f}", len(cells)),
+        report.Figure("largest", "at most 1.00", f"{cells.max():.2f}", len(cells)),
+    ]
     heads = [f"{quantity} after 0.5 s" for quantity in QUANTITIES]
     return report.filled(
         "real_nanobench",
         seconds=SECONDS,
-        figures=report.figures_table(
-            [
-                report.Figure(
-                    "cells of at most 1.00", "100 %", *report.share((cells <= AS_GOOD).tolist())
-                ),
-                report.Figure("median", "at most 1.00", f"{np.median(cells):.2f}", len(cells)),
-                report.Figure("largest", "at most 1.00", f"{cells.max():.2f}", len(cells)),
-            ]
-        ),
+        figures=report.figures_table(figures),
         flights=table(
             ["held-out flight", *heads, "largest of all horizons", "cells above 1.00"], rows
         ),
@@ -171,10 +183,10 @@ def nanobench_part(record: Record) -> str:
 class Pair(NamedTuple):
     """Logs that a model is of and logs that it is diagnosed on, each with a stated mass, kg."""
 
-    known: tuple[str, ...]
-    known_kg: float
-    judged: tuple[str, ...]
-    judged_kg: float
+    reference: tuple[str, ...]
+    reference_kg: float
+    diagnosed: tuple[str, ...]
+    diagnosed_kg: float
 
 
 PAIRS = {
@@ -192,10 +204,9 @@ def payload_flights(
     data: Path, names: Sequence[str], mass_kg: float
 ) -> tuple[FlightLog, ModelParameters]:
     """Return logs as one, and the nominal model of a mass."""
-    found = import_mapped(
-        [data / name for name in names], "usd", PAYLOAD_MAPPING.format(mass_kg=mass_kg)
-    )
-    return found.log, found.nominal_model()
+    mapping = PAYLOAD_MAPPING.format(mass_kg=mass_kg)
+    flight = import_mapped([data / name for name in names], "usd", mapping)
+    return flight.log, flight.nominal_model()
 
 
 def in_proportion(model: ModelParameters, per_command: float) -> ModelParameters:
@@ -229,40 +240,48 @@ def payload(data: Path) -> Record:
     """
     records = {}
     for name, pair in PAIRS.items():
-        known, nominal = payload_flights(data, pair.known, pair.known_kg)
-        judged, _ = payload_flights(data, pair.judged, pair.judged_kg)
-        per_command = [
-            np.median(log["f"][:, 2]) / np.median(log["u"][:, 3] + 1.0) for log in (known, judged)
-        ]
-        model, of_model = diagnose_log(known, in_proportion(nominal, per_command[0]))
-        reference = in_proportion(model.extended, per_command[0])
-        found, record = diagnose_log(judged, reference)
+        known, nominal = payload_flights(data, pair.reference, pair.reference_kg)
+        log, _ = payload_flights(data, pair.diagnosed, pair.diagnosed_kg)
+        known_force, force = (
+            np.median(one["f"][:, 2]) / np.median(one["u"][:, 3] + 1.0) for one in (known, log)
+        )
+        model, model_record = diagnose_log(known, in_proportion(nominal, known_force))
+        reference = in_proportion(model.extended, known_force)
+        diagnosis, record = diagnose_log(log, reference)
         records[name] = record | {
-            "model": of_model["diagnosis"]["causes"],
-            "ratio": thrust_of(found.extended, judged) / thrust_of(reference, judged),
-            "force_per_command_ratio": float(per_command[1] / per_command[0]),
+            "model": model_record["diagnosis"]["causes"],
+            "ratio": thrust_of(diagnosis.extended, log) / thrust_of(reference, log),
+            "force_per_command_ratio": float(force / known_force),
         }
-    logs = payload_flights(data, PAIRS[OWN_MODEL].judged, PAIRS[OWN_MODEL].judged_kg)
-    return records | {OWN_MODEL_RECORD: diagnose_log(*logs)[1]}
+    pair = PAIRS[IMPORTED_MODEL]
+    log, model = payload_flights(data, pair.diagnosed, pair.diagnosed_kg)
+    return records | {IMPORTED_MODEL_RECORD: diagnose_log(log, model)[1]}
 
 
 def payload_part(record: Record) -> str:
     """Return ratios found and true, and whether anything was named that is not there."""
     rows = []
     for name, pair in PAIRS.items():
-        one, names = (
-            record[name],
-            [cause["effect"] for cause in record[name]["diagnosis"]["causes"]],
-        )
-        ratio, true_ratio = one["ratio"], pair.known_kg / pair.judged_kg  # of thrust over mass
-        false = ", ".join(f"`{effect}`" for effect in names if effect in UNWANTED) or "none"
+        measured = record[name]
+        causes = [cause["effect"] for cause in measured["diagnosis"]["causes"]]
+        ratio = measured["ratio"]
+        true_ratio = pair.reference_kg / pair.diagnosed_kg  # of thrust over mass
         logs = [
             " and ".join(path.rpartition("log")[2] for path in paths)
-            for paths in (pair.known, pair.judged)
+            for paths in (pair.reference, pair.diagnosed)
         ]
-        found = [f"{ratio:.3f}", f"{true_ratio:.3f}", f"{ratio / true_ratio - 1.0:+.1%}"]
-        is_named = "yes" if "thrust_scale" in names else "no"
-        rows.append([name, *logs, *found, f"{one['force_per_command_ratio']:.3f}", is_named, false])
+        rows.append(
+            [
+                name,
+                *logs,
+                f"{ratio:.3f}",
+                f"{true_ratio:.3f}",
+                f"{ratio / true_ratio - 1.0:+.1%}",
+                f"{measured['force_per_command_ratio']:.3f}",
+                "yes" if "thrust_scale" in causes else "no",
+                ", ".join(f"`{effect}`" for effect in causes if effect in UNWANTED) or "none",
+            ]
+        )
     header = (
         "pair | model of logs | diagnosed on | thrust over mass, found | by the stated masses | "
         f"off (target: {WITHIN:.0%}) | measured force per command | `thrust_scale` named | "
@@ -273,17 +292,15 @@ def payload_part(record: Record) -> str:
 
 def crazyflie(data: Path) -> Record:
     """Return the diagnosis of the Crazyflie's flights; held out are those of some policies."""
-    (learnt, model), (judged, _) = (
-        flights(data / FOLDER, policies) for policies in (LEARNT, JUDGED)
-    )
-    log = joined([learnt, judged])
-    return diagnose_log(log, model, np.arange(len(log)) >= len(learnt))[1]
+    training, model = load_flights(data / FOLDER, TRAINING)
+    log = joined([training, load_flights(data / FOLDER, HELD_OUT)[0]])
+    return diagnose_log(log, model, np.arange(len(log)) >= len(training))[1]
 
 
 def betaflight(data: Path) -> Record:
     """Return the diagnosis of the Betaflight log; held out are the last of every four blocks."""
-    found = import_mapped(data / BETAFLIGHT / "shortLog.BFL", "betaflight", QUAD)
-    return diagnose_log(found.log, found.nominal_model())[1]
+    flight = import_mapped(data / BETAFLIGHT / "shortLog.BFL", "betaflight", QUAD)
+    return diagnose_log(flight.log, flight.nominal_model())[1]
 
 
 class Craft(NamedTuple):
@@ -306,7 +323,7 @@ CRAFTS = {
         FOLDER,
         crazyflie,
         lambda record: report.filled(
-            "real_learnt", learnt=", ".join(LEARNT), judged=", ".join(JUDGED)
+            "real_learnt", learnt=", ".join(TRAINING), judged=", ".join(HELD_OUT)
         ),
     ),
     "payload": Craft(

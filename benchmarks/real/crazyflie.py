@@ -22,7 +22,13 @@ import jax
 import numpy as np
 
 from benchmarks import report
-from benchmarks.real.black_boxes import base_steps, flown, linear_ones, network, rows_of
+from benchmarks.real.black_boxes import (
+    base_steps,
+    fit_linear_boxes,
+    fit_network,
+    fly_windows,
+    rows_of,
+)
 from benchmarks.report import ROOT, table
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid import FlightLog, import_log
@@ -43,8 +49,8 @@ LINES = ROOT / "benchmarks" / "data" / "real" / "crazyflie.jsonl"
 FITS = LINES.with_name("crazyflie_fits.json")
 PROPOSED = ("command_delay", "second_order_rates", "rate_scale", "motor_imbalance", "linear_drag")
 SECONDS = 10.0  # learnt from of each policy: 100 s in all
-SPACING_S, MOST = 0.25, 10_000
-FEWEST_ROWS = 2000  # of a policy, to fit it alone
+SPACING_S, MAX_WINDOWS = 0.25, 10_000
+MIN_ROWS = 2000  # of a policy, to fit it alone
 MAPPING = "crazyflie_phoenix"
 FIGURES = (("attitude", 0.1, 0.70), ("attitude", 0.25, 0.83), ("position", 0.5, 0.80))
 BLACK_BOXES = {
@@ -66,11 +72,11 @@ def policies_in(folder: Path) -> list[str]:
     return sorted({file.name[7:9] for file in folder.glob("seed*.csv.gz")})
 
 
-def flights(folder: Path, policies: Sequence[str]) -> tuple[FlightLog, ModelParameters]:
+def load_flights(folder: Path, policies: Sequence[str]) -> tuple[FlightLog, ModelParameters]:
     """Return the flights of policies, and the nominal model."""
-    files = [file for one in policies for file in sorted(folder.glob(f"seed000{one}_*.csv.gz"))]
-    found = import_log(files, "csv", MAPPING)
-    return found.log, found.nominal_model()
+    files = [file for name in policies for file in sorted(folder.glob(f"seed000{name}_*.csv.gz"))]
+    flight = import_log(files, "csv", MAPPING)
+    return flight.log, flight.nominal_model()
 
 
 def shortened(log: FlightLog, seconds: float) -> FlightLog:
@@ -78,110 +84,116 @@ def shortened(log: FlightLog, seconds: float) -> FlightLog:
     return log.select(np.cumsum(np.diff(log.time, prepend=log.time[0]).clip(0.0, 0.1)) < seconds)
 
 
-def models_of(learnt: FlightLog, nominal: ModelParameters) -> tuple[np.ndarray, refinement.Refined]:
+def fit_models(log: FlightLog, nominal: ModelParameters) -> tuple[np.ndarray, refinement.Refined]:
     """Return the base and proposed effects of flights, fitted to single steps, then refined."""
-    parts = split(learnt, nominal, None, None)
-    problem, state = parts.train, SearchState.start(learnt, parts.train)
-    ways = ([one for one in CANDIDATES if one.effect == name] for name in PROPOSED)
-    candidates = [found[len(found) // 2] for found in ways]  # from probes in the middle
+    parts = split(log, nominal, None, None)
+    problem, state = parts.train, SearchState.start(log, parts.train)
+    candidates = []
+    for name in PROPOSED:
+        of_effect = [candidate for candidate in CANDIDATES if candidate.effect == name]
+        candidates.append(of_effect[len(of_effect) // 2])  # from probes in the middle
     base = state.fitted((), problem.start)
     vector = base.vector.copy()
-    for field, value in (probe for one in candidates for probe in one.probes):
-        vector[problem.names.index(field)] = value
+    for candidate in candidates:
+        for field, value in candidate.probes:
+            vector[problem.names.index(field)] = value
     model = state.fitted(candidates, vector)
     state = state.with_noise(fit_noise(problem.lanes, problem.residuals(model.vector[None])[0]))
     base, model = state.fitted((), base.vector), state.fitted(candidates, model.vector)
-    return base.vector, refinement.refine(
-        state, base, model, learnt, parts.held_out, is_explained=False
-    )
+    refined = refinement.refine(state, base, model, log, parts.held_out, is_explained=False)
+    return base.vector, refined
 
 
-def fold(folder: Path, judged: str, seconds: float) -> dict[str, Any]:
+def measure_fold(folder: Path, policy: str, seconds: float) -> dict[str, Any]:
     """Return what the flights of all policies but one say, and how that predicts the one."""
-    others = [one for one in policies_in(folder) if one != judged]
-    learnt = joined([shortened(flights(folder, [one])[0], seconds) for one in others])
-    own, nominal = flights(folder, [judged])
+    others = [name for name in policies_in(folder) if name != policy]
+    training = joined([shortened(load_flights(folder, [name])[0], seconds) for name in others])
+    log, nominal = load_flights(folder, [policy])
     started = time.process_time()
-    base, refined = models_of(learnt, nominal)
+    base, refined = fit_models(training, nominal)
     cpu_s = time.process_time() - started
     problem, fit = refined.problem, refined.fit
     extended = base if fit is None else fit.vector  # the base's where no effect helps
-    windows = make_windows(own, np.ones(len(own), bool), SPACING_S, MOST)
+    windows = make_windows(log, np.ones(len(log), bool), SPACING_S, MAX_WINDOWS)
     vectors = {"refitted_base": base, "extended": extended}
     if refined.base is not None:
         vectors["refitted_to_flights"] = refined.base
-    errors = refinement.errors_at(refined.problem, np.stack(list(vectors.values())), windows).errors
+    errors = refinement.errors_at(problem, np.stack(list(vectors.values())), windows).errors
     results = {
-        name: refinement.Tested(one[None], windows)
-        for name, one in zip(vectors, errors, strict=True)
+        name: refinement.Tested(error[None], windows)
+        for name, error in zip(vectors, errors, strict=True)
     }
     plain = from_vector(base, problem.like)._replace(effects=())
-    rows, steps = rows_of(learnt, plain), base_steps(plain, own)
-    boxes = {**linear_ones(rows), "network": network(rows)}
-    results |= {name: flown(one, windows, steps) for name, one in boxes.items()}
-    known = make_windows(learnt, np.ones(len(learnt), bool), SPACING_S, MOST)
-    results["placebo"] = refinement.Tested(refinement.placebo_errors(known, windows), windows)
-    widths = {} if fit is None else dict(zip(fit.places, fit.half_widths, strict=True))
+    rows, steps = rows_of(training, plain), base_steps(plain, log)
+    boxes = {**fit_linear_boxes(rows), "network": fit_network(rows)}
+    results |= {name: fly_windows(black_box, windows, steps) for name, black_box in boxes.items()}
+    seen = make_windows(training, np.ones(len(training), bool), SPACING_S, MAX_WINDOWS)
+    results["placebo"] = refinement.Tested(refinement.placebo_errors(seen, windows), windows)
     return {
-        "policy": judged,
-        "rows": len(learnt),
+        "policy": policy,
+        "rows": len(training),
         "cpu_s": round(cpu_s, 1),
-        "kept": [one.effect for one in refined.kept],
+        "kept": [candidate.effect for candidate in refined.kept],
         "removed": refined.removed,
         "removal_costs": refined.removal_costs,
-        "rms": {name: one.rms()[0].round(6).tolist() for name, one in results.items()},
-        "by_flight": by_flight(results, own.segment[windows.start]),
-        "values": {
-            problem.names[place]: [float(extended[place]), float(half)]
-            for place, half in widths.items()
-        },
+        "rms": {name: tested.rms()[0].round(6).tolist() for name, tested in results.items()},
+        "by_flight": error_ratios(
+            results["refitted_base"], results["extended"], log.segment[windows.start]
+        ),
+        "values": {} if fit is None else values_of(problem, fit),
     }
 
 
-def by_flight(
-    results: dict[str, refinement.Tested], segment: np.ndarray
+def values_of(problem: Problem, fit: Any) -> dict[str, list[float]]:
+    """Return the fitted parameters by name: value and half of the 95 % interval."""
+    pairs = zip(fit.places, fit.half_widths, strict=True)
+    return {problem.names[i]: [float(fit.vector[i]), float(half)] for i, half in pairs}
+
+
+def error_ratios(
+    base: refinement.Tested, extended: refinement.Tested, segment: np.ndarray
 ) -> dict[str, list[list[float]]]:
-    """Return the extended model's errors over the base's, (horizons, quantities), by flight."""
+    """Return the extended model's errors over the base's, (horizons, quantities), by flight.
+
+    segment: (windows,), the flight of each; 0 where a flight has no window.
+    """
     ratios = {}
     for number in np.unique(segment):
         part = segment == number
-        windows = results["extended"].windows
-        own = windows._replace(counts=windows.counts[:, part])
-        tested = (results[name].errors[:, :, part] for name in ("refitted_base", "extended"))
-        base, extended = (refinement.Tested(errors, own).rms()[0] for errors in tested)
-        no_window_as_0 = np.nan_to_num(extended / base, nan=0.0)
-        ratios[str(number)] = no_window_as_0.round(4).tolist()
+        windows = extended.windows._replace(counts=extended.windows.counts[:, part])
+        base_rms, rms = (
+            refinement.Tested(model.errors[:, :, part], windows).rms()[0]
+            for model in (base, extended)
+        )
+        ratios[str(number)] = np.nan_to_num(rms / base_rms, nan=0.0).round(4).tolist()
     return ratios
 
 
-def fits_of(
+def fit_policies(
     folder: Path, structure: Sequence[str], start: dict[str, float]
 ) -> list[dict[str, Any]]:
     """Return values of one structure and half-response times, of each policy's flights alone."""
     result = []
     for policy in report.progress(policies_in(folder), "policies"):
-        log, model = flights(folder, [policy])
-        every = np.ones(len(log), bool)
-        if len(log) < FEWEST_ROWS:
+        log, model = load_flights(folder, [policy])
+        is_used = np.ones(len(log), bool)
+        if len(log) < MIN_ROWS:
             continue
-        windows = refinement.windows_of(log, every)
+        windows = refinement.windows_of(log, is_used)
         assert windows is not None
-        problem = Problem.of(thinned(lanes_of(log, every, model)), model)
+        problem = Problem.of(thinned(lanes_of(log, is_used, model)), model)
         vector = problem.start.copy()
         vector[problem.index(list(start))] = list(start.values())
         scale = refinement.errors_at(problem, vector[None], windows).rms()[0]
         target = refinement.Target(problem, windows, scale, np.ones(scale.shape, bool))
         fields = [name for name in problem.names if name.partition(".")[0] in structure]
-        fit = target.fitted(
-            vector, problem.index([*TAUS, *THRUST_COEFFS, *fields]), refinement.MOST_ROUNDS
-        )
-        pairs = zip(fit.places, fit.half_widths, strict=True)
-        values = {
-            problem.names[place]: [float(fit.vector[place]), float(half)] for place, half in pairs
-        }
+        fitted = problem.index([*TAUS, *THRUST_COEFFS, *fields])
+        fit = target.fitted(vector, fitted, refinement.MOST_ROUNDS)
         half_s = half_responses(fit.vector[None], problem.like, SMALL_STEP)[0]
         times = dict(zip(STICKS, half_s.tolist(), strict=True))
-        result.append({"policy": policy, "values": values, "half_response_s": times})
+        result.append(
+            {"policy": policy, "values": values_of(problem, fit), "half_response_s": times}
+        )
     return result
 
 
@@ -206,10 +218,10 @@ def figures_table(lines: list[Line]) -> str:
     rows = []
     for quantity, horizon, target in FIGURES:
         cell = _cell(quantity, horizon)
-        own, *boxes = (_median(lines, name)[cell] for name in ("extended", *BLACK_BOXES))
-        cells = [f"{value:.2f}" for value in (*boxes, own / min(boxes))]
+        median, *boxes = (_median(lines, name)[cell] for name in ("extended", *BLACK_BOXES))
+        cells = [f"{value:.2f}" for value in (*boxes, median / min(boxes))]
         name = f"{quantity} after {horizon:g} s"
-        figure = report.Figure(name, f"at most {target:.2f}", f"{own:.2f}", len(lines))
+        figure = report.Figure(name, f"at most {target:.2f}", f"{median:.2f}", len(lines))
         rows.append([*figure, *cells])
     return table(["figure", "target", "measured", "n", *BLACK_BOXES, "over the best of them"], rows)
 
@@ -218,12 +230,12 @@ def horizons_table(lines: list[Line]) -> str:
     """Return the medians over policies at all horizons, of all models."""
     names = {"extended": "extended model", **OTHERS, **BLACK_BOXES}
     rows = []
-    for quantity in QUANTITIES:
+    for column, quantity in enumerate(QUANTITIES):
         for name, words in names.items():
-            found = [line for line in lines if name in line["rms"]]
-            if found:
-                middle = _median(found, name)[:, QUANTITIES.index(quantity)]
-                rows.append([quantity, words, *(f"{value:.2f}" for value in middle)])
+            measured = [line for line in lines if name in line["rms"]]
+            if measured:
+                medians = _median(measured, name)[:, column]
+                rows.append([quantity, words, *(f"{value:.2f}" for value in medians)])
     return table(["error of", "model", *(f"{horizon:g} s" for horizon in HORIZONS_S)], rows)
 
 
@@ -231,15 +243,14 @@ def policies_table(lines: list[Line]) -> str:
     """Return what stayed in the model of each fold, and how the left-out policy is predicted."""
     rows = []
     for line in lines:
-        found = ratios(line, "extended")
-        flights = np.concatenate([np.ravel(one) for one in line["by_flight"].values()])
+        errors = ratios(line, "extended")
+        flights = np.concatenate([np.ravel(cells) for cells in line["by_flight"].values()])
         flights = flights[flights > 0.0]
-        cells = [f"{found[_cell(quantity, horizon)]:.2f}" for quantity, horizon, _ in FIGURES]
-        worse = f"{np.sum(flights > AS_GOOD)} of {len(flights)}"
+        values = [*(errors[_cell(*figure[:2])] for figure in FIGURES), np.nanmax(errors)]
+        num_worse = f"{np.sum(flights > AS_GOOD)} of {len(flights)}"
         kept = ", ".join(f"`{name}`" for name in line["kept"]) or "none: the refitted base"
-        rows.append(
-            [line["policy"], kept, *cells, f"{np.nanmax(found):.2f}", worse, f"{line['cpu_s']:.0f}"]
-        )
+        cells = [f"{value:.2f}" for value in values]
+        rows.append([line["policy"], kept, *cells, num_worse, f"{line['cpu_s']:.0f}"])
     heads = [f"{quantity} {horizon:g} s" for quantity, horizon, _ in FIGURES]
     header = ["left-out policy", "effects that stay", *heads, "largest of all cells"]
     return table([*header, "cells worse, by flight", "CPU s"], rows)
@@ -249,19 +260,22 @@ def fits_table() -> str:
     """Return a table of one structure's values by policy, and whether they agree."""
     fits = json.loads(FITS.read_text(encoding="utf-8"))
     rows = []
+
+    def add_row(title: str, cells: list[str], agree: list[bool]) -> None:
+        rows.append([title, *cells, f"{sum(agree)} of {len(agree)}"])
+
     for name in fits[0]["values"]:
-        if "." not in name and not name.startswith("tau"):
-            continue
-        pairs = [one["values"][name] for one in fits]
-        agree = [abs(a - b) <= first + second for (a, first), (b, second) in combinations(pairs, 2)]
-        values = [f"{value:.3g} ± {half:.2g}" for value, half in pairs]
-        rows.append([f"`{name}`", *values, f"{sum(agree)} of {len(agree)}"])
+        if "." in name or name.startswith("tau"):
+            pairs = [fit["values"][name] for fit in fits]
+            agree = [
+                abs(a - b) <= half_a + half_b for (a, half_a), (b, half_b) in combinations(pairs, 2)
+            ]
+            add_row(f"`{name}`", [f"{value:.3g} ± {half:.2g}" for value, half in pairs], agree)
     for stick in fits[0]["half_response_s"]:
-        times_ms = np.array([1e3 * one["half_response_s"][stick] for one in fits])
+        times_ms = [1e3 * fit["half_response_s"][stick] for fit in fits]
         agree = [abs(a - b) <= WITHIN_MS for a, b in combinations(times_ms, 2)]
-        cells = [f"{time:.1f} ms" for time in times_ms]
-        rows.append([f"half response, {stick}", *cells, f"{sum(agree)} of {len(agree)}"])
-    heads = [f"policy {one['policy']}" for one in fits]
+        add_row(f"half response, {stick}", [f"{time:.1f} ms" for time in times_ms], agree)
+    heads = [f"policy {fit['policy']}" for fit in fits]
     return table(
         ["parameter", *heads, f"pairs that overlap (times: within {WITHIN_MS:g} ms)"], rows
     )
@@ -292,12 +306,12 @@ def main(
         if fits:
             last = report.lines_in(LINES)[-1]
             start = {name: value for name, (value, _) in last["values"].items()}
-            report.write_json(FITS, fits_of(folder, last["kept"], start))
+            report.write_json(FITS, fit_policies(folder, last["kept"], start))
             return
         commit = report.commit_of_checkout()  # before its lines change a file
-        wanted = policies.split(",") if policies else policies_in(folder)
-        for policy in report.progress(wanted, "policies"):
-            report.append_line(LINES, {"commit": commit, **fold(folder, policy, seconds)})
+        chosen = policies.split(",") if policies else policies_in(folder)
+        for policy in report.progress(chosen, "policies"):
+            report.append_line(LINES, {"commit": commit, **measure_fold(folder, policy, seconds)})
 
 
 if __name__ == "__main__":
