@@ -96,7 +96,7 @@ class Flown(NamedTuple):
     """A policy's file, its evaluation, share of finishes, and flying lap over the time-optimal."""
 
     policy: Path
-    found: Report
+    evaluation: Report
     success: float
     times_optimal: float
 
@@ -115,11 +115,11 @@ def fly(policy: Path, recipe: Recipe) -> Flown:
         seed=FLIGHT_SEED,
         ghost=True,
     )
-    found = evaluate(settings)
-    above_percent = float(found.numbers["optimal"]["flying_lap_s"]["mean_percent_above"])
-    return Flown(
-        policy, found, float(found.numbers["success"]["share"]), 1.0 + above_percent / 100.0
-    )
+    evaluation = evaluate(settings)
+    numbers = evaluation.numbers
+    above_percent = float(numbers["optimal"]["flying_lap_s"]["mean_percent_above"])
+    success = float(numbers["success"]["share"])
+    return Flown(policy, evaluation, success, 1.0 + above_percent / 100.0)
 
 
 def train(name: str, seed: int) -> tuple[Path, Path]:
@@ -144,20 +144,23 @@ def train(name: str, seed: int) -> tuple[Path, Path]:
     return before, after
 
 
+def list_settings(values: dict[str, float]) -> str:
+    """Return settings as a list in a sentence."""
+    return ", ".join(f"{name} {value:g}" for name, value in values.items())
+
+
 def row_of(seed: int, before: Flown, after: Flown) -> list[str]:
     """Return a seed's row of the table."""
-    numbers, meta = after.found.numbers, after.found.checkpoint.meta
-    laps = (f"{numbers[name]['mean']:.3f}" for name in ("first_lap_s", "flying_lap_s"))
-    earlier = f"{before.times_optimal:.3f}, {before.success:.1%}"
-    seconds = meta["seconds"], meta["polished"]["seconds"]
-    ratio = f"{after.times_optimal:.3f}"
+    numbers, meta = after.evaluation.numbers, after.evaluation.checkpoint.meta
     return [
         str(seed),
         f"{after.success:.1%}",
-        *laps,
-        ratio,
-        earlier,
-        *(f"{one:.0f}" for one in seconds),
+        f"{numbers['first_lap_s']['mean']:.3f}",
+        f"{numbers['flying_lap_s']['mean']:.3f}",
+        f"{after.times_optimal:.3f}",
+        f"{before.times_optimal:.3f}, {before.success:.1%}",
+        f"{meta['seconds']:.0f}",
+        f"{meta['polished']['seconds']:.0f}",
     ]
 
 
@@ -165,23 +168,21 @@ def section_of(name: str, seeds: list[int]) -> tuple[str, bool]:
     """Train, fly and ship a champion; return its part of the page and whether targets are met."""
     recipe = RECIPES[name]
     flown = [[fly(policy, recipe) for policy in train(name, seed)] for seed in seeds]
-    after = [pair[1] for pair in flown]
-    best = min(
-        (one for one in after if one.success >= recipe.success), key=lambda one: one.times_optimal
-    )
+    polished = [after for _, after in flown]
+    good = [policy for policy in polished if policy.success >= recipe.success]
+    best = min(good, key=lambda policy: policy.times_optimal)
     shipped = FOLDER / best.policy.name
     write_atomically(shipped, best.policy.read_bytes())
     flights = f"--plants {FLIGHTS} --episodes 1" if recipe.is_robust else f"--episodes {FLIGHTS}"
-    changes = ", ".join(f"{key} {value:g}" for key, value in (CHANGES | recipe.changes).items())
-    polished = ", ".join(f"{key} {value:g}" for key, value in recipe.settings._asdict().items())
     path = shipped.relative_to(report.ROOT)
-    slowest, least = max(one.times_optimal for one in after), min(one.success for one in after)
+    slowest = max(policy.times_optimal for policy in polished)
+    least = min(policy.success for policy in polished)
     figures = [
         report.Figure(
             "flying lap over the time-optimal one, largest of the seeds",
             f"at most {recipe.times_optimal:g}",
             f"{slowest:.3f}",
-            len(after),
+            len(polished),
         ),
         report.Figure(
             "flights that finish, fewest of any seed",
@@ -192,15 +193,17 @@ def section_of(name: str, seeds: list[int]) -> tuple[str, bool]:
     ]
     lines = [
         f"## `{path}`",
-        f"PPO on {recipe.env_id}, {recipe.config.total_timesteps / 1e6:.0f} M steps, {changes}; "
-        f"polishing: {polished}. Shipped: seed {best.found.checkpoint.meta['seed']}.",
+        f"PPO on {recipe.env_id}, {recipe.config.total_timesteps / 1e6:.0f} M steps, "
+        f"{list_settings(CHANGES | recipe.changes)}; "
+        f"polishing: {list_settings(recipe.settings._asdict())}. "
+        f"Shipped: seed {best.evaluation.checkpoint.meta['seed']}.",
         report.figures_table(figures),
         report.table(
             HEADER, [row_of(seed, *pair) for seed, pair in zip(seeds, flown, strict=True)]
         ),
         f"`flytrack eval --checkpoint {path} --steps {STEPS} {flights} --laps {LAPS} "
         f"--seed {FLIGHT_SEED} --ghost`:",
-        "```\n" + best.found.text.replace(f"{report.ROOT}/", "") + "```",
+        "```\n" + best.evaluation.text.replace(f"{report.ROOT}/", "") + "```",
     ]
     return "\n\n".join(lines), least >= recipe.success and slowest <= recipe.times_optimal
 
@@ -215,7 +218,7 @@ def main(
         report.RESULTS / "champion.md",
         "champion",
         model=MODEL.relative_to(report.ROOT),
-        reward=", ".join(f"{term} {weight:g}" for term, weight in REWARD.items()),
+        reward=list_settings(REWARD),
         sections="\n\n".join(text for text, _ in sections),
     )
     if not all(is_met for _, is_met in sections):

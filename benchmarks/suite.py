@@ -13,7 +13,7 @@ from typing import Any
 from benchmarks import report
 from benchmarks.loop.plants import draw_plant
 from flytrack_bench.suite import FOLDER, craft_as_json, digest_of
-from flytrack_env import load_track, random_track, save_track
+from flytrack_env import Track, load_track, random_track, save_track
 from flytrack_env.references import shipped_reference, track_digest
 
 SEED, START_SEED = 2026, 7
@@ -29,21 +29,16 @@ PAGE = report.ROOT / "docs" / "benchmark.md"
 def draw_suite(folder: Path) -> None:
     """Write suite v1 into a folder: its tracks and its file."""
     for name, seed in TRACK_SEEDS.items():
-        save_track(
-            folder / "v1" / f"{name}.toml", dataclasses.replace(random_track(seed), name=name)
-        )
-    own = {
-        name: (f"v1/{name}.toml", load_track(folder / "v1" / f"{name}.toml"))
-        for name in TRACK_SEEDS
-    }
+        track = dataclasses.replace(random_track(seed), name=name)
+        save_track(folder / "v1" / f"{name}.toml", track)
     flytrack, optimal_s = load_track("flytrack"), shipped_reference("flytrack").time_s
-    tasks = [_task("flytrack", "flytrack", flytrack, optimal_s, None)]
-    tasks += [
-        _task(name, file, track, OPTIMAL_S[name], None) for name, (file, track) in own.items()
-    ]
-    for place, number in enumerate(PLANTS):
-        craft = craft_as_json(draw_plant(number, SEED))
-        tasks.append(_task(f"plant_{place + 1}", "flytrack", flytrack, optimal_s, craft))
+    tasks = [_task("flytrack", "flytrack", flytrack, optimal_s)]
+    for name, time_s in OPTIMAL_S.items():
+        file = f"v1/{name}.toml"
+        tasks.append(_task(name, file, load_track(folder / file), time_s))
+    for number, plant in enumerate(PLANTS, 1):
+        craft = craft_as_json(draw_plant(plant, SEED))
+        tasks.append(_task(f"plant_{number}", "flytrack", flytrack, optimal_s, craft))
     content: dict[str, Any] = {
         "name": "v1",
         "seed": START_SEED,
@@ -55,7 +50,9 @@ def draw_suite(folder: Path) -> None:
     report.write_json(folder / "v1.json", {"digest": digest_of(content), **content})
 
 
-def _task(name: str, file: str, track: Any, optimal_s: float, craft: Any) -> dict[str, Any]:
+def _task(
+    name: str, file: str, track: Track, optimal_s: float, craft: Any = None
+) -> dict[str, Any]:
     return {
         "id": name,
         "track": file,
@@ -67,30 +64,32 @@ def _task(name: str, file: str, track: Any, optimal_s: float, craft: Any) -> dic
 
 def row(path: Path) -> list[str]:
     """Return an entry's row of the table."""
-    found = json.loads(path.read_text(encoding="utf-8"))
-    flown = found["tasks"]
+    entry = json.loads(path.read_text(encoding="utf-8"))
+    flights = entry["tasks"]
 
-    def mean(ids: list[str], name: str) -> str:
-        values = [one[name] for task in ids for one in flown.get(task, ()) if one[name] is not None]
-        if not values:
-            return "-"
-        share = sum(values) / len(values)
-        return f"{share:.1%}" if name == "success" else f"{share:.3f}"
+    def mean(tasks: list[str], name: str, digits: str) -> str:
+        values = [
+            flight[name]
+            for task in tasks
+            for flight in flights.get(task, ())
+            if flight[name] is not None
+        ]
+        return format(sum(values) / len(values), digits) if values else "-"
 
-    groups = (
-        ["flytrack"],
-        list(TRACK_SEEDS),
-        [f"plant_{place + 1}" for place in range(len(PLANTS))],
-    )
-    cells = [f"{mean(ids, 'success')}, {mean(ids, 'over_optimal')}" for ids in groups]
-    score = found["summary"]["score"]
+    plants = [f"plant_{number}" for number in range(1, len(PLANTS) + 1)]
+    cells = [
+        f"{mean(tasks, 'success', '.1%')}, {mean(tasks, 'over_optimal', '.3f')}"
+        for tasks in (["flytrack"], list(TRACK_SEEDS), plants)
+    ]
+    score = entry["summary"]["score"]
     interval = "" if score["ci95"] is None else " ({:.3f} to {:.3f})".format(*score["ci95"])
+    is_whole = len(flights) > len(PLANTS)
     return [
         f"[{path.stem}](results/suite/{path.name})",
-        found["regime"],
-        str(len(found["policies"])),
+        entry["regime"],
+        str(len(entry["policies"])),
         *cells,
-        f"{score['interquartile_mean']:.3f}{interval}" if len(flown) > len(PLANTS) else "-",
+        f"{score['interquartile_mean']:.3f}{interval}" if is_whole else "-",
     ]
 
 

@@ -58,36 +58,47 @@ def true_noise(step_s: float) -> np.ndarray:
 
 
 def clean_problem(
-    clean: FlightLog, log: FlightLog, judged: np.ndarray, model: ModelParameters
+    clean: FlightLog, log: FlightLog, is_scored: np.ndarray, model: ModelParameters
 ) -> Problem:
     """Return the problem of the clean rows that a measured log kept, with the sensors' true noise.
 
     Of the voltage that is rounding, which lasts while the battery drains by a digit: it is fitted.
     """
     kept = clean.select(np.isin(np.round(clean.time, 6), np.round(log.time, 6)))
-    problem, measured = (Problem.of(lanes_of(one, judged, model), model) for one in (kept, log))
+    problem = Problem.of(lanes_of(kept, is_scored, model), model)
+    measured = Problem.of(lanes_of(log, is_scored, model), model)
     errors = measured.residuals(problem.start[None])[0] - problem.residuals(problem.start[None])[0]
     noise = true_noise(float(np.median(np.diff(clean.time))))
     noise[:, -1] = fit_noise(measured.lanes, errors, noise)[:, -1]
     return problem.with_noise(noise)
 
 
-def with_all(state: SearchState, effects: Mapping[str, Mapping[str, float]]) -> FittedModel:
+def fit_all(state: SearchState, effects: Mapping[str, Mapping[str, float]]) -> FittedModel:
     """Return the model with all true effects, fitted to the clean log from the true parameters.
 
-    Each is looked for in the way that has its true parameters and the fewest others.
+    Each is parameterised with its true parameters and the fewest others.
     """
-    chosen = []
+    problem, chosen = state.problem, []
+    vector = problem.start.copy()
     for name, values in effects.items():
-        own = [one for one in CANDIDATES if one.effect == name and name != "thrust_scale"]
         fields = {f"{name}.{field}" for field in values}
-        chosen += sorted(own, key=lambda one: (-len(fields & {*one.fields}), len(one.fields)))[:1]
-    vector = state.problem.start.copy()
-    for way in chosen:
-        for field in way.fields:
-            place = state.problem.names.index(field)
-            vector[place] = effects[way.effect].get(field.split(".")[1], vector[place])
-    return state.fitted(chosen, state.problem.clipped(vector))
+        candidates = [
+            candidate
+            for candidate in CANDIDATES
+            if candidate.effect == name and name != "thrust_scale"
+        ]
+        candidates.sort(key=lambda one: (-len(fields & {*one.fields}), len(one.fields)))
+        for candidate in candidates[:1]:
+            chosen.append(candidate)
+            for field in fields & {*candidate.fields}:
+                vector[problem.names.index(field)] = values[field.split(".")[1]]
+    return state.fitted(chosen, problem.clipped(vector))
+
+
+def _known(gain: float, rivals: Mapping[str, float]) -> Known:
+    """Return what a log could show of an effect, by its gain and its gains beside rivals."""
+    rival = min(rivals, key=rivals.__getitem__, default="")
+    return Known(gain, max(min(rivals.get(rival, gain), gain), 0.0), rival)
 
 
 def _scale_known(state: SearchState, model: FittedModel) -> Known:
@@ -95,46 +106,42 @@ def _scale_known(state: SearchState, model: FittedModel) -> Known:
 
     Against the nominal curve, all else fitted, and the best rival beside that.
     """
-    places = state.problem.index(THRUST_COEFFS)
+    curve = state.problem.index(THRUST_COEFFS)
     vector = model.vector.copy()
-    vector[places] = state.problem.start[places]
+    vector[curve] = state.problem.start[curve]
     state = replace(state, held=tuple(Held(field, "") for field in THRUST_COEFFS))
-    less = state.fitted(model.candidates, vector)
-    state, nearby = state.linearized(less.vector)
-    rivals = {}
-    others = [
-        one
-        for one in score_candidates(state, nearby, less)
-        if one.candidate.effect != "thrust_scale"
+    nominal = state.fitted(model.candidates, vector)
+    state, linearization = state.linearized(nominal.vector)
+    scores = [
+        score
+        for score in score_candidates(state, linearization, nominal)
+        if score.candidate.effect != "thrust_scale"
     ]
-    for one in others[:MOST_RIVALS]:
-        rivals[one.candidate.effect] = add_effect(state, nearby, less, one).cost
-    rival = min(rivals, key=rivals.__getitem__, default="")
-    gain = less.cost - model.cost
-    return Known(gain, max(min(rivals.get(rival, less.cost) - model.cost, gain), 0.0), rival)
+    gains = {}
+    for score in scores[:MOST_RIVALS]:
+        extended = add_effect(state, linearization, nominal, score)
+        gains[score.candidate.effect] = extended.cost - model.cost
+    return _known(nominal.cost - model.cost, gains)
 
 
 def known(
     clean: FlightLog,
     log: FlightLog,
-    judged: np.ndarray,
+    is_scored: np.ndarray,
     model: ModelParameters,
     effects: Mapping[str, Mapping[str, float]],
 ) -> dict[str, Known]:
-    """Return, by hidden effect, what the judged rows of a log could show of it."""
+    """Return, by hidden effect, what the scored rows of a log could show of it."""
     with jax.enable_x64(True):
-        state = SearchState(clean_problem(clean, log, judged, model))
-        found = with_all(state, effects)
-        state, linearization = state.linearized(found.vector)
+        state = SearchState(clean_problem(clean, log, is_scored, model))
+        fitted = fit_all(state, effects)
+        state, linearization = state.linearized(fitted.vector)
         result = {}
-        for one in found.candidates:
-            ablation = ablate(state, found, linearization, one.effect)
-            rivals = ablation.rivals
-            rival = min(rivals, key=rivals.__getitem__, default="")
-            beside = min(rivals.get(rival, ablation.gain), ablation.gain)
-            result[one.effect] = Known(ablation.gain, max(beside, 0.0), rival)
+        for candidate in fitted.candidates:
+            ablation = ablate(state, fitted, linearization, candidate.effect)
+            result[candidate.effect] = _known(ablation.gain, ablation.rivals)
         if "thrust_scale" in effects:
-            result["thrust_scale"] = _scale_known(state, found)
+            result["thrust_scale"] = _scale_known(state, fitted)
     return result
 
 
@@ -148,13 +155,12 @@ def removed(
     """
     with jax.enable_x64(True):
         lanes = lanes_of(clean, np.ones(len(clean), bool), base)
-        problem = Problem.of(lanes, extended)
-        every = [Problem.of(lanes, one).start for one in (base, extended)]
-        left = problem.residuals(np.stack(every))
-    size = np.array([STD["w"]] * 3 + [STD["f"]] * 3)
-    counts = lanes.counts[..., :6, 0]
-    power = [float(np.mean(np.square(one[..., :6, 0] / size)[counts])) for one in left]
-    return 1.0 - power[1] / max(power[0], 1e-300), float(np.sqrt(power[0]))
+        vectors = [Problem.of(lanes, model).start for model in (base, extended)]
+        residuals = Problem.of(lanes, extended).residuals(np.stack(vectors))
+    whitened = residuals[..., :6, 0] / np.repeat([STD["w"], STD["f"]], 3)
+    is_counted = lanes.counts[..., :6, 0]
+    base_power, power = (float(np.mean(np.square(values[is_counted]))) for values in whitened)
+    return 1.0 - power / max(base_power, 1e-300), float(np.sqrt(base_power))
 
 
 # How visible an effect outside the list is, which has no law to fit
@@ -166,18 +172,18 @@ def _expected(truth: Truth, log: FlightLog, tau: np.ndarray, coeffs: np.ndarray)
     tau, coeffs: lags, s, from the first command on, and coefficients of thrust, in place of the
     truth's.
     """
-    sticks, step_s, applied = (
-        np.vstack([log["u"][:1], log["u"][:-1]]),
-        log.time[1] - log.time[0],
-        [],
-    )
-    for column, keep in zip(sticks.T, np.exp(-step_s / tau), strict=True):
+    before = np.maximum(np.arange(len(log)) - 1, 0)
+    applied = []
+    for column, keep in zip(
+        log["u"][before].T, np.exp(-(log.time[1] - log.time[0]) / tau), strict=True
+    ):
         applied.append(signal.lfilter([1.0 - keep], [1.0, -keep], column, zi=[keep * column[0]])[0])
-    stick, volt = applied[3], np.concatenate([log["v_bat"][:1, 0], log["v_bat"][:-1, 0]])
-    expected = np.zeros((len(log), len(SCALES)))
+    *turns, stick = applied
+    volt = log["v_bat"][before, 0]
     terms = np.stack([stick**0, stick, stick**2, stick**3, volt, stick * volt])
+    expected = np.zeros((len(log), len(SCALES)))
     expected[:, 2] = coeffs @ terms / truth.mass
-    expected[:, 3:6] = np.radians(truth.max_rate) * np.stack(applied[:3], axis=1)
+    expected[:, 3:6] = np.radians(truth.max_rate) * np.stack(turns, axis=1)
     expected[:, 6] = log["v_bat"][0, 0] - truth.drain / SECONDS_PER_MINUTE * log.time
     return expected
 

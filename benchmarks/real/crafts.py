@@ -245,11 +245,11 @@ def payload(data: Path) -> Record:
         known_force, force = (
             np.median(one["f"][:, 2]) / np.median(one["u"][:, 3] + 1.0) for one in (known, log)
         )
-        model, model_record = diagnose_log(known, in_proportion(nominal, known_force))
-        reference = in_proportion(model.extended, known_force)
+        earlier, earlier_record = diagnose_log(known, in_proportion(nominal, known_force))
+        reference = in_proportion(earlier.extended, known_force)
         diagnosis, record = diagnose_log(log, reference)
         records[name] = record | {
-            "model": model_record["diagnosis"]["causes"],
+            "model": earlier_record["diagnosis"]["causes"],
             "ratio": thrust_of(diagnosis.extended, log) / thrust_of(reference, log),
             "force_per_command_ratio": float(force / known_force),
         }
