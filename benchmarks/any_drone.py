@@ -58,6 +58,9 @@ voltage_v = [{empty_v}, {full_v}]
 """
 
 
+SOURCES = ("by the model", "in the environment", "in the C header", "in a flight")
+
+
 class TrueCraft(NamedTuple):
     """A craft's truth.
 
@@ -99,21 +102,20 @@ def write_log(craft: TrueCraft, folder: Path, seed: int) -> tuple[Path, Path]:
     rng = np.random.default_rng(seed)
     time = np.arange(LOG_S * RATE_HZ) / RATE_HZ
 
-    def held(changes_hz: float, size: float) -> np.ndarray:
+    def hold(changes_hz: float, size: float) -> np.ndarray:
         return rng.uniform(-size, size, 1000)[(time * changes_hz).astype(int)]
 
-    def lagged(values: np.ndarray, tau_s: float) -> np.ndarray:
+    def lag(values: np.ndarray, tau_s: float) -> np.ndarray:
         decay = np.exp(-1.0 / RATE_HZ / tau_s)
         return lfilter([1.0 - decay], [1.0, -decay], values, axis=0)
 
-    sticks = np.column_stack(
-        [held(1.5, 0.3), held(1.3, 0.3), held(1.1, 0.3), -0.2 + held(1.7, 0.6)]
-    )
+    turns = [hold(changes_hz, 0.3) for changes_hz in (1.5, 1.3, 1.1)]
+    sticks = np.column_stack([*turns, -0.2 + hold(1.7, 0.6)])
     empty_v, full_v = craft.volts
     volts = full_v - 0.9 * (full_v - empty_v) * time / time[-1]
     before = np.vstack([sticks[:1], sticks[:-1]])  # held from the row before on
-    rates = lagged(before[:, :3] * np.deg2rad(craft.max_rate_deg_s), craft.lag_s)
-    throttle = 0.5 * (lagged(before[:, 3], craft.thrust_lag_s) + 1.0)
+    rates = lag(before[:, :3] * np.deg2rad(craft.max_rate_deg_s), craft.lag_s)
+    throttle = 0.5 * (lag(before[:, 3], craft.thrust_lag_s) + 1.0)
     force = np.zeros((len(time), 3))
     force[:, 2] = craft.peak * throttle * volts / full_v
     rates += rng.normal(0.0, GYRO_NOISE, rates.shape)
@@ -176,11 +178,9 @@ def in_header(checkpoint: Path, folder: Path) -> Thrust:
     header = folder / "policy.h"
     run("export", "--c", header, checkpoint)
     words = " ".join(header.read_text(encoding="utf-8").replace("\n *", " ").split())
-    found = re.search(
-        r"gives ([\d.]+) times the weight at full thrust, and (-?[\d.]+) hovers", words
-    )
-    assert found is not None, "the header states no thrust"
-    return Thrust(float(found[1]), float(found[2]))
+    pattern = r"gives ([\d.]+) times the weight at full thrust, and (-?[\d.]+) hovers"
+    ((full, hover),) = re.findall(pattern, words)
+    return Thrust(float(full), float(hover))
 
 
 def on_evaluator(checkpoint: Checkpoint, model: ModelParameters) -> Thrust:
@@ -210,73 +210,60 @@ def on_evaluator(checkpoint: Checkpoint, model: ModelParameters) -> Thrust:
     )
 
 
+class Measured(NamedTuple):
+    """What was measured of a model: thrust by the four sources of ``SOURCES``, and the race."""
+
+    craft: TrueCraft
+    kind: str
+    battery: str
+    thrusts: tuple[Thrust, Thrust, Thrust, Thrust]
+    finished: int
+    lap_s: float
+
+
 def race(checkpoint: Checkpoint) -> tuple[int, float]:
     """Return how many noisy starts finish three laps simulated, and the median flying lap, s."""
     env = simulated_env(checkpoint)
     keys = flights.start_keys(0, NUM_STARTS)
     outcomes = flights.race_many(env, checkpoint.policy, keys, NUM_STEPS, NUM_LAPS)
     laps_s = outcomes.flying_laps_s()
-    return int(outcomes.is_complete().sum()), float(np.median(laps_s)) if len(laps_s) else float(
-        "nan"
+    return int(outcomes.is_complete().sum()), float(np.median(laps_s)) if len(laps_s) else np.nan
+
+
+def measure(craft: TrueCraft, kind: str, path: Path, timesteps: int, folder: Path) -> Measured:
+    """Train on a model file, and return what was measured."""
+    model, policy = flytrack_env.load_model(path), folder / "trained" / "final.safetensors"
+    options = ("--total-timesteps", timesteps, "--evaluate-every", 0, "--no-tracking")
+    run("train", "--model", path, *options, "--out", policy.parent)
+    checkpoint = load_checkpoint(policy)
+    thrusts = (
+        by_model(model),
+        in_environment(path),
+        in_header(policy, folder),
+        on_evaluator(checkpoint, model),
     )
+    return Measured(craft, kind, model.battery.describe(), thrusts, *race(checkpoint))
 
 
-def measure(
-    craft: TrueCraft, kind: str, path: Path, timesteps: int, folder: Path
-) -> dict[str, Any]:
-    """Train on a model file, and return a row of results."""
-    model = flytrack_env.load_model(path)
-    trained = folder / "trained"
-    words = (
-        "--model",
-        path,
-        "--total-timesteps",
-        timesteps,
-        "--evaluate-every",
-        0,
-        "--no-tracking",
-    )
-    run("train", *words, "--out", trained)
-    checkpoint = load_checkpoint(trained / "final.safetensors")
-    finished, lap_s = race(checkpoint)
-    return {
-        "craft": craft.name,
-        "kind": kind,
-        "battery": model.battery.describe(),
-        "truth": 0.0 if kind == "nominal" else craft.peak / G,
-        "model": by_model(model),
-        "environment": in_environment(path),
-        "header": in_header(trained / "final.safetensors", folder),
-        "evaluator": on_evaluator(checkpoint, model),
-        "finished": finished,
-        "lap_s": lap_s,
-    }
-
-
-def largest_difference(rows: list[dict[str, Any]]) -> tuple[float, float]:
+def largest_differences(rows: list[Measured]) -> tuple[float, float]:
     """Return the largest differences from the model's full thrust (share) and hover stick."""
-    full, hover = [], []
-    for row in rows:
-        for where in ("environment", "header", "evaluator"):
-            full.append(abs(row[where].full / row["model"].full - 1.0))
-            hover.append(abs(row[where].hover - row["model"].hover))
-    return max(full), max(hover)
+    full, hover = np.moveaxis(np.array([row.thrusts for row in rows]), -1, 0)
+    return (
+        float(np.abs(full[:, 1:] / full[:, :1] - 1.0).max()),
+        float(np.abs(hover[:, 1:] - hover[:, :1]).max()),
+    )
 
 
-def table(rows: list[dict[str, Any]]) -> str:
+def table(rows: list[Measured]) -> str:
     """Return the rows as a table: thrust over weight at full stick / hover stick, and the race."""
-    places = ("model", "environment", "header", "evaluator")
     lines = []
     for row in rows:
-        truth = f"{row['truth']:.3f}" if row["truth"] else "-"
-        thrusts = [f"{row[place].full:.3f} / {row[place].hover:.3f}" for place in places]
-        race_cells = [f"{row['finished']} of {NUM_STARTS}", f"{row['lap_s']:.2f} s"]
-        lines.append([row["craft"], row["kind"], row["battery"], truth, *thrusts, *race_cells])
-    head = (
-        "craft | model | battery | truth | by the model | in the environment | in the C header | "
-        "in a flight"
-    )
-    return report.table(f"{head} | finished | flying lap", lines)
+        truth = "-" if row.kind == "nominal" else f"{row.craft.peak / G:.3f}"
+        thrusts = [f"{thrust.full:.3f} / {thrust.hover:.3f}" for thrust in row.thrusts]
+        laps = [f"{row.finished} of {NUM_STARTS}", f"{row.lap_s:.2f} s"]
+        lines.append([row.craft.name, row.kind, row.battery, truth, *thrusts, *laps])
+    head = f"craft | model | battery | truth | {' | '.join(SOURCES)} | finished | flying lap"
+    return report.table(head, lines)
 
 
 def main(timesteps: int = 10_000_000, seed: int = 0) -> None:
@@ -286,18 +273,17 @@ def main(timesteps: int = 10_000_000, seed: int = 0) -> None:
         with TemporaryDirectory() as name:
             folder = Path(name)
             log, mapping = write_log(craft, folder, seed + number)
-            nominal, fitted, npz = (
-                folder / text for text in ("nominal.json", "fitted.json", "log.npz")
-            )
-            words = ("--format", "csv", "--map", mapping, "--out", npz, "--model-out", nominal)
-            run("import", log, *words)
-            run("fit", npz, "--from", nominal, "--out", fitted)
-            for kind, path in (("nominal", nominal), ("fitted", fitted)):
-                place = folder / kind
-                place.mkdir()
-                rows.append(measure(craft, kind, path, timesteps, place))
+            npz, models = folder / "log.npz", {}
+            for kind in ("nominal", "fitted"):
+                models[kind] = folder / kind / "model.json"
+                models[kind].parent.mkdir()
+            options = ("--out", npz, "--model-out", models["nominal"])
+            run("import", log, "--format", "csv", "--map", mapping, *options)
+            run("fit", npz, "--from", models["nominal"], "--out", models["fitted"])
+            for kind, path in models.items():
+                rows.append(measure(craft, kind, path, timesteps, path.parent))
                 print(rows[-1], flush=True)
-    full, hover = largest_difference(rows)
+    full, hover = largest_differences(rows)
     report.fill_page(
         report.RESULTS / "any_drone.md",
         "any_drone",

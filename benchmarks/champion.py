@@ -144,11 +144,6 @@ def train(name: str, seed: int) -> tuple[Path, Path]:
     return before, after
 
 
-def list_settings(values: dict[str, float]) -> str:
-    """Return settings as a list in a sentence."""
-    return ", ".join(f"{name} {value:g}" for name, value in values.items())
-
-
 def row_of(seed: int, before: Flown, after: Flown) -> list[str]:
     """Return a seed's row of the table."""
     numbers, meta = after.evaluation.numbers, after.evaluation.checkpoint.meta
@@ -194,8 +189,8 @@ def section_of(name: str, seeds: list[int]) -> tuple[str, bool]:
     lines = [
         f"## `{path}`",
         f"PPO on {recipe.env_id}, {recipe.config.total_timesteps / 1e6:.0f} M steps, "
-        f"{list_settings(CHANGES | recipe.changes)}; "
-        f"polishing: {list_settings(recipe.settings._asdict())}. "
+        f"{report.list_settings(CHANGES | recipe.changes)}; "
+        f"polishing: {report.list_settings(recipe.settings._asdict())}. "
         f"Shipped: seed {best.evaluation.checkpoint.meta['seed']}.",
         report.figures_table(figures),
         report.table(
@@ -218,7 +213,7 @@ def main(
         report.RESULTS / "champion.md",
         "champion",
         model=MODEL.relative_to(report.ROOT),
-        reward=list_settings(REWARD),
+        reward=report.list_settings(REWARD),
         sections="\n\n".join(text for text, _ in sections),
     )
     if not all(is_met for _, is_met in sections):

@@ -123,7 +123,7 @@ def main(seeds: int = 5, out: Path = report.RESULTS / "learning_curve.md") -> No
     report.fill_page(
         out,
         "learning_curve",
-        settings=", ".join(f"{name} {value:g}" for name, value in SHORT.items()),
+        settings=report.list_settings(SHORT),
         every=EVERY / 1e6,
         episodes=NUM_EPISODES,
         laps=NUM_LAPS,

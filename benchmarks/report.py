@@ -143,6 +143,11 @@ def spread(values: Sequence[float], digits: str = ",.0f") -> str:
     return f"{min(values):{digits}} to {max(values):{digits}}"
 
 
+def list_settings(values: dict[str, float]) -> str:
+    """Return settings as a list in a sentence."""
+    return ", ".join(f"{name} {value:g}" for name, value in values.items())
+
+
 def progress(items: Iterable[Item], unit: str) -> Iterable[Item]:
     """Return items with a progress bar, shown on a terminal only; unit: what is counted."""
     return tqdm(items, unit=f" {unit}", disable=None)

@@ -1,8 +1,8 @@
 """How plants with hidden effects are drawn.
 
 Each effect is drawn by its **size**, log-uniform between what a flight of a minute barely shows
-under the noise of ``benchmarks.hidden.noise`` and what cannot be missed. ``EFFECTS`` gives the unit
-of each size.
+under the noise of ``benchmarks.hidden.noise`` and what cannot be missed. ``EFFECTS`` gives the
+sizes with their units.
 """
 
 import math
@@ -21,11 +21,10 @@ OTHER_AXES, SIDEWAYS, GROUND_M, ZETA = (0.5, 1.0), (0.7, 1.4), (0.2, 0.5), (0.4,
 
 
 class EffectRange(NamedTuple):
-    """How an effect is drawn: smallest and largest size, unit, and parameters at a size."""
+    """How an effect is drawn: smallest and largest size, and parameters at a size."""
 
     low: float
     high: float
-    unit: str
     make: Callable[[float, Rng], Values]
 
 
@@ -115,33 +114,32 @@ def _oscillator(size: float, rng: Rng) -> Values:
 
 # Parameters and signs are the package's where the laws agree.
 EFFECTS: dict[str, EffectRange] = {
-    "command_delay": EffectRange(0.0006, 0.02, "s", _positive("delay_s")),
-    "thrust_lag_asymmetry": EffectRange(0.25, 1.2, "|ln ratio|", _log_factor("ratio")),
-    "rate_expo": EffectRange(0.006, 0.15, "1", _per_axis(signs=(-1.0, 1.0))),
-    "rate_scale": EffectRange(0.005, 0.1, "|ln factor|", _factors(*STICKS)),
-    "rate_saturation": EffectRange(0.008, 0.2, "share lost at full stick", _per_axis()),
-    "rate_cross_coupling": EffectRange(0.005, 0.08, "1", direction("from_roll", "from_pitch")),
-    "motor_imbalance": EffectRange(0.0006, 0.01, "rad/s per m/s^2", direction("roll", "pitch")),
-    "yaw_reaction": EffectRange(0.003, 0.05, "rad", _signed("angle")),
-    "second_order_rates": EffectRange(0.002, 0.025, "s, 1 / wn", _oscillator),
-    "rate_slew_limit": EffectRange(0.02, 0.25, "s, centre to full stick", _per_axis("_s")),
-    "wind": EffectRange(
-        0.12, 1.5, "m/s^2; with drag 6 times that in m/s", direction("a_x", "a_y", "a_z")
-    ),
-    "thrust_scale": EffectRange(0.01, 0.2, "|ln factor|", _log_factor("factor")),
-    "translational_lift": EffectRange(0.03, 0.4, "share of thrust", _positive("gain")),
-    "ground_effect": EffectRange(0.06, 0.5, "share of thrust", _ground),
-    "linear_drag": EffectRange(0.03, 0.6, "1/s", _drag("d", (0.2, 1.0))),
-    "quadratic_drag": EffectRange(0.003, 0.05, "1/m", _drag("k", (0.5, 2.0))),
-    "rotor_drag": EffectRange(0.003, 0.05, "s/m", _positive("h")),
-    "thrust_tilt": EffectRange(0.008, 0.12, "rad", direction("towards_x", "towards_y")),
-    "voltage_sag": EffectRange(0.01, 1.0, "V at full thrust", _positive("at_full_v")),
-    "accelerometer_bias": EffectRange(0.12, 1.5, "m/s^2", direction("x", "y", "z")),
-    "accelerometer_scale": EffectRange(0.008, 0.12, "|ln factor|", _factors("x", "y", "z")),
-    "gyro_bias": EffectRange(0.006, 0.1, "rad/s", direction("x", "y", "z")),
-    "gyro_scale": EffectRange(0.005, 0.1, "|ln factor|", _factors("x", "y", "z")),
-    "imu_offset": EffectRange(0.005, 0.06, "m", direction("x", "y", "z")),
-    "imu_latency": EffectRange(0.0006, 0.015, "s", _positive("latency_s")),
+    "command_delay": EffectRange(0.0006, 0.02, _positive("delay_s")),  # s
+    "thrust_lag_asymmetry": EffectRange(0.25, 1.2, _log_factor("ratio")),  # |ln ratio|
+    "rate_expo": EffectRange(0.006, 0.15, _per_axis(signs=(-1.0, 1.0))),  # 1
+    "rate_scale": EffectRange(0.005, 0.1, _factors(*STICKS)),  # |ln factor|
+    "rate_saturation": EffectRange(0.008, 0.2, _per_axis()),  # share lost at full stick
+    "rate_cross_coupling": EffectRange(0.005, 0.08, direction("from_roll", "from_pitch")),  # 1
+    "motor_imbalance": EffectRange(0.0006, 0.01, direction("roll", "pitch")),  # rad/s per m/s^2
+    "yaw_reaction": EffectRange(0.003, 0.05, _signed("angle")),  # rad
+    "second_order_rates": EffectRange(0.002, 0.025, _oscillator),  # s, 1 / wn
+    "rate_slew_limit": EffectRange(0.02, 0.25, _per_axis("_s")),  # s, centre to full stick
+    # m/s^2; with drag 6 times that in m/s
+    "wind": EffectRange(0.12, 1.5, direction("a_x", "a_y", "a_z")),
+    "thrust_scale": EffectRange(0.01, 0.2, _log_factor("factor")),  # |ln factor|
+    "translational_lift": EffectRange(0.03, 0.4, _positive("gain")),  # share of thrust
+    "ground_effect": EffectRange(0.06, 0.5, _ground),  # share of thrust
+    "linear_drag": EffectRange(0.03, 0.6, _drag("d", (0.2, 1.0))),  # 1/s
+    "quadratic_drag": EffectRange(0.003, 0.05, _drag("k", (0.5, 2.0))),  # 1/m
+    "rotor_drag": EffectRange(0.003, 0.05, _positive("h")),  # s/m
+    "thrust_tilt": EffectRange(0.008, 0.12, direction("towards_x", "towards_y")),  # rad
+    "voltage_sag": EffectRange(0.01, 1.0, _positive("at_full_v")),  # V at full thrust
+    "accelerometer_bias": EffectRange(0.12, 1.5, direction("x", "y", "z")),  # m/s^2
+    "accelerometer_scale": EffectRange(0.008, 0.12, _factors("x", "y", "z")),  # |ln factor|
+    "gyro_bias": EffectRange(0.006, 0.1, direction("x", "y", "z")),  # rad/s
+    "gyro_scale": EffectRange(0.005, 0.1, _factors("x", "y", "z")),  # |ln factor|
+    "imu_offset": EffectRange(0.005, 0.06, direction("x", "y", "z")),  # m
+    "imu_latency": EffectRange(0.0006, 0.015, _positive("latency_s")),  # s
 }
 NAMES = tuple(EFFECTS)
 DRAGS = ("linear_drag", "quadratic_drag", "rotor_drag")
