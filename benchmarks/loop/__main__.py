@@ -9,16 +9,15 @@ are not run again.
 
 import os
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from baselines.purejaxrl_ppo import Config
-from benchmarks.loop.jobs import LAW, LOG, SHARED, pin, run_job
+from benchmarks.loop.jobs import LAW, SHARED, pin, run_job
 from benchmarks.loop.page import write_page
-from benchmarks.report import command
+from benchmarks.report import command, progress
 
 
 def run_all(plants: list[str], out: Path, steps: int, seed: int) -> list[dict[str, Any]]:
@@ -28,18 +27,12 @@ def run_all(plants: list[str], out: Path, steps: int, seed: int) -> list[dict[st
     free_cores = context.Queue()
     for core in cores:
         free_cores.put(core)
-    results: dict[str, dict[str, Any]] = {}
+    run = partial(run_job, out=out.resolve(), steps=steps, seed=seed)
     with ProcessPoolExecutor(len(cores), context, initializer=pin, initargs=(free_cores,)) as pool:
-        for jobs in (list(SHARED), plants):  # every plant needs both shared policies
-            running = {job: pool.submit(run_job, job, out.resolve(), steps, seed) for job in jobs}
-            for job, future in tqdm(running.items(), unit="job"):
-                try:
-                    results[job] = future.result()
-                except Exception as error:
-                    tqdm.write(f"{job}: failed, see {out / job / LOG}: {error}")
-                    if job in SHARED:
-                        raise SystemExit(1) from None
-    return [result for job, result in results.items() if job not in SHARED]
+        shared = list(progress(pool.map(run, SHARED), "jobs"))
+        if None in shared:  # every plant needs both shared policies
+            raise SystemExit(1)
+        return [result for result in progress(pool.map(run, plants), "jobs") if result is not None]
 
 
 def main(

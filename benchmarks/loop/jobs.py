@@ -8,6 +8,7 @@ only, because its threads stay on the core to which ``pin`` has moved the proces
 import json
 import os
 import shutil
+import sys
 import time
 import traceback
 from contextlib import redirect_stderr, redirect_stdout
@@ -28,18 +29,18 @@ def pin(free_cores: Any) -> None:
         os.sched_setaffinity(0, {free_cores.get()})
 
 
-def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
+def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any] | None:
     """Return a job's result, from its file if it has finished; an unfinished job starts again.
 
-    What it prints, and the traceback of an error, go to a log in the job's folder. Programs are
-    forgotten, since a process may map only so many into its memory.
+    What it prints goes to a log in the job's folder, and so does the traceback of an error, of
+    which None comes back. Programs are forgotten, since a process may map only so many into its
+    memory.
     """
     folder = out / job
     if (folder / RESULT).exists():
         return dict(json.loads((folder / RESULT).read_text()))
-    shutil.rmtree(
-        folder, ignore_errors=True
-    )  # else its trainings would be refused as another run's
+    # Else its trainings would be refused as another run's.
+    shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     import jax
 
@@ -47,9 +48,10 @@ def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
     with (folder / LOG).open("w") as log, redirect_stdout(log), redirect_stderr(log):
         try:
             result = (train_shared if job in SHARED else measure_plant)(job, out, steps, seed)
-        except BaseException:
+        except Exception as error:
             traceback.print_exc()
-            raise
+            print(f"{job}: failed, see {folder / LOG}: {error}", file=sys.__stderr__)
+            return None
         finally:
             jax.clear_caches()
     result["cpu_s"] = time.process_time() - started_s
@@ -93,12 +95,12 @@ def measure_plant(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
     plant, hidden = make_plant(job, seed)
     config, seeds, settings = Config(total_timesteps=steps), seeds_of(seed), Settings()
     loop = close_loop(plant, out / job, config, seed, settings)
-    rest = (seeds["train"], seeds["evaluation"], loop.held_out)
-    stages = [train_stage("refitted_base", loop.diagnosis.base, plant, out / job, config, *rest)]
+    scoring = (seeds["evaluation"], loop.held_out)
+    base, train_seed = loop.diagnosis.base, seeds["train"]
+    stages = [train_stage("refitted_base", base, plant, out / job, config, train_seed, *scoring)]
     for name in SHARED:
         checkpoint = load_checkpoint(out / name / "final.safetensors")
-        model = nominal_parameters()
-        stages.append(judge(name, model, checkpoint, plant, seeds["evaluation"], loop.held_out))
+        stages.append(judge(name, nominal_parameters(), checkpoint, plant, *scoring))
     content = loop_as_json(loop, seed, config, settings)
     content["stages"] += [stage_as_json(stage) for stage in stages]
     return {"job": job, "hidden": hidden, **content}
