@@ -12,7 +12,6 @@ rates of two runs.
 import statistics
 import time
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +28,7 @@ VARIANTS = {
     f"FlyTrack{name}-v0 vmap(step), 1,024": f"FlyTrack{name}-v0"
     for name in ("Noisy", "ActionHistory", "Randomized", "Robust")
 }
-MOST_COSTLY = 1.5  # a variant's step over the plain one's
+MAX_COST = 1.5  # a variant's step over the plain one's
 # Our rate, the peer's, the ratio to reach.
 TARGETS = ((PLAIN, L2F_SMALL, 6.0), (BATCH, L2F_LARGE, 10.0), (DUEL, SMALL_BATCH, 0.4))
 
@@ -55,7 +54,8 @@ def jax_contestant(
     import gymnax
     import jax
 
-    flytrack_env = import_module("flytrack_env")  # registers the id
+    import flytrack_env  # registers the ids
+
     drones: tuple[int, ...] = ()
     if env_id == "FlyTrackDuel-v0":
         env, drones = flytrack_env.make_race(env_id), (2,)
@@ -71,12 +71,12 @@ def jax_contestant(
 
     @jax.jit
     def fly(state: Any, keys: jax.Array, actions: jax.Array, params: Any) -> Any:
-        def one(carry: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
+        def step_once(outputs: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
             key, action = inputs
-            return step(key, carry[1], action, params), None
+            return step(key, outputs[1], action, params), None
 
         first = step(keys[0], state, actions[0], params)
-        return jax.lax.scan(one, first, (keys, actions))[0]
+        return jax.lax.scan(step_once, first, (keys, actions))[0]
 
     def run() -> None:
         nonlocal state
@@ -96,11 +96,8 @@ def l2f_contestant(name: str, num_envs: int, length: int) -> Contestant:
 
     vector = l2f.vector_selector[num_envs]
     device, rng, env = l2f.Device(), vector.VectorRng(), vector.VectorEnvironment()
-    parameters, state, next_state = (
-        vector.VectorParameters(),
-        vector.VectorState(),
-        vector.VectorState(),
-    )
+    parameters = vector.VectorParameters()
+    state, next_state = vector.VectorState(), vector.VectorState()
     vector.initialize_rng(device, rng, 0)
     vector.initialize_environment(device, env)
     vector.sample_initial_parameters(device, env, parameters, rng)
@@ -196,7 +193,7 @@ def with_effects() -> dict[str, Any]:
 
 def cost_figure(name: str, cost: float, repeats: int) -> report.Figure:
     """Return the figure of a step's cost over the plain one's."""
-    return report.Figure(name, f"at most {MOST_COSTLY:g}", f"{cost:.2f}", repeats)
+    return report.Figure(name, f"at most {MAX_COST:g}", f"{cost:.2f}", repeats)
 
 
 def effect_costs(repeats: int) -> str:
@@ -207,11 +204,9 @@ def effect_costs(repeats: int) -> str:
     plain, rows = jax_contestant(PLAIN, "FlyTrack-v0", 1024, 200, is_batch=False), []
     for name, model in report.progress(with_effects().items(), "model"):
         entry = jax_contestant(name, "FlyTrack-v0", 1024, 200, is_batch=False, model=model)
-        rates = measure([plain, entry], repeats, warm_up=1)
-        costs = [a / b for a, b in zip(rates[PLAIN], rates[name], strict=True)]
-        rows.append(
-            [*cost_figure(name, statistics.median(costs), repeats), report.spread(costs, ".2f")]
-        )
+        costs = ratios(measure([plain, entry], repeats, warm_up=1), PLAIN, name)
+        figure = cost_figure(name, statistics.median(costs), repeats)
+        rows.append([*figure, report.spread(costs, ".2f")])
     return report.table("figure | target | measured | n | lowest to highest", rows)
 
 
@@ -229,9 +224,9 @@ def measure(entries: list[Contestant], repeats: int, warm_up: int = 3) -> dict[s
     return rates
 
 
-def median_ratio(rates: dict[str, list[float]], name: str, peer: str) -> float:
-    """Return the median of the rounds' ratios, in which drift of the machine cancels."""
-    return statistics.median(a / b for a, b in zip(rates[name], rates[peer], strict=True))
+def ratios(rates: dict[str, list[float]], name: str, peer: str) -> list[float]:
+    """Return the rounds' ratios, in which drift of the machine cancels."""
+    return [rate / other for rate, other in zip(rates[name], rates[peer], strict=True)]
 
 
 def main(repeats: int = 7, out: Path | None = None, effects: bool = False) -> None:
@@ -242,35 +237,27 @@ def main(repeats: int = 7, out: Path | None = None, effects: bool = False) -> No
     """
     core = report.pin_to_one_core()
     if effects:
-        where = f"{repeats} rounds, {core}. {report.provenance_line(report.provenance())}"
-        told = (
+        about = (
             f"{report.command_line()}: `vmap(step)` of 1,024 environments, CPU time over that "
             "of the plain step, median of the rounds."
         )
-        text = report.page("What an effect costs", told, effect_costs(repeats), where)
+        source = f"{repeats} rounds, {core}. {report.provenance_line(report.provenance())}"
+        text = report.page("What an effect costs", about, effect_costs(repeats), source)
         report.write_page(out, text)
         return
     rates = measure(contestants(), repeats)
-    speeds = (
-        (name, f"{statistics.median(found):.3g}", report.spread(found, ".3g"))
-        for name, found in rates.items()
-    )
-    figures = [
-        report.Figure(
-            f"{name} to {peer}",
-            f"at least {goal:g}",
-            f"{median_ratio(rates, name, peer):.2g}",
-            repeats,
-        )
-        for name, peer, goal in TARGETS
-        if peer in rates
+    speeds = [
+        (name, f"{statistics.median(values):.3g}", report.spread(values, ".3g"))
+        for name, values in rates.items()
     ]
-    figures += [
-        cost_figure(
-            f"cost of {name} over the plain step", median_ratio(rates, PLAIN, name), repeats
-        )
-        for name in VARIANTS
-    ]
+    figures = []
+    for name, peer, goal in TARGETS:
+        if peer in rates:
+            ratio = f"{statistics.median(ratios(rates, name, peer)):.2g}"
+            figures.append(report.Figure(f"{name} to {peer}", f"at least {goal:g}", ratio, repeats))
+    for name in VARIANTS:
+        cost = statistics.median(ratios(rates, PLAIN, name))
+        figures.append(cost_figure(f"cost of {name} over the plain step", cost, repeats))
     report.fill_page(
         out,
         "env_speed",
