@@ -28,6 +28,7 @@ from flytrack_sysid.parameters import DRAIN
 from flytrack_sysid.record import fill_gaps, make_record
 from flytrack_sysid.sensors import measure
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
+from tests.support.tables import table
 from tests.support.written_logs import NUM_ROWS, SUFFIXES, columns_of, make_log, write
 
 FOUR_CELLS, MIDDLE_V = (14.0, 16.8), 15.4
@@ -35,6 +36,7 @@ CRAFT = Craft((343.775, 343.775, 343.775), 0.7, FOUR_CELLS)
 FORCE_PER_VOLT = 35.0 / 16.8  # m/s^2 at full stick
 NOMINAL = nominal_parameters()
 CONTINUOUS = NOMINAL._replace(motion=Motion.CONTINUOUS)
+CASES = table("measured_logs")
 
 
 def through_file(log: FlightLog, path: Path) -> FlightLog:
@@ -104,25 +106,6 @@ def test_what_a_simulator_flew_is_marked():
 
 # --- How a log is replayed -----------------------------------------------------------------------
 
-HANDOUT = Motion.HANDOUT
-# Origin of the log, motion of the model, requested motion: the motion, and what is noted.
-NOTES = [
-    ("measured", None, None, Motion.CONTINUOUS, []),
-    ("measured", Motion.CONTINUOUS, None, Motion.CONTINUOUS, []),
-    ("measured", HANDOUT, None, Motion.CONTINUOUS, ["is measured; the model says handout"]),
-    (
-        "measured",
-        Motion.CONTINUOUS,
-        HANDOUT,
-        HANDOUT,
-        ["handout was requested, but log is measured", "as requested; the model says continuous"],
-    ),
-    ("simulated", HANDOUT, None, None, []),
-    ("simulated", HANDOUT, Motion.CONTINUOUS, Motion.CONTINUOUS, ["the model says handout"]),
-    (None, HANDOUT, None, None, ["chosen so, since log does not say whether a drone"]),
-    (None, None, Motion.SEMI_IMPLICIT, Motion.SEMI_IMPLICIT, []),
-]
-
 
 def assert_noted(notes: list[str], parts: list[str]) -> None:
     """Assert that there are as many notes as parts, each with its part."""
@@ -130,11 +113,12 @@ def assert_noted(notes: list[str], parts: list[str]) -> None:
         assert part in note
 
 
-@pytest.mark.parametrize(("origin", "of_model", "requested", "expected", "parts"), NOTES)
+@pytest.mark.parametrize(("origin", "of_model", "requested", "expected", "parts"), CASES["motions"])
 def test_contradictions_on_the_motion_are_noted(origin, of_model, requested, expected, parts):
-    log = replace(make_log(), origin=origin, source="log")
-    model = of_model and NOMINAL._replace(motion=of_model)
-    assert required_motion(log, requested) is expected
+    log = replace(make_log(), origin=origin or None, source="log")
+    model = NOMINAL._replace(motion=Motion(of_model)) if of_model else None
+    requested = Motion(requested) if requested else None
+    assert required_motion(log, requested) is (Motion(expected) if expected else None)
     assert_noted(motion_notes(log, model, requested, "chosen so"), parts)
 
 
@@ -142,7 +126,7 @@ def test_measured_logs_are_replayed_continuously(truth):
     log = replace(truth, origin="measured")
     assert motion_of(log, NOMINAL) is Motion.CONTINUOUS
     assert what_is_fitted(log, NOMINAL)[0].motion is Motion.CONTINUOUS
-    assert what_is_fitted(log, NOMINAL, motion=HANDOUT)[0].motion is HANDOUT
+    assert what_is_fitted(log, NOMINAL, motion=Motion.HANDOUT)[0].motion is Motion.HANDOUT
     parts = split(log, NOMINAL, None, None)
     for motion in (parts.moves.motion, parts.train.like.motion, parts.test.like.motion):
         assert motion is Motion.CONTINUOUS
@@ -227,34 +211,20 @@ def test_what_matters_is_a_share_of_the_battery(battery, drain, sag_v, truth):
             assert is_notable(cause, problem, vector) is expected
 
 
-FOUR, ONE = Battery(16.8, 14.0, 14.2, 16.6), Battery(4.1, 3.2, 3.2, 4.1)
-DEEP = Battery(16.0, 12.5, 12.5, 16.0)
-
-
-def fitted_at(battery: Battery, low_v: float, high_v: float) -> Battery:
-    return battery._replace(fitted_low_v=low_v, fitted_high_v=high_v)
-
-
-# Logged or stated voltages, the model's battery: the craft's, that of a fit, what is noted.
-BATTERIES = [
-    ((14.5, 16.5), None, FOUR, FOUR, fitted_at(FOUR, 14.5, 16.5), []),
-    ((13.6, 16.9), None, FOUR, FOUR, fitted_at(FOUR, 13.6, 16.9), []),  # within 3 %
-    ((12.5, 16.0), None, FOUR, DEEP, DEEP, ["exceeds"]),
-    ((3.2, 4.1), None, Battery(), ONE, ONE, ["is outside"]),
-    (None, (3.2, 4.1), Battery(), ONE, fitted_at(ONE, 3.65, 3.65), ["3.65 V", "outside"]),
-    (None, None, FOUR, FOUR, fitted_at(FOUR, 15.4, 15.4), ["15.4 V, the middle"]),
-    (None, None, Battery(), Battery(), fitted_at(Battery(), 23.0, 23.0), ["23 V, the middle"]),
-]
-
-
-@pytest.mark.parametrize(("logged", "stated", "given", "of_craft", "fitted", "parts"), BATTERIES)
+@pytest.mark.parametrize(
+    ("logged", "stated", "given", "of_craft", "fitted", "parts"), CASES["batteries"]
+)
 def test_batteries_follow_the_voltages_of_a_log(logged, stated, given, of_craft, fitted, parts):
-    log = replace(make_log(num_rows=1000, names=("w",)), stated_voltage_v=stated)
-    if logged is not None:
+    given = Battery(*given)
+    log = make_log(num_rows=1000, names=("w",))
+    if stated:
+        log = replace(log, stated_voltage_v=tuple(stated))
+    if logged:
         volts = np.repeat(logged, 500)[:, None]
         volts[3] = 0.1  # a wrong sample is no range
         log = replace(log, channels={**log.channels, "v_bat": volts})
-        assert flown_voltages(log) == logged
-    own = replace(log, stated_voltage_v=stated or (given.empty_v, given.full_v))
-    assert battery_of_craft(own, given) == of_craft and fitted_battery(own, given) == fitted
+        assert flown_voltages(log) == tuple(logged)
+    known = replace(log, stated_voltage_v=tuple(stated) or (given.empty_v, given.full_v))
+    assert battery_of_craft(known, given) == Battery(*of_craft)
+    assert fitted_battery(known, given) == Battery(*fitted)
     assert_noted(voltage_notes(log, given), parts)

@@ -1,20 +1,18 @@
 """Flight logs raise no problem; each wrong unit, sign and stuck column alone is named."""
 
-from collections.abc import Callable
+import re
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.log import CHANNELS, FlightLog, LogError
 from flytrack_sysid.plausibility import FEWEST_ROWS, GRAVITY, check_plausible, find_problems
 from flytrack_sysid.sensors import measure, specific_force_b
 from tests.support.handout_plant import HandoutPlant, excited
 from tests.support.made_flight import noisy
-
-UPWARDS = np.array([0.0, 0.0, GRAVITY])
-Change = Callable[[FlightLog], FlightLog]
+from tests.support.tables import table
 
 
 @pytest.fixture(scope="module")
@@ -25,112 +23,70 @@ def logs() -> dict[str, FlightLog]:
     return {"clean": clean, "noisy": measure(exact, 1.0, GRAVITY, np.random.default_rng(9))}
 
 
-def changed(channel: str, change: Callable[[np.ndarray], np.ndarray]) -> Change:
-    return lambda log: replace(log, channels={**log.channels, channel: change(log[channel])})
+class Change(NamedTuple):
+    """What is wrong with a channel of a log, and which problem is found."""
+
+    channel: str
+    text: str = ""
+    scale: float | list[float] = 1.0
+    offset: float | list[float] = 0.0
+    order: Any = slice(None)
+    columns: str = ""
+
+    def apply(self, log: FlightLog) -> FlightLog:
+        """Return the log that is wrong."""
+        if self.channel == "t":
+            return replace(log, time=self.scale * log.time)
+        values = log[self.channel][:, self.order] * np.array(self.scale) + self.offset
+        return replace(log, channels={**log.channels, self.channel: values})
+
+    def named(self) -> str:
+        """Return the columns that the problem names."""
+        return self.columns or ", ".join(CHANNELS[self.channel])
 
 
-def scaled(channel: str, factor: float | list[float]) -> Change:
-    return changed(channel, lambda values: values * np.array(factor))
-
-
-def constant(channel: str, row: list[float]) -> Change:
-    return changed(channel, lambda values: np.tile(row, (len(values), 1)))
-
-
-def rolled(step: int) -> Change:
-    """Return a change of the order of a quaternion's numbers."""
-    return changed("q", lambda values: np.roll(values, step, axis=1))
-
-
-def columns(channel: str) -> str:
-    return ", ".join(CHANNELS[channel])
-
-
-# What is done to a log -> the columns that the one problem names, and what else it says.
-WRONG = {
-    "w in deg/s": (scaled("w", 180 / np.pi), columns("w"), "looks like deg/s"),
-    "t in ms": (
-        lambda log: replace(log, time=1e3 * log.time),
-        "t",
-        "median step of 10, .* looks like ms",
-    ),
-    "q world to body": (scaled("q", [1.0, -1.0, -1.0, -1.0]), columns("q"), "looks like world to"),
-    "q stuck": (constant("q", [1.0, 0.0, 0.0, 0.0]), columns("q"), "the attitude looks stuck"),
-    "v_bat in mV": (scaled("v_bat", 1000.0), "v_bat", "looks like mV$"),
-    "v_bat in tenths": (scaled("v_bat", 10.0), "v_bat", "looks like tenths of V$"),
-    "f in g": (scaled("f", 1 / GRAVITY), columns("f"), "looks like g$"),
-    "f with z down": (scaled("f", [1.0, -1.0, -1.0]), "f_z", "pointed down"),
-    "a with gravity": (changed("a", lambda acc: acc + UPWARDS), "a_z", "gravity looks left in"),
-    "commands stuck": (constant("u", [0.0] * 4), columns("u"), "look stuck"),
-    "too few seconds": (
-        lambda log: log.select(log.time < 0.06),
-        "t",
-        r"found \d+ rows and \d\.\d+ s, ",
-    ),
-    "too few rows": (lambda log: log.select(slice(0, FEWEST_ROWS - 1)), "t", "found 99 rows"),
-}
+WRONG, MISREAD = (
+    {name: Change(**fields) for name, fields in changes.items()}
+    for changes in table("implausible_logs").values()
+)
 
 
 @pytest.mark.parametrize("name", ["clean", "noisy"])
-@pytest.mark.parametrize("wrong", [None, *WRONG])
+@pytest.mark.parametrize("wrong", WRONG)
 def test_wrong_log_is_named_and_only_that(logs, name, wrong):
-    log = replace(logs[name], source="flight.csv")
-    if wrong is None:
-        check_plausible(log)
-        return
-    change, where, text = WRONG[wrong]
-    if where == "a_z" and "a" not in log:
+    log, change = replace(logs[name], source="flight.csv"), WRONG[wrong]
+    check_plausible(log)
+    if change.channel == "a" and "a" not in log:
         pytest.skip("no accelerations are measured")
-    log = change(log)
+    log = change.apply(log)
     (problem,) = find_problems(log)
-    assert problem.startswith(f"flight.csv: {where}: found ")
-    with pytest.raises(LogError, match=text):
+    assert problem.startswith(f"flight.csv: {change.named()}: found ")
+    with pytest.raises(LogError, match=change.text):
         check_plausible(log)
 
 
-FRD = Rotation.from_rotvec([np.pi, 0.0, 0.0])
-
-
-def turned(change: Callable[[Rotation], Rotation]) -> Change:
-    """Return a change of the attitude."""
-
-    def apply(quat: np.ndarray) -> np.ndarray:
-        return change(Rotation.from_quat(quat, scalar_first=True)).as_quat(scalar_first=True)
-
-    return changed("q", apply)
-
-
-# One wrong word in a mapping -> the channel that is named, and how it agrees.
-MISREAD = {
-    "wxyz read as xyzw": (rolled(1), "q", "if q is read as wxyz"),
-    "xyzw read as wxyz": (rolled(-1), "q", "if q is read as xyzw"),
-    "q inverted": (turned(Rotation.inv), "q", "if q is inverted"),
-    "q in frd": (turned(lambda quat: quat * FRD), "q", "if q has its body axes turned"),
-    "q in ned": (turned(lambda quat: FRD * quat), "q", "if q has its world turned"),
-    "q in frd and ned": (
-        turned(lambda quat: FRD * quat * FRD),
-        "q",
-        "if q has body axes and world turned",
-    ),
-    "w in frd": (scaled("w", [1.0, -1.0, -1.0]), "w", "if w has y and z turned"),
-    "v in ned": (scaled("v", [1.0, -1.0, -1.0]), "v", "if v has y and z turned"),
-    "p in ned": (scaled("p", [1.0, -1.0, -1.0]), "p", "if p has y and z turned"),
-}
+@pytest.mark.parametrize("name", ["clean", "noisy"])
+def test_too_little_is_no_log(logs, name):
+    short = logs[name].select(logs[name].time < 0.06)
+    for log, found in (
+        (short, r"found \d+ rows and \d\.\d+ s, "),
+        (logs[name].select(slice(0, FEWEST_ROWS - 1)), "found 99 rows"),
+    ):
+        (problem,) = find_problems(log)
+        assert re.search(f": t: {found}", problem)
 
 
 @pytest.mark.parametrize("noise", [False, True])
 @pytest.mark.parametrize("name", MISREAD)
 def test_channels_that_contradict_each_other_are_read_right(name, noise, truth):
-    change, channel, text = MISREAD[name]
-    right = noisy(truth, 3) if noise else truth
+    change, right = MISREAD[name], noisy(truth, 3) if noise else truth
     log = replace(right, channels={**right.channels, "u": np.clip(right["u"], -1.0, 1.0)})
     assert find_problems(log) == []
-    (problem,) = find_problems(change(log))
-    assert (
-        f": {columns(channel)}: found motion that contradicts itself" in problem and text in problem
-    )
+    (problem,) = find_problems(change.apply(log))
+    assert f": {change.named()}: found motion that contradicts itself" in problem
+    assert change.text in problem
     with pytest.raises(LogError, match="contradicts itself"):
-        check_plausible(change(log))
+        check_plausible(change.apply(log))
 
 
 def test_right_logs_of_any_noise_contradict_nothing(truth):
@@ -149,9 +105,9 @@ def test_right_logs_of_any_noise_contradict_nothing(truth):
 def test_all_problems_are_listed(logs):
     log = logs["noisy"]
     for wrong in ("t in ms", "w in deg/s", "v_bat in mV", "f in g"):
-        log = WRONG[wrong][0](log)
+        log = WRONG[wrong].apply(log)
     problems = find_problems(log)
-    named = ["t", columns("w"), columns("f"), "v_bat"]
+    named = [WRONG[wrong].named() for wrong in ("t in ms", "w in deg/s", "f in g", "v_bat in mV")]
     assert [problem.split(": ")[1] for problem in problems] == named
     with pytest.raises(LogError) as error:
         check_plausible(log)
@@ -169,6 +125,7 @@ def test_drone_that_stands_while_commands_move(logs, measured):
 
 def test_batteries_of_one_to_fourteen_cells_raise_no_problem(logs):
     for volts in (3.0, 16.8, 60.0):
-        assert find_problems(constant("v_bat", [volts])(logs["clean"])) == []
-    (problem,) = find_problems(constant("v_bat", [420.0])(logs["clean"]))
+        battery = Change("v_bat", scale=0.0, offset=volts)
+        assert find_problems(battery.apply(logs["clean"])) == []
+    (problem,) = find_problems(battery._replace(offset=420.0).apply(logs["clean"]))
     assert problem.endswith("this looks like hundredths of V or tenths of V")

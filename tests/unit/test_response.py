@@ -10,7 +10,17 @@ from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid.response import FULL_STEP, half_response_s
 
 TAU = np.array([0.02, 0.03, 0.04, 0.05])
-MODEL = nominal_parameters()._replace(tau=TAU)
+# Neutral, so that all tests share one compiled program.
+NEUTRAL = (
+    effects.CommandDelay(),
+    effects.ThrustLagAsymmetry(),
+    effects.SecondOrderRates(),
+    effects.RateSlewLimit(),
+    effects.RateExpo(),
+    effects.MotorImbalance(),
+    effects.GyroScale(),
+)
+MODEL = nominal_parameters()._replace(tau=TAU).with_effects(*NEUTRAL)
 
 
 def test_a_first_order_lag_takes_ln_2_of_its_time_constant_and_delays_add() -> None:
