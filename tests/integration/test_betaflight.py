@@ -49,10 +49,10 @@ def plant() -> Iterator[Betaflight]:
 
 def starts(number: int = 3, volts: float = 23.0) -> np.ndarray:
     rng = np.random.default_rng(0)
-    found = [
+    rows = [
         start_state(rng, volts, -0.2, tilt_deg=20.0 * row, speed=2.0 * row) for row in range(number)
     ]
-    return np.array(found, np.float32)
+    return np.array(rows, np.float32)
 
 
 def sticks(number: int = 3, steps: int = 80) -> np.ndarray:
@@ -130,24 +130,24 @@ def test_a_held_stick_turns_as_the_models_curve_says(rates_type, rc_rate, rate, 
 
 def test_settings_are_read_back():
     dump = "feature -AIRMODE\nprofile 1\nset p_roll = 60\nrateprofile 2\nset rates_type = ACTUAL\n"
+    expected = {"p_roll": "60", "roll_srate": "80", "feature AIRMODE": "OFF", "nonsense": ""}
     with Betaflight(dump + "set roll_srate = 80\n") as plant:
-        found = [
-            plant.value(name) for name in ("p_roll", "roll_srate", "feature AIRMODE", "nonsense")
-        ]
-        assert found == ["60", "80", "OFF", ""] and plant.full_stick_deg_s[0] == 800.0
+        assert {name: plant.value(name) for name in expected} == expected
+        assert plant.full_stick_deg_s[0] == 800.0
         values = plant.firmware.values
-    masters = {name: value for (scope, _, name), value in values.items() if scope == "master"}
-    names = [name for name in masters if " " not in name and "profile" not in name]
-    lines = [f"set {name} = {masters[name]}" for name in names]
+    lines = [
+        f"set {name} = {value}"
+        for (scope, _, name), value in values.items()
+        if scope == "master" and " " not in name and "profile" not in name
+    ]
     with Betaflight("\n".join(lines)) as again:  # names and values that the firmware itself has
         assert len(lines) > 200 and again.value("p_roll") == "45"
 
 
 def test_refused_settings_are_named():
-    with pytest.raises(
-        FirmwareError, match=r"the firmware refused roll_srate, p_rol, feature WINGS; skip="
-    ):
-        Betaflight({"p_rol": 60, "roll_srate": 10_000, "feature wings": True, "p_pitch": 50})
+    wrong = {"p_rol": 60, "roll_srate": 10_000, "feature wings": True}
+    with pytest.raises(FirmwareError, match="refused roll_srate, p_rol, feature WINGS; skip="):
+        Betaflight({**wrong, "p_pitch": 50})
     with Betaflight({"p_rol": 60, "p_pitch": 50}, skip=["p_ro*"]) as plant:
         assert plant.value("p_pitch") == "50"
 
@@ -263,16 +263,14 @@ def test_loop_with_the_numbers_of_the_body_flies_as_the_firmware_does(plant):
 
 
 def test_what_was_changed_is_named_and_a_matched_set_up_has_no_name() -> None:
-    logs = {}
-    for name, body in (
-        ("before", Body()),
-        ("same", Body()),
-        ("weak", Body(health=(1.0, 0.85, 1.0, 1.0))),
-    ):
+    weak = Body(health=(1.0, 0.85, 1.0, 1.0))
+    logs = []
+    for number, body in enumerate((Body(), Body(), weak)):
         with Betaflight(body=body) as flown:
-            logs[name], model = collect(flown, 1.0, len(logs), 1.0), known_model(flown)
-    before = logs["before"]
-    assert diagnose_change(logs["same"], before, model, motion=model.motion).causes == ()
-    (cause,) = diagnose_change(logs["weak"], before, model, motion=model.motion).causes
+            logs.append(collect(flown, 1.0, number, 1.0))
+            model = known_model(flown)
+    before, same, changed = logs
+    assert diagnose_change(same, before, model, motion=model.motion).causes == ()
+    (cause,) = diagnose_change(changed, before, model, motion=model.motion).causes
     assert cause.effect == "betaflight_loop"
     assert cause.parameters["front_right"].value == pytest.approx(0.85, abs=0.03)

@@ -24,8 +24,8 @@ from flytrack_env.state import unpack_action
 from flytrack_sysid.importing.flight import Craft
 
 HANDOUT = Battery()
-# Cells, mass in kg: a whoop, a cinewhoop, a small and a large freestyle quadcopter, a racer.
-CRAFTS = [(1, 0.032), (2, 0.08), (3, 0.35), (4, 0.6), (6, 0.75)]
+# Cells, mass in kg: a whoop, a freestyle quadcopter, a racer.
+CRAFTS = [(1, 0.032), (4, 0.6), (6, 0.75)]
 CELL_V = (3.4, 4.2)
 NUM_STARTS = 256
 BATTERY_ROW = 22  # of the observation
