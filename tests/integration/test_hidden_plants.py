@@ -23,24 +23,14 @@ from flytrack_sysid.log import FlightLog
 from tests.support.hidden_flights import LOW_START, flown_in_floats, random_sticks, state_of
 from tests.support.simulated_flights import flown_by
 from tests.support.slow import slow_but
+from tests.support.tables import table
 
 START = Start((1.0, -2.0, 6.0), 0.7, 23.8, -0.2)
 LOOP_STEPS = 120
 STEP_S, STEPS = 0.01, 100
-DELAY_S, LATENCY_S, MOCAP_S = 0.0137, 0.0032, 0.0246
-MOVING_EFFECTS = {
-    "command_delay": {"delay_s": DELAY_S},
-    "second_order_rates": {
-        **{"roll_s": 0.02, "pitch_s": 0.025, "yaw_s": 0.015},
-        **{"roll_damping": 0.6, "pitch_damping": 0.8, "yaw_damping": 0.5},
-    },
-    "yaw_reaction": {"angle": 0.05},
-    "motor_imbalance": {"roll": 0.01, "pitch": -0.005},
-    "voltage_sag": {"at_full_v": 0.8},
-    "linear_drag": {"d_x": 0.3, "d_y": 0.2, "d_z": 0.1},
-    "rotor_drag": {"h": 0.02},
-    "imu_latency": {"latency_s": LATENCY_S},
-}
+MOVING_EFFECTS = table("moving_effects")
+DELAY_S = MOVING_EFFECTS["command_delay"]["delay_s"]
+LATENCY_S, MOCAP_S = MOVING_EFFECTS["imu_latency"]["latency_s"], 0.0246
 # A thousandth of the sensors' noise or less (slopes: of 140 rad/s^2, times an arm of 0.06 m).
 FINE_ERRORS = {"p": 1e-4, "v": 1e-4, "q": 5e-5, "f": 1e-3, "w": 1e-3, "slope": 0.1}
 MINUTE_S = 60.0

@@ -11,24 +11,11 @@ from flytrack_sysid import Imported, diagnose, import_log
 from flytrack_sysid.importing.units import GRAVITY
 from flytrack_sysid.plausibility import summed_turns, windows_of
 from tests.support.real_logs import CRAZYFLIE, import_shared, shared
+from tests.support.tables import table
 
 pytestmark = pytest.mark.slow
 WINDOW_S = 0.3
-LEE = {"cf_lee_standard": (182, 183), "cf_lee_upgraded": (29, 45, 108, 113, 115, 119, 202, 203)}
-# Log 30 ends in a crash. Logs 182 and 183 hardly accelerate, and their velocity is a slow estimate.
-NANOBENCH = (
-    "B10_lissajous_fast_rep1",
-    "B2_circle_fast_rep1",
-    "B3_figure8_fast_rep1",
-    "B3_figure8_slow_rep1",
-)
-NANOBENCH += (
-    "B5_helix_fast_rep1",
-    "B7_oval_fast_rep1",
-    "B8_star_fast_rep1",
-    "B9_trefoil_fast_rep14",
-)
-NANOBENCH += ("B9_trefoil_medium_rep12",)
+FLIGHTS = table("real_flights")
 
 
 def check(imported: Imported, least: float, tolerance: float) -> None:
@@ -62,9 +49,7 @@ def check(imported: Imported, least: float, tolerance: float) -> None:
         assert sizes[1] / sizes[0] == pytest.approx(1.0, abs=tolerance)
 
 
-@pytest.mark.parametrize(
-    ("folder", "number"), [(name, one) for name, numbers in LEE.items() for one in numbers]
-)
+@pytest.mark.parametrize(("folder", "number"), FLIGHTS["lee"])
 def test_lee_logs(tmp_path, folder, number):
     path = shared(folder) / f"log{number}"
     stated = yaml.safe_load(path.with_name(f"info{number}.yaml").read_text())
@@ -81,7 +66,7 @@ def test_lee_logs(tmp_path, folder, number):
     assert gains == pytest.approx(expected, rel=0.03)
 
 
-@pytest.mark.parametrize("name", NANOBENCH)
+@pytest.mark.parametrize("name", FLIGHTS["nanobench"])
 def test_nanobench(name):
     imported = import_log(shared("nanobench") / f"{name}.csv.gz", "csv", "nanobench")
     check(imported, 0.9, 0.15)

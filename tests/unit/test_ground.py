@@ -117,23 +117,11 @@ def test_wrong_rows_are_refused(tmp_path, form, rows, message):
         import_log(path, form, tmp_path / "map.toml")
 
 
-# Folder, file, format, mapping -> seconds on the ground at the start and the end, by the motors'
-# outputs. NanoBench's mapping chooses heights.
-REAL = {
-    "Gecko": ("bf_gecko/btfl_002.bbl", "betaflight", None, 1.25, 0.0),
-    "6S acro": ("betaflight_acro_log/shortLog.BFL", "betaflight", None, 2.25, 0.0),
-    # PX4's own detector says so 0.8 s later.
-    "PX4": ("px4_h520/3DRFlight_1.ulg", "ulog", None, 0.0, 1.82),
-    "Crazyflie": ("crazyflie_rate_flights/seed00066_log3.csv.gz", "csv", "crazyflie_phoenix", 0, 0),
-    "NanoBench": ("nanobench/B8_star_fast_rep1.csv.gz", "csv", "nanobench", 0.0, 0.0),
-    "Crazyflie, motors": ("cf_arpl_motors/log15", "usd", "crazyflie_motors", 11.75, 7.7),
-}
-
-
-@pytest.mark.parametrize("name", REAL)
-def test_real_flights_lose_their_ground_and_nothing_else(name):
-    where, form, mapping, before_s, after_s = REAL[name]
-    flight = import_shared(where, form, mapping)
+@pytest.mark.parametrize(
+    ("where", "form", "mapping", "before_s", "after_s"), table("real_flights")["ground"]
+)
+def test_real_flights_lose_their_ground_and_nothing_else(where, form, mapping, before_s, after_s):
+    flight = import_shared(where, form, mapping or None)
     counts = re.findall(r"(\d+) of \d+ rows left out: on the ground", " ".join(flight.notes))
     left_out_s = sum(map(int, counts)) * np.median(np.diff(flight.log.time))
     # Some rows of the last log are lost.

@@ -16,10 +16,8 @@ def ramp(*lost: int, rows: int = 12, slope: float = 0.02) -> FlightLog:
     time = np.arange(rows) * 0.01
     u = np.outer(time / 0.01 * slope, [1.0, -1.0, 2.0, 0.0])
     q = Rotation.from_rotvec(np.outer(3.0 * time, [1.0, 0.0, 0.0])).as_quat(scalar_first=True)
-    log = FlightLog(
-        time, {"u": u, "q": q, "v": np.outer(time, [1.0, 2.0, 3.0])}, np.zeros(rows, int)
-    )
-    return log.select(~np.isin(np.arange(rows), lost))
+    channels = {"u": u, "q": q, "v": np.outer(time, [1.0, 2.0, 3.0])}
+    return FlightLog(time, channels, np.zeros(rows, int)).select(~np.isin(np.arange(rows), lost))
 
 
 # What is lost: in the middle, two in a row, two gaps side by side, next to both ends of the flight.
