@@ -110,7 +110,7 @@ def test_torques_of_motors_show_the_rotation_that_follows(tmp_path, number, from
 
 
 def test_px4():
-    check(import_shared("px4_h520/3DRFlight_1.ulg", "ulog"), 0.99, 0.02)
+    check(import_shared("px4_h520/3DRFlight_1.ulg", "ulog", None), 0.99, 0.02)
 
 
 # --- The diagnosis of a Crazyflie -----------------------------------------------------------------

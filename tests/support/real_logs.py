@@ -22,7 +22,7 @@ def shared(name: str) -> Path:
 
 
 @cache
-def import_shared(where: str, form: str, mapping: str | None = None) -> Imported:
+def import_shared(where: str, form: str, mapping: str | None) -> Imported:
     """Return a measured flight, imported once; where: its folder and file."""
     folder, _, file = where.partition("/")
     return import_log(shared(folder) / file, form, mapping)

@@ -255,7 +255,7 @@ def test_real_log_holds_what_another_decoder_found(tmp_path):
 
 def test_gecko_flies_without_a_mapping():
     """The first 14 frames change a frame that the decoder lost; smoothing overshoots full stick."""
-    imported = import_shared("bf_gecko/btfl_002.bbl", "betaflight")
+    imported = import_shared("bf_gecko/btfl_002.bbl", "betaflight", None)
     log = imported.log
     assert len(log) == 66000 and np.diff(log.time).max() < 0.005 and log["v_bat"].min() > 13.0
     assert imported.craft.max_rate_deg_s == pytest.approx((700.0, 700.0, 700.0))

@@ -155,7 +155,7 @@ def test_slow_topics_are_noted(topics, read):
 
 
 def test_a_real_hexacopter_is_named():
-    notes = " ".join(import_shared("px4_h520/3DRFlight_1.ulg", "ulog").notes)
+    notes = " ".join(import_shared("px4_h520/3DRFlight_1.ulg", "ulog", None).notes)
     assert "found a hexacopter (MAV_TYPE 13), not a quadcopter" in notes
     assert "u at 31.2 Hz, held" in notes
 
