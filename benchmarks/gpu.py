@@ -40,8 +40,8 @@ WHAT = (
 
 def rate_of(entry: Contestant) -> float:
     """Return the median rate of a contestant, amount per second."""
-    found = measure([entry._replace(clock=time.perf_counter)], REPEATS, warm_up=1)
-    return statistics.median(found[entry.name])
+    rates = measure([entry._replace(clock=time.perf_counter)], REPEATS, warm_up=1)
+    return statistics.median(rates[entry.name])
 
 
 def open_loop(keys: jax.Array) -> jax.Array:
@@ -55,10 +55,10 @@ def open_loop(keys: jax.Array) -> jax.Array:
     def fly(key: jax.Array, actions: jax.Array) -> jax.Array:
         _, state = env.reset(key, env.default_params)
 
-        def one(state: Any, action: jax.Array) -> tuple[Any, None]:
+        def step(state: Any, action: jax.Array) -> tuple[Any, None]:
             return env.step_env(key, state, action, env.default_params)[1], None
 
-        return jnp.stack(env.drone(jax.lax.scan(one, state, actions)[0]).pos_w)
+        return jnp.stack(env.drone(jax.lax.scan(step, state, actions)[0]).pos_w)
 
     return jax.jit(jax.vmap(fly))(keys, actions)
 
@@ -72,8 +72,8 @@ def agreement() -> str:
         with jax.default_device(device):
             keys = start_keys(0, NUM_FLIGHTS)
             ends.append(np.asarray(open_loop(keys)))
-            found = score(race_many(env, champion.policy, keys, 2500, 3))
-        rows.append([device.device_kind, f"{found.success:.1%}", f"{found.flying_lap_s:.4f}"])
+            races = score(race_many(env, champion.policy, keys, 2500, 3))
+        rows.append([device.device_kind, f"{races.success:.1%}", f"{races.flying_lap_s:.4f}"])
     apart_m = np.abs(ends[0] - ends[1]).max()
     return (
         report.table("the champion on | finish | flying lap (s)", rows)
@@ -90,11 +90,12 @@ def environments(most: int) -> str:
     rows = []
     for power in report.progress(range(10, most + 1, 2), "size"):
         rates = [
-            1e6 * rate_of(jax_contestant(one, one, 2**power, LENGTH, is_batch=False)) for one in IDS
+            1e6 * rate_of(jax_contestant(name, name, 2**power, LENGTH, is_batch=False))
+            for name in IDS
         ]
         rows.append([f"2^{power}", *(f"{rate:.3g}" for rate in rates), f"{0.01 * rates[0]:.3g}"])
     return report.table(
-        ["environments", *(f"{one}, decisions/s" for one in IDS), "simulated s/s"], rows
+        ["environments", *(f"{name}, decisions/s" for name in IDS), "simulated s/s"], rows
     )
 
 

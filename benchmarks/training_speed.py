@@ -80,10 +80,10 @@ def main(total_timesteps: float = Config.total_timesteps, repeats: int = 1) -> N
             rates[name].append(measure(trainer, options, is_tracked=options is DEFAULT_OPTIONS))
             print(f"{name}: {rates[name][-1]:,.0f} steps per CPU s", flush=True)
     rows = [
-        [name, f"{statistics.median(found):,.0f}", report.spread(found)]
-        for name, found in rates.items()
+        [name, f"{statistics.median(values):,.0f}", report.spread(values)]
+        for name, values in rates.items()
     ]
-    alone, watched = (statistics.median(found) for found in rates.values())
+    alone, watched = map(statistics.median, rates.values())
     cost = 1.0 - watched / alone
     limit = statistics.median(matrix_limit(trainer) for _ in range(LIMIT_REPEATS))
     figures = [

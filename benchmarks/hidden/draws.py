@@ -106,9 +106,9 @@ def _per_axis(
 
 def _oscillator(size: float, rng: Rng) -> Values:
     values: Values = {}
-    for name, own in _per_axis()(size, rng).items():
+    for name, period in _per_axis()(size, rng).items():
         damping = float(rng.uniform(*ZETA))
-        values |= {f"{name}_s": 2.0 * damping * own, f"{name}_damping": damping}
+        values |= {f"{name}_s": 2.0 * damping * period, f"{name}_damping": damping}
     return values
 
 
@@ -174,10 +174,10 @@ def draw_base(rng: Rng) -> Truth:
     span = full - idle
     # With s = (1 + u) / 2: idle + span ((1 - curved) s + curved s^2 + cubic (u^3 - u)) at the
     # reference.
-    one = idle + span * ((1.0 - curved) / 2.0 + curved / 4.0)
+    constant = idle + span * ((1.0 - curved) / 2.0 + curved / 4.0)
     linear = span * ((1.0 - curved) / 2.0 + curved / 2.0 - cubic)
     coeffs = (
-        one - volt * REFERENCE_V,
+        constant - volt * REFERENCE_V,
         linear - both * REFERENCE_V,
         span * curved / 4.0,
         span * cubic,

@@ -70,7 +70,7 @@ def _attempt(
         if now != last:
             sticks, last = pilot.command(drone, planned[now]), now
         state = (sticks, *drone.tracked, drone.acc_w, *drone.felt, (drone.battery_v,))
-        rows.append([value for vector in state for value in vector])
+        rows.append(np.concatenate(state))
         drone.step(sticks)
     columns = np.split(np.array(rows), np.cumsum(list(CHANNELS.values()))[:-1], axis=1)
     return dict(zip(CHANNELS, columns, strict=True))
@@ -104,12 +104,13 @@ def imu_readings(
     offset_b = _vector(truth, "imu_offset", 0.0)
     if truth.motion != "fine":
         slopes_b = np.diff(rates_b, axis=0, prepend=rates_b[:1]) / truth.step_s
-    force_b = (
-        force_b + np.cross(rates_b, np.cross(rates_b, offset_b)) + np.cross(slopes_b, offset_b)
+    centripetal_b = np.cross(rates_b, np.cross(rates_b, offset_b))
+    force_b = force_b + centripetal_b + np.cross(slopes_b, offset_b)
+    scale, bias = (
+        _vector(truth, "accelerometer_scale", 1.0),
+        _vector(truth, "accelerometer_bias", 0.0),
     )
-    force_b = _vector(truth, "accelerometer_scale", 1.0) * force_b + _vector(
-        truth, "accelerometer_bias", 0.0
-    )
+    force_b = scale * force_b + bias
     rates_b = _vector(truth, "gyro_scale", 1.0) * rates_b + _vector(truth, "gyro_bias", 0.0)
     latency_s = truth.effects.get("imu_latency", {}).get("latency_s", 0.0)
     return _delayed(truth, force_b, latency_s), _delayed(truth, rates_b, latency_s)

@@ -48,12 +48,8 @@ BEGIN_S = 0.5  # of hover before something begins
 START_SPREAD_M = 5.0
 HIGHER_M = 1.5  # of the start, per repeated attempt
 # Each gain is a share of the inner loop's, so that no loop is faster than the one inside it.
-ATTITUDE_PER_LAG, VELOCITY_PER_ATTITUDE, POSITION_PER_VELOCITY, LEARN_PER_VELOCITY = (
-    0.4,
-    0.3,
-    0.35,
-    0.3,
-)
+ATTITUDE_PER_LAG, VELOCITY_PER_ATTITUDE = 0.4, 0.3
+POSITION_PER_VELOCITY, LEARN_PER_VELOCITY = 0.35, 0.3
 QUICKEST_ATTITUDE, QUICKEST_HEIGHT = 12.0, 5.0  # 1/s
 YAW_GAIN, MOST_YAW_RATE = 2.5, 1.6  # 1/s, rad/s
 MOST_TILTED = math.radians(65.0)  # of the commanded thrust
@@ -61,11 +57,7 @@ MOST_UP, MOST_DOWN = 14.0, 6.0  # m/s^2
 MOST_LESSON = 2.0  # m/s, limit of the speed error in the integrator
 MOST_SPEED, MOST_CORRECTION, MOST_LEARNT = 18.0, 4.0, 5.0  # m/s, m/s, m/s^2
 UPRIGHT = 0.3  # cosine of the tilt beyond which the heading is undefined
-TINY, LEAST_SLOPE, CUBE_POWER = (
-    1e-9,
-    1.0,
-    3.0,
-)  # m/s^2; N per stick; of the thrust curve's last term
+TINY, MIN_SLOPE = 1e-9, 1.0  # m/s^2; N per stick
 TREMBLE, TREMBLE_S = 0.01, 0.1  # of sticks that are held still, and its time constant, s
 USUAL_TURN = 0.25  # of a stick, change that a slew limit stretches
 NEWTON_STEPS = 4  # from the previous stick, which is close
@@ -194,9 +186,8 @@ def wave(axis: int, amplitude: float, rng: Rng) -> np.ndarray:
     name, sign = rng.choice(["doublet", "chirp", "pulses"]), rng.choice([-1.0, 1.0])
     if name == "chirp":
         time = np.arange(steps_of(CHIRP_S)) * DT_S
-        shape = np.cos(
-            2.0 * np.pi * (CHIRP_FROM_HZ * time + 0.5 * rng.uniform(*CHIRP_HZ_PER_S) * time**2)
-        )
+        cycles = CHIRP_FROM_HZ * time + 0.5 * rng.uniform(*CHIRP_HZ_PER_S) * time**2
+        shape = np.cos(2.0 * np.pi * cycles)
     else:
         steps = steps_of(rng.uniform(*(QUICK_PULSE_S if amplitude >= QUICK else PULSE_S)))
         gap = 0 if name == "doublet" else steps
@@ -215,10 +206,8 @@ def manoeuvre(sketch: Sketch, axis: int, amplitude: float) -> None:
 def flip(sketch: Sketch) -> None:
     """Append a jump, about one turn at full stick, and time to recover."""
     rng = sketch.rng
-    jump, turn = (
-        np.full((steps_of(JUMP_S), 4), np.nan),
-        np.zeros((steps_of(rng.uniform(*FLIP_S)), 4)),
-    )
+    jump = np.full((steps_of(JUMP_S), 4), np.nan)
+    turn = np.zeros((steps_of(rng.uniform(*FLIP_S)), 4))
     jump[:, 3] = JUMP_STICK
     turn[:, rng.integers(2)], turn[:, 3] = rng.choice([-1.0, 1.0]), rng.uniform(*FLIP_STICK)
     sketch.hands_on(np.concatenate([jump, turn]))
@@ -385,8 +374,8 @@ class Pilot:
         _, linear, square, cube, _, both = self._truth.coeffs
         stick = self._stick
         for _ in range(NEWTON_STEPS):
-            slope = linear + both * battery_v + stick * (2.0 * square + CUBE_POWER * cube * stick)
-            stick += (thrust_n - self._truth.thrust(stick, battery_v)) / max(slope, LEAST_SLOPE)
+            slope = linear + both * battery_v + stick * (2.0 * square + 3.0 * cube * stick)
+            stick += (thrust_n - self._truth.thrust(stick, battery_v)) / max(slope, MIN_SLOPE)
             stick = max(-1.0, min(1.0, stick))
         self._stick = stick
         return stick
