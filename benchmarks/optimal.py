@@ -24,6 +24,7 @@ import casadi
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from flytrack_env import state as layout
 from flytrack_env.dynamics import ModelParameters, advance
@@ -39,9 +40,11 @@ SHORTEST_SHARE, LONGEST_SHARE = 0.2, 5.0  # of a free step's length, of its firs
 LOOSE_UNIT = 1.1  # bound of a component of a unit quaternion, which the step itself normalises
 FRACTION_EDGE = 0.02  # of a step: rounding could put a node on a gate's plane on either side of it
 PATH_POINTS = 400  # per segment
+GRAVITY = np.array([0.0, 0.0, 9.80665])  # m/s^2, of first guesses, whatever the model's
+UPSIDE_DOWN = 1e-6  # norm of a quaternion below which there is no shortest turn
 COARSE_STEP_M = 0.6  # of the path, per step
 FEWEST_STEPS = 4  # of a coarse segment
-SPEEDS_M_S = (10.0, 16.0)  # of first guesses
+SPEEDS_M_S = (10.0, 16.0)  # of first guesses: gentle, and fast enough to turn upside down
 # Of first guesses, None along the path; quarter turns are nearly equivalent.
 HEADINGS_RAD = (None, 0.0, 0.25 * np.pi)
 MOST_SHIFTS = 8  # rounds in which gates move to an adjacent step
@@ -316,29 +319,54 @@ def segment_lengths(task: Task) -> np.ndarray:
     return np.linalg.norm(np.diff(_paths(task), axis=1), axis=-1).sum(axis=1)
 
 
+def _along(points: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """Return points at shares of the length of a polyline."""
+    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    return np.stack([np.interp(shares * lengths[-1], lengths, axis) for axis in points.T], axis=1)
+
+
+def _attitudes(thrust_w: np.ndarray, velocity: np.ndarray, heading_rad: float | None) -> np.ndarray:
+    """Return attitudes (N, 4) with body z along thrust_w and a heading, without jumps in sign."""
+    x, y, z = (thrust_w / np.linalg.norm(thrust_w, axis=1, keepdims=True)).T
+    heading = np.arctan2(velocity[:, 1], velocity[:, 0])
+    if heading_rad is not None:
+        heading = np.full(len(x), heading_rad)
+    # The shortest turn from the world's z to the axis, after a turn about z by the heading.
+    tilt = np.stack([np.maximum(1.0 + z, UPSIDE_DOWN), -y, x, np.zeros(len(x))], axis=1)
+    turn = Rotation.from_quat(tilt, scalar_first=True) * Rotation.from_euler("z", heading[:, None])
+    quats = turn.as_quat(scalar_first=True)
+    is_flipped = np.sum(quats[1:] * quats[:-1], axis=1) < 0.0
+    quats[1:] *= np.cumprod(np.where(is_flipped, -1.0, 1.0))[:, None]
+    return quats
+
+
 def first_guess(
     task: Task, counts: np.ndarray, speed_m_s: float, heading_rad: float | None
 ) -> Flight:
-    """Return an upright flight along the path at one speed, m/s, which obeys no law of motion.
+    """Return a flight along the path at one speed, m/s, with a heading, rad, or along the path.
 
-    counts: (num_gates,), steps of each segment. heading_rad: None along the path.
+    counts: (num_gates,), steps of each segment. The flight satisfies no equation of motion.
     """
     ways = _paths(task)
-    rows = [np.linspace(0, PATH_POINTS - 1, n, endpoint=False).astype(int) for n in counts]
-    pieces = [way[points] for way, points in zip(ways, rows, strict=True)]
+    steps_s = segment_lengths(task) / speed_m_s / counts
+    pieces = [_along(way, np.arange(n) / n) for way, n in zip(ways, counts, strict=True)]
     positions = np.concatenate([*pieces, ways[-1][-1:]])
     states = np.zeros((len(positions), layout.STATE_SIZE))
     commands = np.zeros((len(positions) - 1, layout.ACTION_SIZE))
-    steps_s = segment_lengths(task) / speed_m_s / counts
     guess = Flight(states, commands, steps_s, counts, np.ones(len(counts)))
-    velocity = np.gradient(positions, guess.node_times_s, axis=0)
-    heading = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0]))
-    if heading_rad is not None:
-        heading = np.full(len(states), heading_rad)
+    times = guess.node_times_s
+    velocity = np.gradient(positions, times, axis=0)
+    acceleration = np.gradient(velocity, times, axis=0)
+    if task.is_lap:
+        velocity[0] = velocity[-1] = 0.5 * (velocity[0] + velocity[-1])
     states[:, layout.POSITION], states[:, layout.VELOCITY] = positions, velocity
-    states[:, layout.QUATERNION][:, 0] = np.cos(0.5 * heading)
-    states[:, layout.QUATERNION][:, 3] = np.sin(0.5 * heading)
+    states[:, layout.ACCELERATION] = acceleration
+    states[:, layout.QUATERNION] = _attitudes(acceleration + GRAVITY, velocity, heading_rad)
     states[:, layout.BATTERY] = task.start[layout.BATTERY]
+    if not task.is_lap:
+        states[0] = task.start
+        if states[0, layout.QUATERNION] @ states[1, layout.QUATERNION] < 0.0:
+            states[1:, layout.QUATERNION] *= -1.0
     return guess
 
 

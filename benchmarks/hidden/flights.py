@@ -62,7 +62,8 @@ def _attempt(
     share = truth.outside.shape.get("at_share", 0.0) if truth.outside is not None else 0.0
     centre_w = tuple(moments[int(share * (len(moments) - 1))].pos_w.tolist())
     drone = HiddenDrone(truth, start, rng, seconds + SETTLE_S, centre_w, SETTLE_S)
-    pilot, rows, last = Pilot(truth, rng), [], -1
+    pilot, last = Pilot(truth, rng), -1
+    rows: list[np.ndarray] = []
     planned = [*settling, *moments]
     for number in range(round(len(planned) * DT_S / truth.step_s)):
         # The pilot sends a command every 10 ms, or with every row where these are further apart.
