@@ -34,13 +34,9 @@ TOLERANCE_S = 2e-3
 
 
 @pytest.fixture(scope="module")
-def checkpoint_path(tmp_path_factory):
-    return write_checkpoint(tmp_path_factory.mktemp("checkpoint") / "policy.safetensors")
-
-
-@pytest.fixture(scope="module")
-def checkpoint(checkpoint_path):
-    return load_checkpoint(checkpoint_path)
+def checkpoint(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("checkpoint")
+    return load_checkpoint(write_checkpoint(folder / "policy.safetensors"))
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +83,7 @@ def test_every_step_kept_or_not_is_the_same_flight(flights, raced):
 
 
 @pytest.mark.parametrize("flown_by", slow_but(["black box"], ["black box", "plants"]))
-def test_command_flies_many(flown_by, checkpoint_path, tmp_path, monkeypatch, capsys, flights):
+def test_command_flies_many(flown_by, checkpoint, tmp_path, monkeypatch, capsys, flights):
     outcomes = []
 
     def race(*given):
@@ -101,7 +97,7 @@ def test_command_flies_many(flown_by, checkpoint_path, tmp_path, monkeypatch, ca
         first = jax.tree.map(lambda leaf: leaf[0], flights)  # one program less to compile
         monkeypatch.setattr(evaluate.Report, "_fly_first", lambda *_: first)
     out, file = tmp_path / "flight.npy", tmp_path / "new" / "report.json"
-    where = ["--checkpoint", checkpoint_path, "--out", out, "--json", file]
+    where = ["--checkpoint", checkpoint.path, "--out", out, "--json", file]
     run("eval", *where, "--steps", 120, "--track", "split_s", "--ghost", *more)
     steps, report, text = outcomes[0].steps, json.loads(file.read_text()), capsys.readouterr().out
     assert report["flights"] == report["success"]["of"] == 6 and report["track"] == "split_s"
@@ -121,7 +117,7 @@ def test_command_flies_many(flown_by, checkpoint_path, tmp_path, monkeypatch, ca
 
 
 def test_a_single_flight_as_json_and_docs_name_every_key(
-    checkpoint_path, tmp_path, monkeypatch, capsys, flights, raced
+    checkpoint, tmp_path, monkeypatch, capsys, flights, raced
 ):
     index = int(np.argmax(raced.is_complete()))
     flight = jax.tree.map(lambda leaf: leaf[index], flights)
@@ -129,7 +125,7 @@ def test_a_single_flight_as_json_and_docs_name_every_key(
     out, file, recording = (tmp_path / name for name in ("f.npy", "report.json", "f.rrd"))
     has_rerun = importlib.util.find_spec("rerun") is not None
     where = ["--out", out, "--json", file, *["--rrd", recording] * has_rerun]
-    run("eval", "--checkpoint", checkpoint_path, "--steps", NUM_STEPS, *where)
+    run("eval", "--checkpoint", checkpoint.path, "--steps", NUM_STEPS, *where)
     text, report = capsys.readouterr().out, json.loads(file.read_text())
     if has_rerun:
         assert report["recording"] == str(recording)

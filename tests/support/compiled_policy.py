@@ -7,17 +7,8 @@ import numpy as np
 
 from flytrack_env.state import ACTION_SIZE, BATTERY, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 
-FLAGS = (
-    "-std=c99",
-    "-pedantic",
-    "-Wall",
-    "-Wextra",
-    "-Werror",
-    "-Wconversion",
-    "-O2",
-    "-shared",
-    "-fPIC",
-)
+WARNINGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Wconversion")
+FLAGS = (*WARNINGS, "-O2", "-shared", "-fPIC")
 BEYOND = 1.2  # times the limits of the observation, so that clipping is compared too
 LOOPS = """
 #include "policy.h"
@@ -70,14 +61,11 @@ class CompiledPolicy:
         return applied
 
     def _call(self, name, *arguments):
-        kept = [
-            np.ascontiguousarray(value) if np.ndim(value) else int(value) for value in arguments
+        pointers = [
+            value if isinstance(value, int) else value.ctypes.data_as(ctypes.c_void_p)
+            for value in arguments
         ]
-        given = [
-            value if isinstance(value, int) else ctypes.c_void_p(value.ctypes.data)
-            for value in kept
-        ]
-        getattr(self.functions, name)(*given)
+        getattr(self.functions, name)(*pointers)
 
 
 def states_in_box(policy, count, seed):
