@@ -60,6 +60,18 @@ def test_round_trip(path, params):
     checkpoint.check_fits(FlyTrack())
 
 
+@pytest.mark.parametrize("trained_in_64", [False, True])
+@pytest.mark.parametrize("loaded_in_64", [False, True])
+def test_checkpoints_load_in_either_precision(tmp_path, trained_in_64, loaded_in_64):
+    with jax.enable_x64(trained_in_64):
+        observation = jnp.zeros((1, OBSERVATION_SIZE))
+        params = make_network(CONFIG).init(jax.random.key(0), observation)
+        save_checkpoint(tmp_path / "a.safetensors", params, CONFIG, DESCRIPTION, TRAINING)
+    with jax.enable_x64(loaded_in_64):
+        loaded = load_checkpoint(tmp_path / "a.safetensors").params
+    jax.tree.map(np.testing.assert_allclose, loaded, params)
+
+
 def test_observations_that_do_not_fit_are_refused(tmp_path, params):
     path, env = tmp_path / "b.safetensors", FlyTrack()
     layout = observation_layout(env)
