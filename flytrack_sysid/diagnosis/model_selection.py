@@ -347,7 +347,7 @@ def _best_instead(
     state: SearchState, model: FittedModel, fields: Sequence[str]
 ) -> tuple[SearchState, FittedModel | None]:
     """Return the best model with base parameters held and at most one more effect, if better."""
-    problem, held = state.problem, state.held
+    given, problem, held = state, state.problem, state.held
     state = replace(state, held=(*held, *(Held(field, "") for field in fields)))
     less = state.fitted(model.candidates, problem.at_start(model.vector, fields))
     state, nearby = state.linearized(less.vector)
@@ -362,7 +362,7 @@ def _best_instead(
             state, determined = is_determined(state, trial, one.candidate.fields)
             best, limit = (trial, cost) if determined else (best, limit)
     if best is None:
-        return replace(state, held=held), None
+        return given, None  # and its slopes, of the model without anything held
     effect = "".join(one.effect for one in best.candidates if one not in model.candidates)
     return replace(state, held=(*held, *(Held(field, effect) for field in fields))), best
 
