@@ -2,7 +2,9 @@
 
 from flytrack_env.extras import check_installed
 
-check_installed("sysid", "identification and diagnosis", "scipy", "matplotlib", "tqdm")
+check_installed(
+    "sysid", "identification and diagnosis", "scipy", "threadpoolctl", "matplotlib", "tqdm"
+)
 
 from flytrack_sysid.collect import CollectError, collect
 from flytrack_sysid.diagnosis import Diagnosis, DiagnosisError, diagnose, diagnose_change

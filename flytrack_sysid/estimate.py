@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_limits
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid import parameters
@@ -246,7 +247,8 @@ def _covariance(found: Linearization) -> np.ndarray:
     problem, white = found.problem, found.white * robust_weight(found.white)
     bread = solve(found.total, np.eye(len(found.total)))
     used = problem.counts.any(axis=(2, 3))
-    pulls = np.einsum("prlak,rlak->rlp", found.columns, white, optimize=True)[used]
+    columns = problem.whiten(found.slopes.columns)
+    pulls = np.einsum("prlak,rlak->rlp", columns, white, optimize=True)[used]
     pieces, piece = np.unique(problem.lanes.record.piece[used], return_inverse=True)
     by_piece = np.zeros((len(pieces), len(bread)))
     np.add.at(by_piece, piece, pulls)
@@ -262,7 +264,7 @@ def _acting(found: Linearization, free: tuple[str, ...], may_be_idle: bool) -> l
     """
     if not np.isfinite(found.columns).all() or not np.isfinite(found.cost):
         raise FitError("the fit diverged: residuals are not finite")
-    acts = np.flatnonzero(np.abs(found.columns).max(axis=(1, 2, 3, 4), initial=0.0))
+    acts = np.flatnonzero(np.abs(found.columns).max(axis=(0, 2), initial=0.0))
     names = [found.problem.names[found.places[column]] for column in acts]
     idle = [name for name in free if name not in names]
     if idle and not may_be_idle:
@@ -304,7 +306,7 @@ def estimate(
     Raises:
         FitError: a search that diverged, or a parameter on which nothing depends.
     """
-    with jax.enable_x64(True):
+    with threadpool_limits(1, "blas"), jax.enable_x64(True):
         model: Any = jax.tree.map(lambda leaf: np.asarray(leaf, float), start)
         noise = FIRST_NOISE
         for number, steps in enumerate(LAST_STEPS):

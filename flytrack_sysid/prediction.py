@@ -13,7 +13,7 @@ from flytrack_env.state import Action, Drone
 from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
 from flytrack_sysid.log_voltage import with_voltage
 from flytrack_sysid.record import Filled, Record, is_applied_certain, record_of
-from flytrack_sysid.replay import Step, replay
+from flytrack_sysid.replay import Step, replay, start_replay
 
 # For effects that remember: what they remembered when a segment began is not known.
 SETTLING_S = 0.5
@@ -111,7 +111,8 @@ def _step_from_every_row(
     def observe(step: Step, _: None) -> tuple[Any, ...]:
         return step.before, step.memories, step.after, step.moved.context.force_b
 
-    return replay(model, record, gyro_b, observe, is_gyro_fed=True)
+    state = start_replay(model, jax.tree.map(operator.itemgetter(0), record))
+    return replay(model, state, record, gyro_b, observe, is_gyro_fed=True)[1]
 
 
 def predict(model: ModelParameters, filled: Filled) -> Prediction:

@@ -16,6 +16,7 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, Moved, body_rates, move
 from flytrack_env.effects import MOST_STEPS, at_row, start_memories
+from flytrack_env.fusion import one_kernel
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_sysid.record import Record
@@ -33,6 +34,7 @@ class Step(NamedTuple):
     before: Drone
     memories: tuple[Any, ...]
     moved: Moved
+    model: ModelParameters
 
     @property
     def after(self) -> Drone:
@@ -58,41 +60,64 @@ def measured_drone(row: Record, applied: Action, rates_b: Vec3) -> Drone:
     )
 
 
+class ReplayState(NamedTuple):
+    """What a replay carries from row to row; memories: of the effects."""
+
+    applied: Action
+    rates_b: Vec3
+    memories: tuple[Any, ...]
+
+
+def start_replay(model: ModelParameters, row: Record) -> ReplayState:
+    """Return a state to begin with at a row at which a flight begins."""
+    drone = measured_drone(row, Action(*row.applied), Vec3(*jnp.zeros_like(row.vel_w)))
+    memories = start_memories(model.effects, drone, MOST_STEPS)
+    return ReplayState(drone.applied, drone.rates_b, memories)
+
+
 def replay(
     model: ModelParameters,
+    state: ReplayState,
     record: Record,
-    gyro_b: jax.Array | np.ndarray | None,
+    gyro_b: jax.Array | np.ndarray,
     observe: Callable[[Step, Any], Any],
     extras: Any = None,
     is_gyro_fed: bool = False,
-) -> Any:
-    """Return what ``observe`` makes of a model's step from every row; differentiable in the model.
+) -> tuple[ReplayState, Any]:
+    """Return the state after some rows, and what ``observe`` makes of the model's step from each.
 
-    gyro_b: (num_rows, 3) rad/s, with which a flight starts, or every step if ``is_gyro_fed``;
-    without a gyro a flight starts with the rates of the sticks. observe: called with a step and the
-    row's part of ``extras``, a tree of leaves (num_rows, ...). In float64 inside
-    ``jax.enable_x64(True)``.
+    Differentiable in the model. In float64 inside ``jax.enable_x64(True)``.
+
+    Args:
+        model: what is replayed.
+        state: before the first row; of no effect where a flight begins there.
+        record: rows of a log.
+        gyro_b: (num_rows, 3) rad/s, with which a flight starts, or every step if ``is_gyro_fed``;
+            where it is NaN, a flight starts with the rates of the sticks.
+        observe: called with a step and the row's part of ``extras``.
+        extras: a tree of leaves (num_rows, ...).
+        is_gyro_fed: whether every step starts with the measured rates.
     """
 
-    def next_row(carry: tuple[Any, ...], inputs: tuple[Any, ...]) -> tuple[Any, Any]:
+    def next_row(
+        model: ModelParameters, state: ReplayState, inputs: tuple[Any, ...]
+    ) -> tuple[ReplayState, Any]:
         row, gyro, extra = inputs
-        applied, rates_b, memories = carry
-        applied = where_true(row.begins | row.is_applied_known, Action(*row.applied), applied)
-        first_b = body_rates(applied, model.max_rate) if gyro is None else Vec3(*gyro)
-        rates_b = first_b if is_gyro_fed else where_true(row.begins, first_b, rates_b)
+        applied = where_true(row.begins | row.is_applied_known, Action(*row.applied), state.applied)
+        steady_b = body_rates(applied, model.max_rate)
+        first_b = where_true(jnp.isnan(gyro[0]), steady_b, Vec3(*gyro))
+        rates_b = first_b if is_gyro_fed else where_true(row.begins, first_b, state.rates_b)
         before = measured_drone(row, applied, rates_b)
         # As logged, which it is where a flight begins: past commands then depend on no model of a
         # batch.
         begun = before._replace(applied=Action(*row.applied))
         memories = where_true(
-            row.begins, start_memories(model.effects, begun, MOST_STEPS), memories
+            row.begins, start_memories(model.effects, begun, MOST_STEPS), state.memories
         )
         memories = at_row(memories, row.time_s)
         moved = move(before, memories, Action(*row.command), row.step_s, model)
-        later = moved.after.applied, moved.after.rates_b, moved.memories
-        return later, observe(Step(row, before, memories, moved), extra)
+        later = ReplayState(moved.after.applied, moved.after.rates_b, moved.memories)
+        return later, observe(Step(row, before, memories, moved, model), extra)
 
-    first = jax.tree.map(lambda column: column[0], record)
-    drone = measured_drone(first, Action(*first.applied), Vec3(*jnp.zeros_like(first.vel_w)))
-    start = (drone.applied, drone.rates_b, start_memories(model.effects, drone, MOST_STEPS))
-    return jax.lax.scan(next_row, start, (record, gyro_b, extras))[1]
+    kernel = partial(one_kernel(next_row), model)
+    return jax.lax.scan(kernel, state, (record, gyro_b, extras))

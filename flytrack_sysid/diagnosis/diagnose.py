@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.motion import Motion
@@ -87,7 +88,8 @@ def diagnose(
     Raises:
         DiagnosisError: a log with neither gyro nor attitude; ``held_out`` of another shape.
     """
-    with jax.enable_x64(True):
+    # Matrices are small: threads of BLAS wait for each other longer than they work.
+    with threadpool_limits(1, "blas"), jax.enable_x64(True):
         parts = split(log, model, held_out, motion)
         selection = select_model(parts)
         # Drones, and who is late, are told by their clocks; two simulator's steps only by what they

@@ -28,7 +28,7 @@ def gain_of(problem: Problem, as_logged: Lanes, vector: np.ndarray) -> float:
         judged = replace(one, lanes=one.lanes._replace(counts=counts)).with_noise(problem.noise)
         return robust_square(judged.whitened_residuals(vector)[0])
 
-    return cost(replace(problem, lanes=as_logged, late=None)) - cost(problem)
+    return cost(replace(problem.with_lanes(as_logged), late=None)) - cost(problem)
 
 
 def with_late_poses(

@@ -5,8 +5,6 @@ explains nearly all that smooth functions of everything would. It has to predict
 better in all, and no worse at any horizon where these tell anything.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from flytrack_env.effects.grammar import Law
@@ -84,7 +82,7 @@ def thinned_problem(problem: Problem) -> Problem:
     lanes = thinned(problem.lanes, max(MOST_ROWS // len(problem.lanes.row), 2))
     if lanes is problem.lanes or problem.late is not None or problem.noise is None:
         return problem
-    return replace(problem, lanes=lanes).with_noise(problem.noise)
+    return problem.with_lanes(lanes).with_noise(problem.noise)
 
 
 def _predicts(

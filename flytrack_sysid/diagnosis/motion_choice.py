@@ -166,7 +166,7 @@ def _with_later_poses(seen: Seen, trial: Trial) -> Moves:
     linearization = Linearization(problem, problem.slopes(vector, _places(problem, moves)))
     root = np.sqrt(robust_weight(linearization.white))
     column = problem.whiten(np.where(problem.counts & later.counts, change, 0.0))
-    own, rest = blocks_of(column * root)[:, 0], blocks_of(linearization.columns * root)
+    own, rest = blocks_of(column * root)[:, 0], linearization.columns * blocks_of(root)[:, None]
     across = np.einsum("bpn,bn->p", rest, own)
     share = solve(linearization.total, across)
     information = float(np.sum(own**2) - across @ share)

@@ -15,12 +15,15 @@ nothing wanders, a level counts from the first row to the last; where much wande
 increments do.
 """
 
+from functools import partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from flytrack_env.fusion import one_kernel
 from flytrack_sysid.diagnosis.lanes import NUM_AXES, Lanes
 
 # Variance of a level at its first row, over that of its noise: its first innovation is about 0.
@@ -34,6 +37,8 @@ TAU_RANGE_S = (0.02, 5.0)
 FIRST_DAMPING, MORE, LESS = 1e-2, 10.0, 0.2
 MOST_ROUNDS = 12
 ENOUGH = 1.0  # of minus twice the log likelihood: the error of one parameter
+# Sizes of the compiled programs: rows of lanes, and models, at a time.
+NUM_ROWS, NUM_LANES, NUM_MODELS = 200, 8, 8
 OUTLIER = 4.0  # innovations beyond count by their size, not its square
 
 
@@ -54,79 +59,190 @@ class Noise(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """The filter of a noise, (rows, lanes, NUM_AXES) each; direct before level."""
+    """The filter of a noise at every row, (..., NUM_AXES) each; direct channels before levels.
 
-    keep: jax.Array
-    push: jax.Array
-    direct_d: jax.Array
-    direct_e: jax.Array
-    direct_size: jax.Array
-    level_d: jax.Array
-    level_e: jax.Array
-    level_size: jax.Array
+    keep, push: share of the disturbance that is left after a step, and what it adds to the error of
+    the level. direct_d, direct_e, level_d, level_e: gains of an innovation. direct_scale,
+    level_scale: one over the standard deviations of the innovations.
+    """
 
-
-def make_gains(noise: Noise, step_s: jax.Array, is_known: jax.Array, counts: jax.Array) -> Gains:
-    """Return the gains; step_s (rows, lanes) to the row, counts (rows, lanes, NUM_AXES, 2) bool."""
-
-    def row(carry: tuple[Any, ...], inputs: tuple[Any, ...]) -> tuple[Any, Any]:
-        var_e, cov, var_d = carry
-        dt, joined, counting, keep = inputs
-        dt = dt[:, None]
-        push = noise.coupling * dt
-        stationary = noise.disturbance**2
-        later_d = jnp.where(joined, keep**2 * var_d + stationary * (1.0 - keep**2), stationary)
-        later_cov = jnp.where(joined, keep * cov + push * later_d, 0.0)
-        walked = var_e + 2.0 * push * keep * cov + push**2 * later_d + noise.wander**2 * dt
-        later_e = jnp.where(joined, walked, UNKNOWN_START * noise.level**2)
-        size = later_d + noise.direct**2
-        inverse = counting[..., 0] / size
-        direct_d, direct_e, direct_size = later_d * inverse, later_cov * inverse, size
-        later_e, later_cov, later_d = (
-            later_e - direct_e * later_cov,
-            later_cov - direct_e * later_d,
-            later_d - direct_d * later_d,
-        )
-        size = later_e + noise.level**2
-        inverse = counting[..., 1] / size
-        level_d, level_e, level_size = later_cov * inverse, later_e * inverse, size
-        carry = (
-            later_e - level_e * later_e,
-            later_cov - level_e * later_cov,
-            later_d - level_d * later_cov,
-        )
-        keep, push = jnp.where(joined, keep, 0.0), jnp.where(joined, push, 0.0)
-        return carry, Gains(
-            keep, push, direct_d, direct_e, direct_size, level_d, level_e, level_size
-        )
-
-    keep = jnp.exp(-step_s[..., None] / noise.tau)
-    by_row = (step_s, is_known, counts.astype(step_s.dtype), keep)
-    nothing = jnp.zeros((step_s.shape[1], NUM_AXES))
-    return jax.lax.scan(row, (nothing, nothing, nothing), by_row)[1]
+    keep: Any
+    push: Any
+    direct_d: Any
+    direct_e: Any
+    direct_scale: Any
+    level_d: Any
+    level_e: Any
+    level_scale: Any
 
 
-def innovations(gains: Gains, increments: jax.Array, counts: jax.Array) -> jax.Array:
-    """Return residuals (rows, lanes, axes, 2) as innovations of variance 1; 0 if not counted."""
+class Variances(NamedTuple):
+    """Covariance of the filter's state: error of the level, with the disturbance, disturbance."""
 
-    def row(carry: tuple[Any, ...], inputs: tuple[Any, ...]) -> tuple[Any, Any]:
-        sum_e, wandered, disturbed = carry
-        values, gain, counting = inputs
-        level = sum_e + values[..., 1]
-        disturbed = gain.keep * disturbed
-        wandered = wandered + gain.push * disturbed
-        direct = (values[..., 0] - disturbed) * counting[..., 0]
-        disturbed, wandered = disturbed + gain.direct_d * direct, wandered + gain.direct_e * direct
-        off = (level - wandered) * counting[..., 1]
-        later = level, wandered + gain.level_e * off, disturbed + gain.level_d * off
-        sized = jnp.stack(
-            [direct / jnp.sqrt(gain.direct_size), off / jnp.sqrt(gain.level_size)], axis=-1
-        )
-        return later, sized
+    level: Any
+    across: Any
+    disturbance: Any
 
-    nothing = jnp.zeros(increments.shape[1:3])
-    by_row = (increments, gains, counts.astype(increments.dtype))
-    return jax.lax.scan(row, (nothing, nothing, nothing), by_row)[1]
+
+class Conditions(NamedTuple):
+    """What the filter needs to know of rows besides their residuals; floats.
+
+    step_s: (..., 1), since the row before. is_known: (..., NUM_AXES), 1 where the row continues a
+    flight and no lost command acts. counts: (..., NUM_AXES, 2), 1 for what is judged.
+    """
+
+    step_s: Any
+    is_known: Any
+    counts: Any
+
+
+def gains_of_row(
+    noise: "Noise", variances: Variances, row: Conditions, keep: Any
+) -> tuple[Variances, Gains]:
+    """Return the covariance after a row, and the gains at it; keep: exp(-step / tau)."""
+    joined, new = row.is_known, 1.0 - row.is_known
+    stationary = noise.disturbance * noise.disturbance
+    push = noise.coupling * row.step_s
+    d = joined * (keep * keep * variances.disturbance - keep * keep * stationary) + stationary
+    across = joined * (keep * variances.across + push * d)
+    walk = noise.wander * noise.wander * row.step_s
+    e = variances.level + 2.0 * push * keep * variances.across + push * push * d + walk
+    e = joined * e + new * UNKNOWN_START * noise.level * noise.level
+    direct_size = d + noise.direct * noise.direct
+    inverse = row.counts[..., 0] / direct_size
+    direct_d, direct_e = d * inverse, across * inverse
+    e, across, d = e - direct_e * across, across - direct_e * d, d - direct_d * d
+    level_size = e + noise.level * noise.level
+    inverse = row.counts[..., 1] / level_size
+    level_d, level_e = across * inverse, e * inverse
+    later = Variances(e - level_e * e, across - level_e * across, d - level_d * across)
+    gains = Gains(
+        keep=joined * keep,
+        push=joined * push,
+        direct_d=direct_d,
+        direct_e=direct_e,
+        direct_scale=jax.lax.rsqrt(direct_size),
+        level_d=level_d,
+        level_e=level_e,
+        level_scale=jax.lax.rsqrt(level_size),
+    )
+    return later, gains
+
+
+class Filtered(NamedTuple):
+    """State of the filter: summed changes of the level, its error, and the disturbance."""
+
+    level: Any
+    error: Any
+    disturbance: Any
+
+
+def innovations_of_row(
+    state: Filtered, residuals: Any, gain: Gains, counts: Any
+) -> tuple[Filtered, Any, Any]:
+    """Return the state after a row, and its innovations, direct and level.
+
+    residuals: (..., NUM_AXES, 2).
+    """
+    level = state.level + residuals[..., 1]
+    disturbance = gain.keep * state.disturbance
+    error = state.error + gain.push * disturbance
+    direct = (residuals[..., 0] - disturbance) * counts[..., 0]
+    disturbance = disturbance + gain.direct_d * direct
+    error = error + gain.direct_e * direct
+    off = (level - error) * counts[..., 1]
+    later = Filtered(level, error + gain.level_e * off, disturbance + gain.level_d * off)
+    return later, direct * gain.direct_scale, off * gain.level_scale
+
+
+def conditions_of(lanes: Lanes) -> Conditions:
+    """Return the conditions of the rows of lanes, leaves (rows, lanes, ...)."""
+    return Conditions(
+        step_to(lanes)[..., None], lanes.is_known.astype(float), lanes.counts.astype(float)
+    )
+
+
+@jax.jit
+def _gains_of_rows(
+    log_noise: jax.Array, state: Variances, rows: Conditions
+) -> tuple[Variances, Gains]:
+    """Return the covariance after some rows, and the gains at them, (NUM_ROWS, NUM_LANES, ...)."""
+    noise = noise_of(log_noise)
+
+    def next_row(state: Variances, row: Conditions) -> tuple[Variances, Gains]:
+        return gains_of_row(noise, state, row, jnp.exp(-row.step_s / noise.tau))
+
+    return jax.lax.scan(next_row, state, rows)
+
+
+@jax.jit
+def _whiten_rows(
+    state: Filtered, gains: Gains, counts: jax.Array, residuals: jax.Array
+) -> tuple[Filtered, jax.Array]:
+    """Return the state after some rows, and innovations (NUM_ROWS, NUM_MODELS, NUM_LANES, ...)."""
+
+    def next_row(state: Filtered, inputs: tuple[Any, ...]) -> tuple[Filtered, jax.Array]:
+        gain, counting, values = inputs
+        state, direct, level = innovations_of_row(state, values, gain, counting)
+        return state, jnp.stack([direct, level], axis=-1)
+
+    return jax.lax.scan(next_row, state, (gains, counts, residuals))
+
+
+class Whitener:
+    """The filter of a noise for rows of lanes: a linear map for residuals and their slopes."""
+
+    def __init__(self, lanes: Lanes, log_noise: np.ndarray):
+        nothing = jnp.zeros((NUM_LANES, NUM_AXES))
+        self._parts: dict[int, dict[int, tuple[Gains, jax.Array]]] = {}
+        for lane, parts in cut_to_size(conditions_of(lanes)).items():
+            state, self._parts[lane] = Variances(nothing, nothing, nothing), {}
+            for begin, rows in parts.items():
+                state, gains = _gains_of_rows(log_noise, state, rows)
+                self._parts[lane][begin] = gains, rows.counts
+        self._shape = lanes.row.shape
+
+    def __call__(self, residuals: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
+        """Return residuals (models, rows, lanes, axes, 2) as innovations of variance 1.
+
+        They are 0 where nothing counts. axes: which of ``NUM_AXES`` they are.
+        """
+        num_models, (num_rows, num_lanes) = len(residuals), self._shape
+        filled = -num_models % NUM_MODELS, -num_rows % NUM_ROWS, -num_lanes % NUM_LANES
+        size = np.add((num_models, num_rows, num_lanes), filled)
+        values = np.zeros((size[1], size[0], size[2], NUM_AXES, 2))
+        chosen = values[:num_rows, :num_models, :num_lanes, axes]
+        chosen[...] = np.moveaxis(residuals, 0, 1)
+        nothing = jnp.zeros((NUM_MODELS, NUM_LANES, NUM_AXES))
+        for (lane, parts), model in product(self._parts.items(), range(0, size[0], NUM_MODELS)):
+            state = Filtered(nothing, nothing, nothing)
+            for begin, (gains, counts) in parts.items():
+                place = (
+                    slice(begin, begin + NUM_ROWS),
+                    slice(model, model + NUM_MODELS),
+                    slice(lane, lane + NUM_LANES),
+                )
+                state, values[place] = _whiten_rows(state, gains, counts, values[place])
+        return np.moveaxis(chosen, 0, 1)
+
+
+def cut_to_size(tree: Any) -> dict[int, dict[int, Any]]:
+    """Return leaves (rows, lanes, ...) in parts of one size, by first lane and first row.
+
+    So one program serves logs of any length and rate. What fills parts up is 0.
+    """
+    num_rows, num_lanes = jax.tree.leaves(tree)[0].shape[:2]
+    fill = [(0, -num_rows % NUM_ROWS), (0, -num_lanes % NUM_LANES)]
+    padded = jax.tree.map(lambda leaf: np.pad(leaf, fill + [(0, 0)] * (leaf.ndim - 2)), tree)
+
+    def part(row: int, lane: int) -> Any:
+        place = slice(row, row + NUM_ROWS), slice(lane, lane + NUM_LANES)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[place]), padded)
+
+    return {
+        lane: {row: part(row, lane) for row in range(0, num_rows, NUM_ROWS)}
+        for lane in range(0, num_lanes, NUM_LANES)
+    }
 
 
 def step_to(lanes: Lanes) -> np.ndarray:
@@ -147,50 +263,69 @@ def noise_of(log_noise: jax.Array | np.ndarray) -> Noise:
 DIFFERENCE = 1e-4  # of logarithms, for slopes
 
 
-class _Misfit(NamedTuple):
-    """Minus twice the log likelihood of each axis, with outliers linear in size, and its parts."""
-
-    total: jax.Array
-    log_sizes: jax.Array
-    errors: jax.Array
-    sizes: jax.Array
-
-
-def _misfit(
-    log_noise: jax.Array, step_s: jax.Array, joined: jax.Array, counts: jax.Array, left: jax.Array
-) -> _Misfit:
-    gains = make_gains(noise_of(log_noise), step_s, joined, counts)
-    found = innovations(gains, left, counts)
-    size = jnp.abs(found)
-    squares = jnp.where(size < OUTLIER, size**2, OUTLIER * (2.0 * size - OUTLIER))
-    sizes = jnp.stack([gains.direct_size, gains.level_size], axis=-1)
-    logs = jnp.where(counts, jnp.log(sizes), 0.0)
-    return _Misfit((squares + logs).sum(axis=(0, 1, 3)), logs, found * jnp.sqrt(sizes), sizes)
-
-
 @jax.jit
-def _misfit_and_slopes(
-    log_noise: jax.Array, *given: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return each axis's misfit, slopes and expected curvature.
+def _misfit_rows(
+    log_noise: jax.Array, state: Any, rows: Conditions, residuals: jax.Array
+) -> tuple[Any, tuple[jax.Array, jax.Array, jax.Array]]:
+    """Return the state after some rows, and what these add to the misfit of a noise.
 
-    Shapes are (NUM_AXES,), (6, NUM_AXES) and (NUM_AXES, 6, 6).
-
+    Each axis's misfit (NUM_AXES,), its slopes (6, NUM_AXES) and its expected curvature
+    (NUM_AXES, 6, 6). The misfit is minus twice the log likelihood, outliers counted by their size.
     Axes do not depend on each other, so that one difference serves all.
     """
     shifts = DIFFERENCE * jnp.eye(len(log_noise))[:, :, None]
-    found = jax.vmap(lambda values: _misfit(values, *given))(
-        jnp.concatenate([log_noise[None], log_noise + shifts])
-    )
+    noise = jax.vmap(noise_of)(jnp.concatenate([log_noise[None], log_noise + shifts]))
+    noise = jax.tree.map(lambda leaf: leaf[:, None, :], noise)  # (noises, lanes, axes)
 
-    def slopes(values: jax.Array) -> jax.Array:
-        return (values[1:] - values[0]) / DIFFERENCE
+    def next_row(noise: Noise, state: Any, inputs: Any) -> Any:
+        row, values = inputs
+        (variances, filtered), keep = state, jnp.exp(-row.step_s / noise.tau)
+        variances, gain = gains_of_row(noise, variances, row, keep)
+        filtered, direct, level = innovations_of_row(filtered, values, gain, row.counts)
+        white = jnp.stack([direct, level], axis=-1)
+        scale = jnp.stack([gain.direct_scale, gain.level_scale], axis=-1)
+        return (variances, filtered), (white, scale)
 
-    logs, errors = slopes(found.log_sizes), slopes(found.errors) / jnp.sqrt(found.sizes[0])
-    curvature = jnp.einsum("jlrac,klrac->ajk", logs, logs) + 2.0 * jnp.einsum(
-        "jlrac,klrac->ajk", errors, errors
-    )
-    return found.total[0], slopes(found.total), curvature
+    kernel = partial(one_kernel(next_row), noise)
+    state, (white, scale) = jax.lax.scan(kernel, state, (rows, residuals))
+    size = jnp.abs(white)
+    squares = jnp.where(size < OUTLIER, size**2, OUTLIER * (2.0 * size - OUTLIER))
+    logs = -2.0 * jnp.log(scale) * rows.counts[:, None]
+    errors = white / scale
+    misfit = (squares + logs).sum(axis=(0, 2, 4))
+
+    def slopes(values: jax.Array, axis: int = 0) -> jax.Array:
+        others = jax.lax.slice_in_dim(values, 1, None, axis=axis)
+        return (others - jax.lax.slice_in_dim(values, 0, 1, axis=axis)) / DIFFERENCE
+
+    log_slopes = slopes(logs, axis=1)
+    error_slopes = slopes(errors, axis=1) * scale[:, :1]
+    curvature = jnp.einsum("rjlac,rklac->ajk", log_slopes, log_slopes)
+    curvature += 2.0 * jnp.einsum("rjlac,rklac->ajk", error_slopes, error_slopes)
+    return state, (misfit[0], slopes(misfit), curvature)
+
+
+class Likelihood:
+    """Residuals of lanes, (rows, lanes, NUM_AXES, 2), whose noise is asked for."""
+
+    def __init__(self, lanes: Lanes, residuals: np.ndarray):
+        self._parts = cut_to_size((conditions_of(lanes), residuals))
+
+    def misfit(self, log_noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the sums of ``_misfit_rows`` over all rows."""
+        nothing = jnp.zeros((1 + len(log_noise), NUM_LANES, NUM_AXES))
+        begin = Variances(*[nothing] * 3), Filtered(*[nothing] * 3)
+        sums = []
+        for parts in self._parts.values():
+            state = begin
+            for rows, residuals in parts.values():
+                state, added = _misfit_rows(log_noise, state, rows, residuals)
+                sums.append(added)
+        total, slopes, curvature = (
+            np.sum([np.asarray(one) for one in leaves], axis=0)
+            for leaves in zip(*sums, strict=True)
+        )
+        return total, slopes, curvature
 
 
 def floors_of(lanes: Lanes) -> np.ndarray:
@@ -217,21 +352,13 @@ def disturbance_gain(lanes: Lanes, left: np.ndarray, log_noise: np.ndarray) -> n
     """Return how much a disturbance lowers minus twice the log likelihood, by axis."""
     still = log_noise.copy()
     still[3] = np.log(LEAST_SHARE)
-    return np.subtract(*(_total(one, *_given(lanes, left)) for one in (still, log_noise)))
+    likelihood = Likelihood(lanes, left)
+    return likelihood.misfit(still)[0] - likelihood.misfit(log_noise)[0]
 
 
 def total_misfit(lanes: Lanes, left: np.ndarray, log_noise: np.ndarray) -> float:
     """Return minus twice the log likelihood of residuals under a noise."""
-    return float(np.sum(_total(log_noise, *_given(lanes, left))))
-
-
-def _given(lanes: Lanes, left: np.ndarray) -> tuple[jax.Array, ...]:
-    return tuple(jnp.asarray(part) for part in (step_to(lanes), lanes.is_known, lanes.counts, left))
-
-
-@jax.jit
-def _total(log_noise: jax.Array, *given: jax.Array) -> jax.Array:
-    return _misfit(log_noise, *given).total
+    return float(np.sum(Likelihood(lanes, left).misfit(log_noise)[0]))
 
 
 def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
@@ -239,9 +366,9 @@ def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -
 
     Fisher scoring with Levenberg damping, every axis by itself.
     """
-    given, (low, high) = _given(lanes, left), _bounds(lanes)
+    likelihood, (low, high) = Likelihood(lanes, left), _bounds(lanes)
     best = np.clip(first_guess(lanes, left) if start is None else start, low, high)
-    misfit, slopes, curvature = (np.asarray(part) for part in _misfit_and_slopes(best, *given))
+    misfit, slopes, curvature = likelihood.misfit(best)
     damping = np.full(NUM_AXES, FIRST_DAMPING)
     for _ in range(MOST_ROUNDS):
         scaled = curvature + 1e-9 * np.eye(6)
@@ -255,9 +382,7 @@ def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -
         )
         step = np.linalg.solve(scaled, pull.T[..., None])[..., 0].T
         tried = np.clip(best - np.clip(step, -1.0, 1.0), low, high)
-        then, then_slopes, then_curvature = (
-            np.asarray(part) for part in _misfit_and_slopes(tried, *given)
-        )
+        then, then_slopes, then_curvature = likelihood.misfit(tried)
         is_better = then < misfit
         best = np.where(is_better, tried, best)
         slopes = np.where(is_better, then_slopes, slopes)

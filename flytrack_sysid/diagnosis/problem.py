@@ -1,7 +1,8 @@
 """A log and all that its model may be: residuals, slopes and whitening for parameter vectors.
 
-One program evaluates 20 models at once, another four, each with every effect of the list; a model
-without an effect has it at its neutral value. So no set of effects needs a compilation of its own.
+One program replays pairs of a model and a lane, some rows at a time, whatever the length, rate and
+channels of a log. Each model has every effect of the list; a model without an effect has it at its
+neutral value. So no set of effects needs a compilation of its own.
 
 ========  ==============================================================================  =======
 channel   residual of a row                                                               unit
@@ -28,18 +29,19 @@ from flytrack_env.dynamics import ModelParameters, read_sensors
 from flytrack_env.effects import BY_NAME, EFFECTS, LEARNED_LAW, Effect, LearnedLaw, effect_of
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
+from flytrack_sysid.diagnosis.lanes import AXES, LANE_S, NUM_AXES, Lanes, lead_in_of
 from flytrack_sysid.diagnosis.lateness import Late
-from flytrack_sysid.parameters import TAUS, from_vector, in_batches, names_of, range_of, to_vector
+from flytrack_sysid.parameters import TAUS, from_vector, names_of, range_of, to_vector
 from flytrack_sysid.record import Record
-from flytrack_sysid.replay import Step, replay
+from flytrack_sysid.replay import ReplayState, Step, replay, start_replay
 
 # What a replay can show, whatever the craft: it is fed with poses, so that how late these are has
 # to be known before.
 SEARCHED = tuple(
     effect for effect in EFFECTS if "pose" not in effect.hooks and not effect.search.is_setting
 )
-BATCH, SMALL_BATCH = 20, 4
+# Size of the compiled replay: pairs of a model and a lane, and rows at a time.
+NUM_PAIRS, NUM_ROWS = 32, 200
 RELATIVE_STEP = 1e-6  # of a parameter's scale, for slopes
 
 
@@ -51,54 +53,109 @@ def _turn(measured: Quaternion, predicted: Quaternion) -> Vec3:
     return Vec3(double * error.x, double * error.y, double * error.z)
 
 
-def _of_step(
-    step: Step, next_row: Record, sensed: dict[str, Any], model: ModelParameters
-) -> jax.Array:
-    """Return the residuals of the row after a step, (NUM_AXES, 2); 0 for absent channels."""
+class Measured(NamedTuple):
+    """What was measured at a row, (..., size).
+
+    gyro_b: rad/s, NaN where the log has none. force_b: m/s^2, body, 0 where there is no
+    accelerometer.
+    """
+
+    quat: Any
+    vel_w: Any
+    battery_v: Any
+    gyro_b: Any
+    force_b: Any
+
+
+class Rows(NamedTuple):
+    """Rows of lanes, the gyro at them, and what was measured at the rows after them."""
+
+    row: Record
+    gyro_b: Any
+    later: Measured
+
+
+def _of_step(step: Step, measured: Measured) -> jax.Array:
+    """Return the residuals of the row after a step, (NUM_AXES, 2)."""
     row, before, after = step.row, step.before, step.after
-    read, zero = read_sensors(step.moved, model), Vec3(0.0, 0.0, 0.0)
+    read = read_sensors(step.moved, step.model)
     to_world = before.quat.rotate  # whatever attitude the sensors' force had
-    rates = to_world(Vec3(*sensed["w"]) - read.rates_b) if "w" in sensed else zero
-    turn = _turn(Quaternion(*next_row.quat), after.quat)
-    force = to_world(Vec3(*sensed["f"]) - read.force_b) if "f" in sensed else zero
-    vel_change = Vec3(*next_row.vel_w) - before.vel_w - after.acc_w.scale(row.step_s)
-    voltage_change = next_row.battery_v - after.battery_v
+    rates = to_world(Vec3(*jnp.nan_to_num(measured.gyro_b)) - read.rates_b)
+    turn = _turn(Quaternion(*measured.quat), after.quat)
+    force = to_world(Vec3(*measured.force_b) - read.force_b)
+    vel_change = Vec3(*measured.vel_w) - before.vel_w - after.acc_w.scale(row.step_s)
+    voltage_change = measured.battery_v - after.battery_v
     direct, level = (*rates, *force, 0.0), (*turn, *vel_change, voltage_change)
     return jnp.stack([jnp.stack(direct), jnp.stack(level)], axis=-1)
 
 
-def _of_lane(model: ModelParameters, lane: Record, sensed: dict[str, Any]) -> jax.Array:
-    """Return the residuals of a lane's rows; of its first row nothing is predicted."""
-    rows, gyro_b = jax.tree.map(lambda leaf: leaf[:-1], (lane, sensed.get("w")))
-    later = jax.tree.map(lambda leaf: leaf[1:], (lane, sensed))
-    found = replay(
-        model, rows, gyro_b, lambda step, extra: _of_step(step, extra[0], extra[1], model), later
-    )
-    return jnp.concatenate([jnp.zeros_like(found[:1]), found])
+@jax.jit
+def _start_states(vectors: jax.Array, like: ModelParameters, row: Record) -> ReplayState:
+    """Return the states before the first rows of pairs; row: leaves (NUM_PAIRS, ...)."""
+    return jax.vmap(lambda vector, row: start_replay(from_vector(vector, like), row))(vectors, row)
 
 
-def residuals(vector: jax.Array, like: ModelParameters, lanes: Lanes) -> jax.Array:
-    """Return the residuals of a model, (rows, lanes, NUM_AXES, 2), and 0 where a flight begins.
+@jax.jit
+def _replay_rows(
+    vectors: jax.Array, like: ModelParameters, states: ReplayState, rows: Rows
+) -> tuple[ReplayState, jax.Array]:
+    """Return the states of pairs after some rows, and (rows, NUM_PAIRS, NUM_AXES, 2) residuals.
 
-    vector: the model's numbers, in the order of ``parameters.names_of(like)``.
+    vectors: (NUM_PAIRS, parameters), the model of each pair, in the order of
+    ``parameters.names_of(like)``. rows: leaves (rows, NUM_PAIRS, ...), the lane of each pair.
     """
-    model = from_vector(vector, like)
-    of_lane = jax.vmap(lambda lane, sensed: _of_lane(model, lane, sensed), in_axes=1, out_axes=1)
-    return jnp.where(lanes.is_joined[..., None, None], of_lane(lanes.record, lanes.measured), 0.0)
+
+    def of_pair(vector: jax.Array, state: ReplayState, rows: Rows) -> Any:
+        model = from_vector(vector, like)
+        return replay(model, state, rows.row, rows.gyro_b, _of_step, rows.later)
+
+    return jax.vmap(of_pair, in_axes=(0, 0, 1), out_axes=(0, 1))(vectors, states, rows)
 
 
-@jax.jit
-def _residuals(vectors: jax.Array, like: ModelParameters, lanes: Lanes) -> jax.Array:
-    """Return residuals of models, (BATCH, rows, lanes, NUM_AXES, 2)."""
-    return jax.vmap(lambda vector: residuals(vector, like, lanes))(vectors)
+class Batch(NamedTuple):
+    """Some of the lanes, each repeated to make ``NUM_PAIRS`` pairs of a model and a lane.
+
+    lanes: of the log. first: their first rows. parts: all their rows, ``NUM_ROWS`` at a time.
+    """
+
+    lanes: slice
+    first: Record
+    parts: tuple[Rows, ...]
+
+    @property
+    def num_lanes(self) -> int:
+        """How many lanes there are."""
+        return self.lanes.stop - self.lanes.start
+
+    @property
+    def num_models(self) -> int:
+        """How many models are replayed at once."""
+        return NUM_PAIRS // self.num_lanes
 
 
-@jax.jit
-def _whitened(left: jax.Array, gains: noises.Gains, counts: jax.Array) -> jax.Array:
-    return jax.vmap(lambda one: noises.innovations(gains, one, counts))(left)
+def batches_of(lanes: Lanes) -> tuple[Batch, ...]:
+    """Return the batches of lanes, of one size, whatever the length, rate and channels of a log."""
+    num_rows, num_lanes = lanes.row.shape
+    nowhere = np.zeros((num_rows, num_lanes, 3))
+    record, gyro_b = lanes.record, lanes.measured.get("w", nowhere + np.nan)
+    force_b = lanes.measured.get("f", nowhere)
+    measured = Measured(record.quat, record.vel_w, record.battery_v, gyro_b, force_b)
+    result = []
+    for start in range(0, num_lanes, NUM_PAIRS):
+        chosen = slice(start, min(start + NUM_PAIRS, num_lanes))
+        pair = start + np.arange(NUM_PAIRS) % (chosen.stop - start)
 
+        def at(first: int, values: Any, pair: np.ndarray = pair) -> Any:
+            row = np.minimum(first + np.arange(NUM_ROWS), num_rows - 1)
+            return jax.tree.map(lambda leaf: jnp.asarray(leaf[row[:, None], pair]), values)
 
-_gains = jax.jit(noises.make_gains)
+        parts = tuple(
+            Rows(at(first, record), at(first, gyro_b), at(first + 1, measured))
+            for first in range(0, num_rows - 1, NUM_ROWS)
+        )
+        first_row = jax.tree.map(lambda leaf, pair=pair: jnp.asarray(leaf[0, pair]), lanes.record)
+        result.append(Batch(chosen, first_row, parts))
+    return tuple(result)
 
 
 class Window(NamedTuple):
@@ -132,7 +189,7 @@ class Problem:
 
     like: the nominal model with every effect, float64. given_effects: those that the nominal model
     has. low, high, scale: of each parameter, its bounds and the size of its steps. noise: (6,
-    NUM_AXES), as of ``noise.fit_noise``, and gains of its filter; None before ``with_noise``. late:
+    NUM_AXES), as of ``noise.fit_noise``, and its filter; None before ``with_noise``. late:
     of lanes whose poses were corrected. windows: of the effects that act for a part of the log
     only.
     """
@@ -146,9 +203,10 @@ class Problem:
     high: np.ndarray
     scale: np.ndarray
     noise: np.ndarray | None = None
-    gains: noises.Gains | None = None
+    whitener: noises.Whitener | None = None
     late: Late | None = None
     windows: tuple[Window, ...] = ()
+    batches: tuple[Batch, ...] = ()
 
     @classmethod
     def of(
@@ -177,14 +235,17 @@ class Problem:
             high=np.minimum(high, _longest(names, lanes)),
             scale=np.array([_scale(name, value) for name, value in zip(names, start, strict=True)]),
             late=late,
+            batches=batches_of(lanes),
         )
 
     def with_noise(self, noise: np.ndarray | None) -> "Problem":
         """Return the same problem, weighted by a noise, (6, NUM_AXES), which must not be None."""
         assert noise is not None, "with_noise comes first"
-        lanes = self.lanes
-        gains = _gains(noises.noise_of(noise), noises.step_to(lanes), lanes.is_known, lanes.counts)
-        return replace(self, noise=noise, gains=gains)
+        return replace(self, noise=noise, whitener=noises.Whitener(self.lanes, noise))
+
+    def with_lanes(self, lanes: Lanes) -> "Problem":
+        """Return the same problem of other lanes."""
+        return replace(self, lanes=lanes, batches=batches_of(lanes))
 
     def with_law(self, law: LearnedLaw) -> "Problem":
         """Return the problem whose vectors end with the numbers of a law.
@@ -235,9 +296,29 @@ class Problem:
         return found if self.late is None else self.late.residuals(found)
 
     def _replayed(self, vectors: np.ndarray) -> np.ndarray:
-        return in_batches(
-            lambda part: _residuals(part, self.like, self.lanes), vectors, _size_for(vectors)
-        )
+        rows, lanes = self.lanes.row.shape
+        result = np.zeros((len(vectors), rows, lanes, NUM_AXES, 2))
+        for batch in self.batches:
+            for first in range(0, len(vectors), batch.num_models):
+                last = min(first + batch.num_models, len(vectors))
+                model = np.minimum(first + np.arange(NUM_PAIRS) // batch.num_lanes, last - 1)
+                found = self._replay_pairs(vectors[model], batch)
+                found = found[:, : (last - first) * batch.num_lanes]
+                found = found.reshape(rows - 1, last - first, batch.num_lanes, NUM_AXES, 2)
+                result[first:last, 1:, batch.lanes] = np.swapaxes(found, 0, 1)
+        result *= self.lanes.is_joined[..., None, None]
+        for name, axes in zip(("w", "f"), AXES, strict=False):
+            if name not in self.lanes.measured:
+                result[..., axes, 0] = 0.0
+        return result
+
+    def _replay_pairs(self, vectors: np.ndarray, batch: Batch) -> np.ndarray:
+        """Return the residuals of all rows but the first, (rows - 1, NUM_PAIRS, NUM_AXES, 2)."""
+        states, parts = _start_states(vectors, self.like, batch.first), []
+        for rows in batch.parts:
+            states, residuals = _replay_rows(vectors, self.like, states, rows)
+            parts.append(residuals)
+        return np.concatenate(parts)[: len(self.lanes.row) - 1]
 
     def _composed(self, vectors: np.ndarray) -> np.ndarray:
         """Return residuals of models whose effects act in windows; each row is of one replay."""
@@ -268,14 +349,9 @@ class Problem:
         return vectors
 
     def whiten(self, left: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
-        """Return residuals as innovations.
-
-        left: (num_models, rows, lanes, NUM_AXES, 2), or of some axes only.
-        """
-        assert self.gains is not None, "with_noise comes first"
-        gains = jax.tree.map(lambda leaf: np.asarray(leaf)[..., axes], self.gains)
-        counts = self.counts[..., axes, :]
-        return in_batches(lambda part: _whitened(part, gains, counts), left, _size_for(left))
+        """Return residuals (num_models, rows, lanes, axes, 2) of some axes as innovations."""
+        assert self.whitener is not None, "with_noise comes first"
+        return self.whitener(left, axes)
 
     def whitened_residuals(self, *vectors: np.ndarray) -> np.ndarray:
         """Return the innovations of models, (num_models, rows, lanes, NUM_AXES, 2)."""
@@ -314,11 +390,6 @@ class Problem:
     def index(self, names: Sequence[str]) -> list[int]:
         """Return the places of parameters in the vector."""
         return [self.names.index(name) for name in names]
-
-
-def _size_for(values: np.ndarray) -> int:
-    """Return how many values a program takes at once."""
-    return SMALL_BATCH if len(values) <= SMALL_BATCH else BATCH
 
 
 def as_replayed(model: ModelParameters) -> ModelParameters:

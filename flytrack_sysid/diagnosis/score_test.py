@@ -172,8 +172,8 @@ class Linearization:
     """A model and, to first order, what every column would change: parameters, and ways to probes.
 
     vector: the model. places: parameters of the first columns. probes: of further ones, whose step
-    is the share of the way to the probe. columns: whitened. The slopes may be those of a nearby
-    model.
+    is the share of the way to the probe. columns: whitened, (blocks, columns, numbers). The slopes
+    may be those of a nearby model.
     """
 
     def __init__(self, problem: Problem, slopes: Slopes, probes: Sequence[Probe] = ()):
@@ -182,14 +182,13 @@ class Linearization:
         self.prior = np.concatenate(
             [prior_information(problem)[self.places], np.full(len(self.probes), PROBE_PRIOR)]
         )
-        self.columns = problem.whiten(slopes.columns)
-        self.vector, self.white = slopes.vector, problem.whiten(slopes.residuals[None])[0]
-        root = np.sqrt(robust_weight(self.white))
-        weighted = blocks_of(self.columns * root)
-        self.by_block = weighted @ np.swapaxes(weighted, 1, 2)
-        self.score_by_block = -np.einsum(
-            "bpn,bn->bp", weighted, blocks_of(self.white * root), optimize=True
-        )
+        white = problem.whiten(np.concatenate([slopes.residuals[None], slopes.columns]))
+        self.vector, self.white = slopes.vector, white[0]
+        blocks = blocks_of(white)
+        self.columns = blocks[:, 1:]
+        weighted = blocks * np.sqrt(robust_weight(blocks[:, :1]))
+        self.by_block = weighted[:, 1:] @ np.swapaxes(weighted[:, 1:], 1, 2)
+        self.score_by_block = -(weighted[:, 1:] @ weighted[:, 0, :, None])[..., 0]
         self.total = self.by_block.sum(axis=0) + np.diag(self.prior)
         self._sum_scores()
 
@@ -207,11 +206,8 @@ class Linearization:
         later = copy.copy(self)
         later.vector = vector
         later.white = self.problem.whitened_residuals(vector)[0] if white is None else white
-        root = np.sqrt(robust_weight(later.white))
-        weighted = blocks_of(later.white * root * root)
-        later.score_by_block = -np.einsum(
-            "bpn,bn->bp", blocks_of(self.columns), weighted, optimize=True
-        )
+        weighted = blocks_of(later.white * robust_weight(later.white))
+        later.score_by_block = -(self.columns @ weighted[..., None])[..., 0]
         later._sum_scores()
         return later
 
@@ -233,7 +229,7 @@ class Linearization:
         kept = [self.places.index(place) for place in places]
         later = copy.copy(self)
         later.places, later.probes = list(places), []
-        later.prior, later.columns = self.prior[kept], self.columns[kept]
+        later.prior, later.columns = self.prior[kept], self.columns[:, kept]
         later.by_block = self.by_block[:, kept][:, :, kept]
         later.score_by_block = self.score_by_block[:, kept]
         later.total, later.score = self.total[np.ix_(kept, kept)], self.score[kept]

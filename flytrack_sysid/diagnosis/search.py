@@ -8,7 +8,7 @@ import numpy as np
 
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import voltages_of
-from flytrack_sysid.diagnosis.problem import SEARCHED, SMALL_BATCH, Problem
+from flytrack_sysid.diagnosis.problem import SEARCHED, Problem
 from flytrack_sysid.diagnosis.score_test import (
     Candidate,
     Gain,
@@ -33,7 +33,7 @@ SATURATED_SHARES = np.array([0.0, 1.0, 0.5, 0.2])  # of the step to everything a
 # Gauss-Newton: rounds, the least gain of a round, shares of a step tried at once, and after how
 # much gain slopes are taken again; gains in minus twice the log likelihood.
 MOST_ROUNDS, LEAST_GAIN, STALE = 30, 0.05, 30.0
-STEP_SHARES = np.array([1.0, 0.5, 0.2, 0.05])[:SMALL_BATCH]
+STEP_SHARES = np.array([1.0, 0.5, 0.2, 0.05])
 
 
 class FittedModel(NamedTuple):

@@ -1,5 +1,6 @@
 """Parts of the diagnosis: its noise filter, lanes, messages, and logs that say too little."""
 
+import operator
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -11,11 +12,20 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
+from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
+from flytrack_sysid import FlightLog
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, vetoes
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
-from flytrack_sysid.diagnosis.lanes import LANE_S, LEAD_IN_S, NUM_AXES, make_lanes, thinned
+from flytrack_sysid.diagnosis.lanes import (
+    LANE_S,
+    LEAD_IN_S,
+    NUM_AXES,
+    lanes_of,
+    make_lanes,
+    thinned,
+)
 from flytrack_sysid.diagnosis.learned import improves_flights
 from flytrack_sysid.diagnosis.model_selection import Ablation
 from flytrack_sysid.diagnosis.problem import Problem
@@ -27,7 +37,7 @@ from flytrack_sysid.diagnosis.summary import stand_in_notes, warnings_of, with_r
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.parameters import THRUST_COEFFS
 from flytrack_sysid.record import make_record
-from flytrack_sysid.replay import Step, replay
+from flytrack_sysid.replay import Step, replay, start_replay
 from tests.support.hidden_flights import scripted
 
 SECONDS, DT_S = 40.0, 0.01
@@ -38,6 +48,7 @@ DIRECT = np.repeat([0.1, 1.5, 1.0], [3, 3, 1])
 LEVEL = np.repeat([0.01, 0.05, 0.01], [3, 3, 1])
 DISTURBANCE = np.repeat([0.1, 1.5, 1e-3], [3, 3, 1])
 WANDER, TAU_S = 0.1 * LEVEL, 0.3
+TRACED = "/jax/core/compile/jaxpr_trace_duration"
 CAUSE = Cause("rate_scale", (), "rates", {}, 100.0, 30.0, 100.0, 90.0)
 
 
@@ -86,12 +97,11 @@ def correlation(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 def test_innovations_are_white_and_of_variance_one(lanes, disturbed):
     ones = np.ones(NUM_AXES)
-    noise = noises.Noise(
-        DIRECT, LEVEL, WANDER, DISTURBANCE, TAU_S * ones, ones
-    )  # that they were made of
+    shares = np.log([WANDER / LEVEL, DISTURBANCE / DIRECT, TAU_S * ones])
+    felt = 30.0 * ones  # a logit: the drone feels all of the disturbance
+    log_noise = np.concatenate([np.log([DIRECT, LEVEL]), shares, felt[None]])  # made of
     with jax.enable_x64(True):
-        gains = noises.make_gains(noise, noises.step_to(lanes), lanes.is_known, lanes.counts)
-        found = np.array(noises.innovations(gains, disturbed, lanes.counts))
+        found = noises.Whitener(lanes, log_noise)(disturbed[None])[0]
     found[~lanes.counts] = np.nan
     counting = lanes.counts.any(axis=(0, 1))
     assert counting.sum() == 2 * NUM_AXES - 1
@@ -147,7 +157,9 @@ def test_lanes_agree_with_one_long_replay(flown, lanes):
         left = problem.residuals(problem.start[None])[0]
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
         record = make_record(log)
-        later = jax.jit(lambda: replay(like, record, None, predictions))()
+        no_gyro = np.full(record.pos_w.shape, np.nan)
+        begin = start_replay(like, jax.tree.map(operator.itemgetter(0), record))
+        later = jax.jit(lambda: replay(like, begin, record, no_gyro, predictions))()[1]
         rates_b, force_b, acc_w = (np.roll(np.asarray(one), 1, axis=0) for one in later)
     before = Rotation.from_quat(np.roll(record.quat, 1, axis=0), scalar_first=True)
     source = record.source_row
@@ -164,6 +176,37 @@ def test_lanes_agree_with_one_long_replay(flown, lanes):
         # full stick.
         error = (left[..., axes, channel] - one[lanes.row]) / (DIRECT, LEVEL)[channel][axes]
         assert counts[LEAD_IN_S * RATE].any() and np.abs(error[counts]).max() < 1e-3
+
+
+def evaluate(log: FlightLog, model: ModelParameters) -> None:
+    """Run every program that a search for effects in a log needs."""
+    problem = Problem.of(lanes_of(log, np.ones(len(log), bool), model), model)
+    residuals = problem.residuals(np.repeat(problem.start[None], 3, axis=0))
+    problem = problem.with_noise(noises.fit_noise(problem.lanes, residuals[0]))
+    assert np.isfinite(problem.whiten(residuals)).all()
+
+
+def test_logs_of_another_length_rate_and_channels_compile_nothing(flown):
+    truth, log = flown
+    model, compiled = model_of(truth), []
+
+    def count(event: str, duration_s: float, **_: object) -> None:
+        if event in ("/jax/core/compile/backend_compile_duration", TRACED):
+            compiled.append(event)
+
+    others = (
+        log.select(np.arange(len(log)) < 1500),
+        replace(log, time=0.8 * log.time),
+        log.without("f"),
+        log.without("v", "v_bat"),
+    )
+    with jax.enable_x64(True):
+        evaluate(log, model)
+        jax.monitoring.register_event_duration_secs_listener(count)
+        for other in others:
+            evaluate(other, model)
+    jax.monitoring.unregister_event_duration_listener(count)
+    assert compiled == []
 
 
 def test_a_log_without_turns_is_refused(flown):
