@@ -60,7 +60,7 @@ ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (12, 4))
 class Trap:
     """Fails the test that unpickles it."""
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self):
         return (pytest.fail, ("a pickle was read",))
 
 
@@ -77,7 +77,7 @@ class Kind(NamedTuple):
     hostile: Callable[[bytes], list[bytes]] = lambda content: []
     is_slow: bool = False
 
-    def content(self, folder: Path) -> bytes:
+    def content(self, folder):
         """Return a valid file."""
         if isinstance(self.valid, bytes):
             return self.valid
@@ -86,35 +86,35 @@ class Kind(NamedTuple):
         return path.read_bytes()
 
 
-def imported(kind: str, suffix: str, is_slow: bool = True, **options: Any) -> Kind:
+def imported(kind, suffix, is_slow=True, **options):
     """Return a kind of log that is imported, with the mapping beside the valid one."""
     form, write = WRITERS[kind]
 
-    def save(path: Path) -> None:
+    def save(path):
         write(path.parent, flying())[0].rename(path)
 
-    def load(path: Path) -> Any:
+    def load(path):
         mapping = path.with_name("map.toml")
         return import_log(path, form, mapping if mapping.exists() else None).log
 
     return Kind(suffix, save, load, LogError, is_slow=is_slow, **options)
 
 
-def npz(arrays: dict[str, np.ndarray]) -> bytes:
+def npz(arrays):
     """Return arrays as a compressed archive."""
     content = io.BytesIO()
     np.savez_compressed(content, **arrays)
     return content.getvalue()
 
 
-def npy(array: np.ndarray) -> bytes:
+def npy(array):
     """Return one array as a file."""
     content = io.BytesIO()
     np.save(content, array)
     return content.getvalue()
 
 
-def hostile_arrays(content: bytes) -> list[bytes]:
+def hostile_arrays(content):
     """Return archives with pickles, arrays of other sizes than declared, and bombs."""
     arrays = dict(np.load(io.BytesIO(content)))
     name = next(iter(arrays))
@@ -133,7 +133,7 @@ def hostile_arrays(content: bytes) -> list[bytes]:
     return [*odd_arrays, header, content + content, version, unannounced.getvalue()]
 
 
-def hostile_texts(content: bytes) -> list[bytes]:
+def hostile_texts(content):
     """Return texts that are very long, nested deeply, or have keys of very many parts."""
     dots = b"\n".join(b"a%d" % number + b".a" * 999 + b" = 1" for number in range(100))
     nested, digits = b"[" * 10**5, b"9" * 10**5
@@ -141,7 +141,7 @@ def hostile_texts(content: bytes) -> list[bytes]:
     return [*long_texts, nested, b"a = " + nested, dots, digits]
 
 
-def hostile_gzips(_: bytes) -> list[bytes]:
+def hostile_gzips(_):
     """Return compressed files that unpack to 256 MiB, or have 100,000 parts."""
     return [
         gzip.compress(b"0," * 2**27, 1),
@@ -150,18 +150,18 @@ def hostile_gzips(_: bytes) -> list[bytes]:
     ]
 
 
-def save_script(path: Path) -> None:
+def save_script(path):
     """Write a script of two flights."""
     flown = np.stack([ACTIONS] * 2)
     sysid.save_script(path, sysid.Script(tuple(MANOEUVRES)[:2], STATES[:2], flown))
 
 
-def save_log(path: Path) -> None:
+def save_log(path):
     """Write a log of one flight."""
     sysid.save_log(path, log_of_states([(STATES, ACTIONS)], 0.01))
 
 
-def save_packed(path: Path) -> None:
+def save_packed(path):
     """Write a compressed CSV log."""
     write_csv(path.parent, flying())
     path.write_bytes(gzip.compress((path.parent / "a.csv").read_bytes(), mtime=0))
@@ -200,7 +200,7 @@ SLOW = {"imported CSV, gzip", "black box"}  # seconds for the crafted files
 
 
 @st.composite
-def damaged(draw: st.DrawFn, valid: bytes) -> bytes:
+def damaged(draw, valid):
     """Return a file with one to four parts, or one of its arrays, damaged.
 
     A part is changed, cut, extended or duplicated.
@@ -224,7 +224,7 @@ def damaged(draw: st.DrawFn, valid: bytes) -> bytes:
 
 
 @st.composite
-def damaged_arrays(draw: st.DrawFn, valid: bytes) -> bytes:
+def damaged_arrays(draw, valid):
     """Return an archive of which one array is missing, or of another type, shape or value."""
     arrays = dict(np.load(io.BytesIO(valid)))
     name = draw(st.sampled_from(sorted(arrays)))
@@ -239,7 +239,7 @@ def damaged_arrays(draw: st.DrawFn, valid: bytes) -> bytes:
     )
 
 
-def loaded_or_refused(kind: Kind, path: Path) -> bool:
+def loaded_or_refused(kind, path):
     """Return whether a file is loaded; only finite numbers or the loader's own error may result."""
     started_s = time.process_time()
     try:
@@ -257,7 +257,7 @@ def loaded_or_refused(kind: Kind, path: Path) -> bool:
 
 
 @pytest.fixture(scope="module")
-def unpickled() -> list[str]:
+def unpickled():
     """What was unpickled since the first test that asked for this."""
     seen: list[str] = []
     sys.addaudithook(lambda event, _: seen.append(event) if event == "pickle.find_class" else None)
@@ -265,13 +265,11 @@ def unpickled() -> list[str]:
 
 
 @pytest.mark.parametrize("kind", slow_but(KINDS.keys() - SLOW, KINDS))
-def test_damaged_and_hostile_files_are_loaded_or_refused(
-    kind: str, tmp_path: Path, unpickled: list[str]
-) -> None:
+def test_damaged_and_hostile_files_are_loaded_or_refused(kind, tmp_path, unpickled):
     file_kind, outcomes = KINDS[kind], list[bool]()
     path, valid = tmp_path / f"b{file_kind.suffix}", file_kind.content(tmp_path)
 
-    def check(content: bytes) -> None:
+    def check(content):
         path.write_bytes(content)
         unpickled.clear()
         outcomes.append(loaded_or_refused(file_kind, path))
@@ -293,9 +291,7 @@ def test_damaged_and_hostile_files_are_loaded_or_refused(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_no_such_file_is_refused(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_such_file_is_refused(kind, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     contents = {
         "garbage": b"\x80\x01\xff garbage",
@@ -313,9 +309,7 @@ def test_what_is_no_such_file_is_refused(
             KINDS[kind].load(Path(name + suffix))
 
 
-def test_compressed_logs_are_read_and_bounded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_compressed_logs_are_read_and_bounded(tmp_path, monkeypatch):
     monkeypatch.setattr(log_file, "PACKED_BYTES", 50_000)
     path, mapping = write_csv(tmp_path, flying())
     expected, text = import_log(path, "csv", mapping).log, path.read_bytes()

@@ -2,9 +2,7 @@
 
 import os
 import signal
-from collections.abc import Iterator
 from functools import partial
-from typing import Any
 
 import jax
 import numpy as np
@@ -15,9 +13,9 @@ pytest.importorskip("firmware", reason="firmware/ is in clones only")
 import flytrack_env
 from firmware import Betaflight, Body, FirmwareError, build
 from firmware.__main__ import check
-from flytrack_env.dynamics import ModelParameters, nominal_parameters
+from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import BetaflightLoop, effect_of
-from flytrack_env.plants import Plant, Simulator
+from flytrack_env.plants import Simulator
 from flytrack_env.state import ACCELERATION, BATTERY, RATES, Action, pack, unpack, unpack_action
 from flytrack_sysid import CollectError, collect, diagnose_change, import_log, load_log, save_log
 from flytrack_sysid.excitation import script, start_state
@@ -33,7 +31,7 @@ SETTLE_S = 0.7  # from arming to the first row of a log, and some more
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _is_built() -> None:
+def _is_built():
     try:
         build(lambda line: None)
     except FirmwareError as error:
@@ -41,13 +39,13 @@ def _is_built() -> None:
 
 
 @pytest.fixture(scope="module")
-def plant() -> Iterator[Betaflight]:
+def plant():
     """The stock firmware on the default body."""
     with Betaflight() as flown:
         yield flown
 
 
-def starts(number: int = 3, volts: float = 23.0) -> np.ndarray:
+def starts(number=3, volts=23.0):
     rng = np.random.default_rng(0)
     rows = [
         start_state(rng, volts, -0.2, tilt_deg=20.0 * row, speed=2.0 * row) for row in range(number)
@@ -55,14 +53,12 @@ def starts(number: int = 3, volts: float = 23.0) -> np.ndarray:
     return np.array(rows, np.float32)
 
 
-def sticks(number: int = 3, steps: int = 80) -> np.ndarray:
+def sticks(number=3, steps=80):
     rng = np.random.default_rng(1)
     return np.repeat(rng.uniform(-1, 1, (number, steps // 8, 4)), 8, axis=1).astype(np.float32)
 
 
-def fly_compiled(
-    plant: Plant, rows: np.ndarray, commands: np.ndarray, model: Any = MODEL
-) -> np.ndarray:
+def fly_compiled(plant, rows, commands, model=MODEL):
     """Return the states (number, steps, 21) after each command, by the plant's own steps."""
     return np.asarray(jax.jit(jax.vmap(partial(flown_by, plant, model)))(rows, commands))
 
@@ -170,7 +166,7 @@ def test_collected_log_and_blackbox_are_the_same_flight(tmp_path):
     box = import_log(boxes[0], "betaflight").log
     flown = log.select(log.segment == 0)
 
-    def seen(channel: str, shift_s: float) -> np.ndarray:
+    def seen(channel, shift_s):
         time = flown.time + shift_s
         return np.stack([np.interp(time, box.time, column) for column in box[channel].T], axis=1)
 
@@ -232,7 +228,7 @@ def test_page_runs_and_check_is_repeatable(tmp_path, monkeypatch):
     assert len(names["log"]) > 3000 and len(names["flown"]) > 200
 
 
-def known_model(plant: Betaflight) -> ModelParameters:
+def known_model(plant):
     """Return the model of the default body: its own numbers, and its thrust curve about 23 V."""
     body, model = plant.body, plant.nominal_model()
     craft = (body.arm_m[1] / body.inertia[0], body.arm_m[0] / body.inertia[1])
@@ -262,7 +258,7 @@ def test_loop_with_the_numbers_of_the_body_flies_as_the_firmware_does(plant):
     assert np.median(away) < 0.02  # m after a second; measured 0.012
 
 
-def test_what_was_changed_is_named_and_a_matched_set_up_has_no_name() -> None:
+def test_what_was_changed_is_named_and_a_matched_set_up_has_no_name():
     weak = Body(health=(1.0, 0.85, 1.0, 1.0))
     logs = []
     for number, body in enumerate((Body(), Body(), weak)):

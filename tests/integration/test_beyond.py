@@ -1,7 +1,6 @@
 """What a diagnosis learns beyond its list: a law with its numbers, or nothing."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +11,7 @@ from benchmarks.hidden.oracle import removed
 from flytrack_env.effects import LearnedLaw
 from flytrack_env.effects.grammar import Factor, Law, Term
 from flytrack_env.model_file import load_model
-from flytrack_sysid.diagnosis import Diagnosis, diagnose, text_of, write_diagnosis
-from flytrack_sysid.log import FlightLog
+from flytrack_sysid.diagnosis import diagnose, text_of, write_diagnosis
 
 pytestmark = pytest.mark.slow
 
@@ -27,7 +25,7 @@ PEAK = hidden.Outside(
 LOAD = hidden.Outside("payload", ("airspeed",), "force", 1.5, {"string_m": 0.6})
 
 
-def flights(seed: int, law: hidden.Outside = PEAK) -> tuple[hidden.Truth, FlightLog, FlightLog]:
+def flights(seed, law=PEAK):
     """Return a plant with a law, a measured and a clean flight.
 
     By default the law is drag that peaks at an airspeed.
@@ -38,21 +36,21 @@ def flights(seed: int, law: hidden.Outside = PEAK) -> tuple[hidden.Truth, Flight
     return truth, log, hidden.fly(truth, SECONDS, rng)
 
 
-def share_removed(found: Diagnosis, clean: FlightLog) -> float:
+def share_removed(found, clean):
     """Return the share of the explainable error that what was learnt removes on a clean flight."""
     assert found.learned is not None
     neutral = found.learned.effect._replace(scale=0.0)
     return removed(clean, found.base.with_effects(neutral), found.extended)[0]
 
 
-def check_flights(found: Diagnosis) -> None:
+def check_flights(found):
     """Check that free flights are predicted better with what was learnt."""
     without, with_law = (found.prediction.errors[name] for name in ("without_learned", "extended"))
     for horizon in ("0.5", "1", "2"):
         assert with_law["velocity_m_per_s"][horizon] < 0.9 * without["velocity_m_per_s"][horizon]
 
 
-def test_a_law_is_found_with_its_numbers(tmp_path: Path) -> None:
+def test_a_law_is_found_with_its_numbers(tmp_path):
     truth, log, clean = flights(71)
     found = diagnose(log, model_of(truth))
     assert found.verdict == "unexplained" and found.learned is not None
@@ -69,7 +67,7 @@ def test_a_law_is_found_with_its_numbers(tmp_path: Path) -> None:
     assert "What was learnt" in report.read_text() or "bump(airspeed" in report.read_text()
 
 
-def test_nothing_is_learnt_beside_a_law_of_another_log() -> None:
+def test_nothing_is_learnt_beside_a_law_of_another_log():
     truth, log, _ = flights(71)
     too_small = Term(
         "force", "air", (Factor("airspeed", "bump", (BUMP_MS, WIDTH_MS)),), (-0.1,), (0.0,)
@@ -79,21 +77,21 @@ def test_nothing_is_learnt_beside_a_law_of_another_log() -> None:
     assert any("learned_law from another log" in warning for warning in found.warnings)
 
 
-def test_a_thermal_that_held_out_rows_do_not_pass_is_found() -> None:
+def test_a_thermal_that_held_out_rows_do_not_pass_is_found():
     """On this plant, another motion seemed likelier before the search."""
     line = beyond.plant(beyond.Trial("position", 0, seed=43))
     assert (line["motion"], line["found_motion"]) == ("handout", "handout")
     assert line["is_form"] and len(line["law"]) == 1 and not line["causes"]
 
 
-def test_a_load_on_a_string_stays_unexplained() -> None:
+def test_a_load_on_a_string_stays_unexplained():
     truth, log, clean = flights(73, LOAD)
     found = diagnose(log, model_of(truth))
     assert "unexplained" in found.verdict and not found.causes
     assert found.learned is None or share_removed(found, clean) > 0.0
 
 
-def test_a_thrust_curve_says_where_it_could_be_motors_that_warm_up() -> None:
+def test_a_thrust_curve_says_where_it_could_be_motors_that_warm_up():
     truth, log, _ = beyond.flown_plant(beyond.Trial("heating", 1, seed=59))
     warm = diagnose(log, model_of(truth))
     rng = np.random.default_rng(74)

@@ -1,13 +1,12 @@
 """What changed: between two logs, and within one, by causes that begin or end in flight."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.diagnosis import Trial, make_log, model_of
-from benchmarks.hidden import Truth, draw_base, draw_outside, fly, measure
+from benchmarks.hidden import draw_base, draw_outside, fly, measure
 from flytrack.cli import main
 from flytrack_env import save_model
 from flytrack_env.motion import Motion
@@ -24,7 +23,7 @@ BASE = replace(draw_base(np.random.default_rng(3)), motion="fine")
 BOTH = replace(BASE, outside=draw_outside(np.random.default_rng(4), "heading", 2.0))
 
 
-def flown(own: Truth, seconds: float, seed: int) -> FlightLog:
+def flown(own, seconds, seed):
     rng = np.random.default_rng(seed)
     return measure(fly(own, seconds, rng), "sensors", rng)
 
@@ -34,14 +33,14 @@ def before():
     return flown(BOTH, CHANGED_S, 0)
 
 
-def test_what_both_logs_lack_is_no_cause(before) -> None:
+def test_what_both_logs_lack_is_no_cause(before):
     found = diagnose_change(
         flown(BOTH, CHANGED_S, 1), before, model_of(BASE), motion=Motion.CONTINUOUS
     )
     assert found.verdict == "consistent" and found.causes == () and not found.unexplained.flagged
 
 
-def test_what_changed_is_named_by_the_command(before, tmp_path: Path, capsys) -> None:
+def test_what_changed_is_named_by_the_command(before, tmp_path, capsys):
     after = flown(replace(BOTH, effects={"linear_drag": DRAG}), CHANGED_S, 2)
     files = [tmp_path / name for name in ("after.npz", "before.npz", "model.json")]
     save_log(files[0], after)
@@ -58,7 +57,7 @@ ONSET_S, SECONDS = 17.3, 40.0
 ROLL, PITCH = 0.003, -0.002
 
 
-def truth(**effects: dict[str, float]) -> Truth:
+def truth(**effects):
     return replace(draw_base(np.random.default_rng(8)), motion="fine", effects=effects)
 
 

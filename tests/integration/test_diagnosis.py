@@ -6,8 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import gymnax
 import jax
@@ -23,8 +22,7 @@ from flytrack_env.effects import BY_NAME, LinearDrag
 from flytrack_env.motion import Motion
 from flytrack_env.plants import Simulator
 from flytrack_sysid import collect
-from flytrack_sysid.diagnosis import Diagnosis, DiagnosisError, diagnose, write_diagnosis
-from flytrack_sysid.diagnosis.result import Estimated
+from flytrack_sysid.diagnosis import DiagnosisError, diagnose, write_diagnosis
 from flytrack_sysid.log import FlightLog
 from tests.support.slow import slow_but
 
@@ -49,24 +47,24 @@ class Case(NamedTuple):
     held_out: np.ndarray | None = None
 
 
-def _drawn(rng: Rng) -> Truth:
+def _drawn(rng):
     return replace(draw_base(rng), motion="fine")
 
 
-def _measured(truth: Truth, clean: FlightLog, rng: Rng) -> Case:
+def _measured(truth, clean, rng):
     log = measure(clean, "sensors", rng)
     return Case(truth, model_of(truth), log, _blocks(log) % 2 == 1)
 
 
-def _blocks(log: FlightLog) -> np.ndarray:
+def _blocks(log):
     return np.floor(log.time / BLOCK_S).astype(int)
 
 
-def _flown(truth: Truth, rng: Rng) -> Case:
+def _flown(truth, rng):
     return _measured(truth, fly(truth, SECONDS, rng), rng)
 
 
-def _known(number: int, spikes: int = 0, **fields: Any) -> Case:
+def _known(number, spikes=0, **fields):
     """Return a flight of a plant that no seed changes, with some outliers of the velocity."""
     rng = np.random.default_rng([3, number])
     case = _flown(replace(_drawn(np.random.default_rng(3)), **fields), rng)
@@ -76,7 +74,7 @@ def _known(number: int, spikes: int = 0, **fields: Any) -> Case:
     return case
 
 
-def _in_training_only(rng: Rng) -> Case:
+def _in_training_only(rng):
     """Return a plant with drag that is absent from what is held out, each block a segment."""
     still = _drawn(rng)
     dragged = replace(still, effects={"linear_drag": draw_effect("linear_drag", rng, 0.4)})
@@ -90,10 +88,10 @@ def _in_training_only(rng: Rng) -> Case:
     return _measured(still, FlightLog(parts[0].time, channels, segment), rng)
 
 
-def _wind_in_hover(rng: Rng) -> Case:
+def _wind_in_hover(rng):
     """Return a flight that only hovers, with small corrections and one heading, in wind."""
 
-    def hover(sketch: pilot.Sketch) -> None:
+    def hover(sketch):
         sketch.wait(sketch.rng.uniform(2.0, 4.5))
         there = np.array(sketch.start_w) + 0.25 * sketch.rng.uniform(-1.0, 1.0, 3)
         speed = tuple(((there - sketch.pos_w) / 0.8).tolist())
@@ -111,7 +109,7 @@ def _wind_in_hover(rng: Rng) -> Case:
         return _flown(replace(truth, effects={"wind": wind}), rng)
 
 
-def _changed(field: str, size: float, rng: Rng) -> Case:
+def _changed(field, size, rng):
     """Return a plant of which the team believes an older base, flown as it is now.
 
     size: |ln factor| of the field's values is at most that, and at least half of it.
@@ -123,13 +121,13 @@ def _changed(field: str, size: float, rng: Rng) -> Case:
     return _flown(now, rng)._replace(model=model_of(believed))
 
 
-def _simulated(rng: Rng) -> Case:
+def _simulated(rng):
     """Return flights of the simulator itself, without noise, of all kinds."""
     log = collect(Simulator(), 1.0, int(rng.integers(2**31)))
     return Case(None, nominal_parameters(), log.select(log.segment % 3 != 2))
 
 
-def _broken(rng: Rng, channel: str, value: float) -> Case:
+def _broken(rng, channel, value):
     """Return a flight with one channel stuck at a value from the first row to the last."""
     case = _flown(_drawn(rng), rng)
     stuck = np.full_like(case.log[channel], value)
@@ -158,25 +156,25 @@ CASES: Mapping[str, Callable[[Rng], Case]] = {
 
 
 @pytest.fixture(scope="module")
-def diagnosed() -> Callable[[str], tuple[Case, Diagnosis]]:
+def diagnosed():
     """A case by name, and its diagnosis."""
     print(f"FLYTRACK_TEST_SEED={SEED}")
 
     @cache
-    def of(name: str) -> tuple[Case, Diagnosis]:
+    def of(name):
         case = CASES[name](np.random.default_rng([SEED, *name.encode()]))
         return case, diagnose(case.log, case.model, case.held_out)
 
     return of
 
 
-def is_within(value: float, estimate: Estimated) -> bool:
+def is_within(value, estimate):
     """Return whether a value lies in an estimate's interval, made wider by half."""
     return abs(value - estimate.value) <= WIDENED * estimate.half_width
 
 
 @pytest.mark.parametrize("name", slow_but(["drag"], CASES))
-def test_every_log_is_diagnosed_or_refused(name, diagnosed) -> None:
+def test_every_log_is_diagnosed_or_refused(name, diagnosed):
     """A diagnosis has what its schema says, in numbers that mean something."""
     try:
         case, found = diagnosed(name)
@@ -222,22 +220,20 @@ def test_every_log_is_diagnosed_or_refused(name, diagnosed) -> None:
 @pytest.mark.parametrize(
     ("name", "motion"), [("clean", Motion.CONTINUOUS), ("simulated", Motion.HANDOUT)]
 )
-def test_a_clean_plant_is_consistent_with_its_model(name, motion, diagnosed) -> None:
+def test_a_clean_plant_is_consistent_with_its_model(name, motion, diagnosed):
     _, found = diagnosed(name)
     assert found.causes == () and found.verdict == "consistent" and found.warnings == ()
     assert found.extended.motion is motion
 
 
-def test_a_hidden_effect_is_found_and_measured(diagnosed) -> None:
+def test_a_hidden_effect_is_found_and_measured(diagnosed):
     (cause,) = diagnosed("drag")[1].causes
     assert cause.effect == "linear_drag" and cause.heldout_gain > 0.0 and cause.lambda_ > 100.0
     assert all(is_within(DRAG[name], one) for name, one in cause.parameters.items())
 
 
 @pytest.mark.slow
-def test_late_motion_capture_is_named_and_corrected_and_outliers_told(
-    diagnosed, tmp_path: Path
-) -> None:
+def test_late_motion_capture_is_named_and_corrected_and_outliers_told(diagnosed, tmp_path):
     case, found = diagnosed("late")
     (cause,) = found.causes
     low, high = cause.parameters["latency_s"].ci95
@@ -259,13 +255,13 @@ def test_late_motion_capture_is_named_and_corrected_and_outliers_told(
 
 
 @pytest.mark.slow
-def test_what_no_list_has_is_flagged_and_not_named(diagnosed) -> None:
+def test_what_no_list_has_is_flagged_and_not_named(diagnosed):
     _, found = diagnosed("outside")
     assert found.causes == () and found.verdict == "unexplained"
     assert "heading" in found.unexplained.depends_on
 
 
-def test_the_extended_model_can_be_flown(diagnosed, tmp_path: Path) -> None:
+def test_the_extended_model_can_be_flown(diagnosed, tmp_path):
     case, found = diagnosed("drag")
     write_diagnosis(tmp_path, found, case.log)
     assert json.loads((tmp_path / "diagnosis.json").read_text()) == json.loads(
@@ -282,7 +278,7 @@ def test_the_extended_model_can_be_flown(diagnosed, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_gone_on_held_out_rows_is_no_cause(diagnosed) -> None:
+def test_what_is_gone_on_held_out_rows_is_no_cause(diagnosed):
     _, found = diagnosed("training_only")
     assert found.causes == ()
     assert found.unexplained.flagged and "time" in found.unexplained.depends_on
@@ -291,14 +287,14 @@ def test_what_is_gone_on_held_out_rows_is_no_cause(diagnosed) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["wind_in_hover", "wind_in_another_hover"])
-def test_a_hover_cannot_tell_wind_from_tilt(name, diagnosed) -> None:
+def test_a_hover_cannot_tell_wind_from_tilt(name, diagnosed):
     found, both = diagnosed(name)[1], {"wind", "thrust_tilt"}
     assert any(both <= {cause.effect, *cause.equivalent} for cause in found.causes)
     assert "headings" in [limit.fly for limit in found.not_identifiable if limit.effect in both]
 
 
 @pytest.mark.slow
-def test_other_base_parameters_are_named_and_measured(diagnosed) -> None:
+def test_other_base_parameters_are_named_and_measured(diagnosed):
     case, found = diagnosed("tau")
     by_name = dict(
         zip(("tau_roll", "tau_pitch", "tau_yaw", "tau_thrust"), case.truth.tau, strict=True)
@@ -313,7 +309,7 @@ def test_other_base_parameters_are_named_and_measured(diagnosed) -> None:
 
 
 @pytest.mark.slow
-def test_what_another_law_of_lift_leaves_is_not_named() -> None:
+def test_what_another_law_of_lift_leaves_is_not_named():
     line = plant(Trial("one", 91, seed=1))
     assert line["effects"] == ["translational_lift"]
     assert [cause["effect"] for cause in line["causes"]] == ["translational_lift"]

@@ -19,7 +19,6 @@ from benchmarks.loop.plants import EFFECTS, draw_plant_with_law
 from flytrack_bench.hidden import HiddenDrone, HiddenPlant, Start, drone
 from flytrack_bench.hidden.laws import STATELESS_KINDS
 from flytrack_env import nominal_parameters
-from flytrack_sysid.log import FlightLog
 from tests.support.hidden_flights import LOW_START, flown_in_floats, random_sticks, state_of
 from tests.support.simulated_flights import flown_by
 from tests.support.slow import slow_but
@@ -37,20 +36,20 @@ MINUTE_S = 60.0
 ARM = {"x": 0.03, "y": -0.02, "z": 0.01}
 
 
-def base(**effects: dict[str, float]) -> hidden.Truth:
+def base(**effects):
     return replace(hidden.draw_base(np.random.default_rng(3)), effects=effects)
 
 
-def flown(truth: hidden.Truth, seconds: float = MINUTE_S, seed: int = 1) -> FlightLog:
+def flown(truth, seconds=MINUTE_S, seed=1):
     return hidden.fly(truth, seconds, np.random.default_rng(seed))
 
 
-def open_loop(truth: hidden.Truth, count: int = 150, start: Start = START) -> dict[str, np.ndarray]:
+def open_loop(truth, count=150, start=START):
     """Return what a plant does, flown by random steps of the sticks."""
     return flown_in_floats(truth, random_sticks(count), start)
 
 
-def test_ground_effect_fades_with_the_height() -> None:
+def test_ground_effect_fades_with_the_height():
     low = START._replace(pos_w=(0.0, 0.0, 0.3))
     own = open_loop(base(ground_effect={"gain": 0.5, "height_m": 0.3}), 1, low)["f"]
     np.testing.assert_allclose(
@@ -59,7 +58,7 @@ def test_ground_effect_fades_with_the_height() -> None:
 
 
 # Laws that the package has as well are flown against its own (tests/unit/test_effect_laws.py).
-def test_an_accelerometer_off_the_centre_feels_the_turn() -> None:
+def test_an_accelerometer_off_the_centre_feels_the_turn():
     clean, moved = (flown(base(**own), seconds=4.0) for own in ({}, {"imu_offset": ARM}))
     arm, rates = np.array(list(ARM.values())), clean["w"][1:]
     expected = np.cross(rates, np.cross(rates, arm)) + np.cross(
@@ -70,8 +69,8 @@ def test_an_accelerometer_off_the_centre_feels_the_turn() -> None:
 
 
 @pytest.mark.parametrize("motion", hidden.MOTIONS)
-def test_a_flight_controller_shapes_the_sticks_before_the_lag(motion: str) -> None:
-    def at_full_stick(num_steps: int, **effects: dict[str, float]) -> HiddenDrone:
+def test_a_flight_controller_shapes_the_sticks_before_the_lag(motion):
+    def at_full_stick(num_steps, **effects):
         truth = replace(base(**effects), motion=motion)
         plant = HiddenDrone(truth, START, np.random.default_rng(0))
         for _ in range(num_steps):
@@ -92,12 +91,12 @@ def test_a_flight_controller_shapes_the_sticks_before_the_lag(motion: str) -> No
 
 
 @pytest.fixture(scope="module")
-def clean() -> FlightLog:
+def clean():
     return flown(hidden.draw_base(np.random.default_rng(0)), seed=0)
 
 
-def test_the_same_seed_gives_the_same_plant_and_log() -> None:
-    def log(seed: int) -> FlightLog:
+def test_the_same_seed_gives_the_same_plant_and_log():
+    def log(seed):
         rng = np.random.default_rng(seed)
         truth = replace(
             hidden.draw_truth(rng, 3), gust=hidden.draw_gust(rng), outside=hidden.draw_outside(rng)
@@ -112,7 +111,7 @@ def test_the_same_seed_gives_the_same_plant_and_log() -> None:
 
 
 @pytest.mark.parametrize("noise", ["sensors", "heavy", "coloured"])
-def test_noise_has_its_standard_deviation_tails_and_colour(noise: str, clean: FlightLog) -> None:
+def test_noise_has_its_standard_deviation_tails_and_colour(noise, clean):
     logs = [hidden.measure(clean, noise, np.random.default_rng(seed)) for seed in range(8)]
     rows = [np.searchsorted(clean.time, log.time - 1e-9) for log in logs]
     assert np.mean([len(log) for log in logs]) / len(clean) == pytest.approx(
@@ -129,7 +128,7 @@ def test_noise_has_its_standard_deviation_tails_and_colour(noise: str, clean: Fl
     assert all(low < colour < high for colour in colours)
 
 
-def test_the_accelerometer_feels_gusts() -> None:
+def test_the_accelerometer_feels_gusts():
     for std in (0.3, 1.5):
         seen = open_loop(replace(base(), gust=hidden.Gust(std, 0.3, 0.05)), 6000)
         # Thrust has no part in body x and y.
@@ -137,9 +136,7 @@ def test_the_accelerometer_feels_gusts() -> None:
         assert 0.04 < np.std(seen["w"] - open_loop(base(), 6000)["w"]) < 0.06
 
 
-def derivative(
-    own: hidden.Truth, time_s: float, x: np.ndarray, stick: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def derivative(own, time_s, x, stick):
     """Return dx/dt of position, velocity, attitude, lagged sticks, rates, slopes; and the force."""
     _, vel_w, quat, applied, rates, slopes = np.split(x, [3, 6, 10, 14, 17])
     change = (stick - applied) / np.array(own.tau)
@@ -163,7 +160,7 @@ def derivative(
     return np.concatenate([vel_w, acc_w, spin, change, slopes, bend]), force_b
 
 
-def integrated(own: hidden.Truth) -> dict[str, np.ndarray]:
+def integrated(own):
     """Return the same from DOP853, between the times of arriving commands and sensor readings."""
     sticks, rows = random_sticks(STEPS), np.arange(STEPS + 1) * STEP_S
     felt_s, tracked_s = rows[1:] - LATENCY_S % STEP_S, rows[1:] - MOCAP_S % STEP_S
@@ -178,7 +175,7 @@ def integrated(own: hidden.Truth) -> dict[str, np.ndarray]:
         number = int(np.floor((0.5 * (begin + end) - DELAY_S) / STEP_S))
         acting = sticks[max(number, 0)]
 
-        def slope(time_s: float, x: np.ndarray, acting: np.ndarray = acting) -> np.ndarray:
+        def slope(time_s, x, acting=acting):
             return derivative(own, time_s, x, acting)[0]
 
         x = solve_ivp(slope, (begin, end), x, "DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
@@ -194,11 +191,11 @@ def integrated(own: hidden.Truth) -> dict[str, np.ndarray]:
     return {name: np.array(values) for name, values in found.items()}
 
 
-def test_fine_motion_obeys_the_differential_equations(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fine_motion_obeys_the_differential_equations(monkeypatch):
     own = replace(base(**MOVING_EFFECTS), motion="fine", mocap_late_s=MOCAP_S)
     exact = integrated(own)
 
-    def errors() -> dict[str, float]:
+    def errors():
         seen = open_loop(own, STEPS)
         assert np.abs(np.linalg.norm(seen["q"], axis=1) - 1.0).max() < 1e-12
         return {name: float(np.abs(seen[name] - values).max()) for name, values in exact.items()}
@@ -211,8 +208,8 @@ def test_fine_motion_obeys_the_differential_equations(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("motion", hidden.MOTIONS)
-def test_late_motion_capture_and_effects_that_begin_in_the_log(motion: str) -> None:
-    def log(own: hidden.Truth) -> FlightLog:
+def test_late_motion_capture_and_effects_that_begin_in_the_log(motion):
+    def log(own):
         return hidden.fly(replace(own, motion=motion), 4.0, np.random.default_rng(2))
 
     rng = np.random.default_rng(5)
@@ -229,9 +226,7 @@ def test_late_motion_capture_and_effects_that_begin_in_the_log(motion: str) -> N
     assert with_onset.time[np.argmax(begun)] == pytest.approx(sudden.onset_s, abs=0.02)
 
 
-def check_flight(
-    truth: hidden.Truth, without: hidden.Truth | None, rng: np.random.Generator
-) -> None:
+def check_flight(truth, without, rng):
     """Compare both flights; that without what is tested, if any, has to differ."""
     commands = np.repeat(rng.uniform(-1.0, 1.0, (LOOP_STEPS // 4, 4)), 4, axis=0).astype(np.float32)
     expected = flown_in_floats(truth, commands)["x"]

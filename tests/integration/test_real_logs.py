@@ -7,7 +7,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from flytrack_sysid import Imported, diagnose, import_log
+from flytrack_sysid import diagnose, import_log
 from flytrack_sysid.importing.units import GRAVITY
 from flytrack_sysid.plausibility import summed_turns, windows_of
 from tests.support.real_logs import CRAZYFLIE, import_shared, shared
@@ -18,7 +18,7 @@ WINDOW_S = 0.3
 FLIGHTS = table("real_flights")
 
 
-def check(imported: Imported, least: float, tolerance: float) -> None:
+def check(imported, least, tolerance):
     """Assert that sensors agree on the motion over 0.3 s.
 
     Gyroscope is compared with attitude, accelerometer with velocity, velocity with position.

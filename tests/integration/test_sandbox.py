@@ -3,9 +3,6 @@
 import hashlib
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +34,7 @@ LIMITS = ResourceLimits(cpu_s=1, memory_bytes=2**27, wall_s=30.0)
 
 
 @pytest.fixture
-def do(tmp_path: Path) -> Callable[..., bytes]:
+def do(tmp_path):
     """The function above, in the sandbox."""
     (tmp_path / "function.py").write_text(FUNCTION)
     return lambda argument, content=b"", limits=LIMITS: sandbox.run(
@@ -45,7 +42,7 @@ def do(tmp_path: Path) -> Callable[..., bytes]:
     )
 
 
-def test_a_result_comes_back(do: Callable[..., bytes]) -> None:
+def test_a_result_comes_back(do):
     assert do("reverse", b"\x00\n12") == b"21\n\x00"
 
 
@@ -61,9 +58,7 @@ def test_a_result_comes_back(do: Callable[..., bytes]) -> None:
         ("write", "File too large|SIGXFSZ", None),
     ],
 )
-def test_failures_are_reported(
-    argument: str, message: str, kind: str | None, do: Callable[..., bytes], tmp_path: Path
-) -> None:
+def test_failures_are_reported(argument, message, kind, do, tmp_path):
     limits = LIMITS._replace(wall_s=0.5) if argument == "sleep" else LIMITS
     with pytest.raises(SandboxError, match=message) as caught:
         do(argument, str(tmp_path / "written").encode(), limits)
@@ -72,12 +67,12 @@ def test_failures_are_reported(
 
 
 @pytest.fixture
-def trials(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
+def trials(monkeypatch):
     """The files that are tried from here on; none has passed yet."""
     seen: list[bytes] = []
     run = sandbox.run
 
-    def count(file: Path, function: str, argument: Any, content: bytes, *rest: Any) -> bytes:
+    def count(file, function, argument, content, *rest):
         seen.append(content)
         return run(file, function, argument, content, *rest)
 
@@ -86,9 +81,7 @@ def trials(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
     return seen
 
 
-def test_a_black_box_is_tried_once_and_the_shipped_one_never(
-    trials: list[bytes], tmp_path: Path
-) -> None:
+def test_a_black_box_is_tried_once_and_the_shipped_one_never(trials, tmp_path):
     assert hashlib.sha256(SHIPPED.read_bytes()).hexdigest() == blackbox.SHIPPED_SHA256
     load(SHIPPED)
     assert trials == []
@@ -98,7 +91,7 @@ def test_a_black_box_is_tried_once_and_the_shipped_one_never(
     assert len(trials) == 1
 
 
-def test_a_script_without_a_guard_may_load_a_black_box(tmp_path: Path) -> None:
+def test_a_script_without_a_guard_may_load_a_black_box(tmp_path):
     write_artifact(tmp_path / "a.bin", lambda x, u: 3.0 * x)
     (tmp_path / "script.py").write_text(
         "print('ran once')\nfrom flytrack_env import blackbox\nprint(blackbox.load('a.bin'))\n"
@@ -109,17 +102,17 @@ def test_a_script_without_a_guard_may_load_a_black_box(tmp_path: Path) -> None:
     assert done.stdout.splitlines() == ["ran once", "BlackBox('a.bin', state_size=21)"], done.stderr
 
 
-def endless(x: jax.Array, u: jax.Array) -> jax.Array:
+def endless(x, u):
     """Never end from the start state."""
     return jax.lax.while_loop(lambda c: c[0] >= 0.0, lambda c: 0.5 * c + 1.0, x)
 
 
-def solving(x: jax.Array, u: jax.Array) -> jax.Array:
+def solving(x, u):
     """Call LAPACK."""
     return x.at[:4].set(jnp.linalg.svd(jnp.eye(4) + u, compute_uv=False))
 
 
-def calling(x: jax.Array, u: jax.Array) -> jax.Array:
+def calling(x, u):
     """Call an unknown function."""
     return jax.ffi.ffi_call("my callback", jax.ShapeDtypeStruct(x.shape, x.dtype))(x)
 
@@ -132,18 +125,14 @@ def calling(x: jax.Array, u: jax.Array) -> jax.Array:
         (calling, "found a call of my callback, expected a pure function that calls nothing"),
     ],
 )
-def test_hostile_black_boxes_are_refused(
-    step: Callable[..., Any], message: str, tmp_path: Path
-) -> None:
+def test_hostile_black_boxes_are_refused(step, message, tmp_path):
     checks = [export.DisabledSafetyCheck.custom_call("my callback")]
     path = write_artifact(tmp_path / "a.bin", step, disabled_checks=checks)
     with pytest.raises(BlackBoxError, match=rf"^{path}: .*({message})"):
         load(path, limits=ResourceLimits(cpu_s=1) if step is endless else ResourceLimits())
 
 
-def test_a_trusted_file_is_not_tried_and_may_call_lapack(
-    trials: list[bytes], tmp_path: Path
-) -> None:
+def test_a_trusted_file_is_not_tried_and_may_call_lapack(trials, tmp_path):
     box = load(write_artifact(tmp_path / "a.bin", solving), limits=None)
     assert trials == []
     np.testing.assert_allclose(box.step_vector(np.zeros(21), np.zeros(4))[:4], 1.0, rtol=1e-5)

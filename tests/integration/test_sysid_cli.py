@@ -1,7 +1,6 @@
 """The commands of the identification: from a plant to a model and its report."""
 
 import json
-from pathlib import Path
 
 import gymnax
 import numpy as np
@@ -21,7 +20,7 @@ OTHER = AIRLESS._replace(mass=1.0, lag=TAUS, max_rate=(618.0, 618.0, 120.0), thr
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(tmp_path_factory):
     """A folder in which the command collected, fitted and validated a plant of other parameters."""
     out = tmp_path_factory.mktemp("sysid")
     build(OTHER, out / "other.bin")

@@ -8,7 +8,7 @@ import json
 import re
 import struct
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ FLIP = np.array([1.0, -1.0, -1.0])  # FLU to FRD; north, west, up to NED
 Rows = list[tuple[Any, ...]]
 
 
-def flying(num_rows: int = 30, step_s: float = 0.01, start_s: float = 1.0) -> FlightLog:
+def flying(num_rows=30, step_s=0.01, start_s=1.0):
     """Return a steady turn with the throttle rising."""
     time = start_s + step_s * np.arange(num_rows)
     channels = {
@@ -36,7 +36,7 @@ def flying(num_rows: int = 30, step_s: float = 0.01, start_s: float = 1.0) -> Fl
     return FlightLog(time, channels, np.zeros(num_rows, int))
 
 
-def _rows(stamps: np.ndarray, *columns: np.ndarray) -> Rows:
+def _rows(stamps, *columns):
     """Return rows of a stamp and numbers."""
     values = np.column_stack(columns).tolist()
     return [(int(stamp), *row) for stamp, row in zip(stamps, values, strict=True)]
@@ -51,12 +51,12 @@ PX4_PARAMETERS |= {"MC_ACRO_Y_MAX": 90.0, "MC_YAWRATE_MAX": 180.0}
 Topics = dict[str, tuple[Any, ...]]
 
 
-def ulog_message(kind: str, content: bytes) -> bytes:
+def ulog_message(kind, content):
     """Return a message of a ULog file."""
     return struct.pack("<Hc", len(content), kind.encode()) + content
 
 
-def ulog(topics: Topics, parameters: dict[str, float] = PX4_PARAMETERS) -> bytes:
+def ulog(topics, parameters=PX4_PARAMETERS):
     """Return a PX4 log of topics: their fields but the time, and the rows of each instance."""
     definitions, data, number = ulog_message("B", bytes(40)), b"", 0
     for name, value in parameters.items():
@@ -75,7 +75,7 @@ def ulog(topics: Topics, parameters: dict[str, float] = PX4_PARAMETERS) -> bytes
     return b"ULog\x01\x12\x35" + struct.pack("<BQ", 1, 0) + definitions + data
 
 
-def ulog_topics(log: FlightLog) -> Topics:
+def ulog_topics(log):
     """Return the topics of a flight: FRD and NED, all at the same times."""
     stamps, level = np.round(1e6 * log.time), np.tile([1.0, 0.0, 0.0, 0.0], (len(log), 1))
     attitude = log["q"] * [1.0, 1.0, -1.0, -1.0] if "q" in log else level
@@ -96,7 +96,7 @@ def ulog_topics(log: FlightLog) -> Topics:
     return topics
 
 
-def write_ulog(folder: Path, log: FlightLog) -> tuple[Path, None]:
+def write_ulog(folder, log):
     """Write a PX4 log."""
     (folder / "a.ulg").write_bytes(ulog(ulog_topics(log)))
     return folder / "a.ulg", None
@@ -116,7 +116,7 @@ BLACKBOX_NAMES = [
 BLACKBOX_NAMES += [f"{sensor}[{axis}]" for sensor in ("gyroADC", "accSmooth") for axis in range(3)]
 
 
-def _variable_bytes(value: int, is_signed: bool) -> bytes:
+def _variable_bytes(value, is_signed):
     """Return a whole number as blackbox logs have it: zigzag if signed, seven bits a byte."""
     rest = (value << 1 if value >= 0 else (-value << 1) - 1) if is_signed else value
     content = bytearray()
@@ -127,10 +127,10 @@ def _variable_bytes(value: int, is_signed: bool) -> bytes:
 
 
 def blackbox(
-    rows: np.ndarray,
-    names: list[str] = BLACKBOX_NAMES,
-    headers: dict[str, str] = BLACKBOX_HEADERS,
-) -> bytes:
+    rows,
+    names=BLACKBOX_NAMES,
+    headers=BLACKBOX_HEADERS,
+):
     """Return a blackbox log of full frames only: rows (num_rows, len(names)) of whole numbers."""
     signed = [int(name not in ("loopIteration", "time")) for name in names]
     lines = {
@@ -149,7 +149,7 @@ def blackbox(
     return content + b"E\xffEnd of log\x00"
 
 
-def blackbox_frames(log: FlightLog) -> np.ndarray:
+def blackbox_frames(log):
     """Return frames: setpoints and gyro in deg/s, accelerometer in 1/2048 g, in whole numbers."""
     columns = [
         np.arange(len(log)),
@@ -163,7 +163,7 @@ def blackbox_frames(log: FlightLog) -> np.ndarray:
     return np.round(np.column_stack(columns)).astype(int)
 
 
-def write_betaflight(folder: Path, log: FlightLog) -> tuple[Path, None]:
+def write_betaflight(folder, log):
     """Write a blackbox log."""
     (folder / "a.bbl").write_bytes(blackbox(blackbox_frames(log)))
     return folder / "a.bbl", None
@@ -186,10 +186,10 @@ Messages = dict[str, tuple[str, str, Rows]]
 
 
 def dataflash(
-    messages: Messages,
-    parameters: dict[str, float] = COPTER_PARAMETERS,
-    text: str = "ArduCopter V4.5.1 (d4a1b2c3)",
-) -> bytes:
+    messages,
+    parameters=COPTER_PARAMETERS,
+    text="ArduCopter V4.5.1 (d4a1b2c3)",
+):
     """Return an ArduPilot log; messages are written one kind after the other."""
     stored = [(0, name, value) for name, value in parameters.items()]
     messages = {
@@ -199,10 +199,10 @@ def dataflash(
         **messages,
     }
 
-    def pattern(types: str) -> str:
+    def pattern(types):
         return "<" + "".join(DATAFLASH_TYPES[kind] for kind in types)
 
-    def packed(number: int, types: str, row: tuple[Any, ...]) -> bytes:
+    def packed(number, types, row):
         values = []
         for kind, value in zip(types, row, strict=True):
             is_text = isinstance(value, str)
@@ -217,7 +217,7 @@ def dataflash(
     return formats + rows
 
 
-def dataflash_messages(log: FlightLog) -> Messages:
+def dataflash_messages(log):
     """Return the messages of a flight: FRD and NED, degrees, all at the same times."""
     stamps, zero = np.round(1e6 * log.time), np.zeros(len(log))
     setpoints = (log["u"][:, :3] * COPTER_FULL_STICK_DEG_S * FLIP).T
@@ -250,7 +250,7 @@ def dataflash_messages(log: FlightLog) -> Messages:
     return messages
 
 
-def write_dataflash(folder: Path, log: FlightLog) -> tuple[Path, None]:
+def write_dataflash(folder, log):
     """Write an ArduPilot log."""
     (folder / "a.bin").write_bytes(dataflash(dataflash_messages(log)))
     return folder / "a.bin", None
@@ -262,19 +262,19 @@ STICK_NAMES, SENSOR_NAMES = ("roll", "pitch", "yaw", "thrust"), ("p", "q", "r", 
 NAMES = (*STICK_NAMES, *SENSOR_NAMES, "volts")
 
 
-def _values(log: FlightLog) -> np.ndarray:
+def _values(log):
     """Return columns of the names above, (num_rows, 11); rates in deg/s."""
     return np.column_stack([log["u"], np.rad2deg(log["w"]), log["f"], log["v_bat"]])
 
 
-def write_mapping(folder: Path, clock: str = "", sticks: str = "", sensors: str = "") -> Path:
+def write_mapping(folder, clock="", sticks="", sensors=""):
     """Write a mapping of the columns, which have names with something before them."""
     columns = read_mapping("columns").format(sticks=sticks, sensors=sensors)
     (folder / "map.toml").write_text(clock + columns)
     return folder / "map.toml"
 
 
-def usd_log(events: dict[str, tuple[dict[str, str], np.ndarray]], version: int = 2) -> bytes:
+def usd_log(events, version=2):
     """Return a Crazyflie's uSD log; each event has variables, and rows with the time in s first."""
     stamp, per_s = {1: ("I", 1e3), 2: ("Q", 1e6)}[version]
     content, records = struct.pack("<BHH", 0xBC, version, len(events)), b""
@@ -291,14 +291,14 @@ def usd_log(events: dict[str, tuple[dict[str, str], np.ndarray]], version: int =
     return content + struct.pack("<I", zlib.crc32(content))
 
 
-def write_usd(folder: Path, log: FlightLog) -> tuple[Path, Path]:
+def write_usd(folder, log):
     """Write a uSD log."""
     rows = np.column_stack([log.time, _values(log)])
     (folder / "log00").write_bytes(usd_log({"fixedFrequency": (dict.fromkeys(NAMES, "f"), rows)}))
     return folder / "log00", write_mapping(folder)
 
 
-def save_messages(path: Path, messages: Iterable[tuple[str, int, Any]]) -> None:
+def save_messages(path, messages):
     """Write an MCAP file of JSON messages: topic, time in ns, and content."""
     from mcap.writer import Writer
 
@@ -314,7 +314,7 @@ def save_messages(path: Path, messages: Iterable[tuple[str, int, Any]]) -> None:
         writer.finish()
 
 
-def write_bag(folder: Path, log: FlightLog) -> tuple[Path, Path]:
+def write_bag(folder, log):
     """Write an MCAP file of messages with stamps, recorded at a steady rate."""
     messages, step_ns = [], round(1e9 * np.median(np.diff(log.time)))
     for row, (stamp_s, values) in enumerate(zip(log.time, _values(log), strict=True)):
@@ -326,17 +326,17 @@ def write_bag(folder: Path, log: FlightLog) -> tuple[Path, Path]:
     return folder / "a.mcap", write_mapping(folder, "", "/flight:", "/flight:")
 
 
-def _save_csv(path: Path, names: Iterable[str], *columns: np.ndarray) -> None:
+def _save_csv(path, names, *columns):
     np.savetxt(path, np.column_stack(columns), "%.9f", ",", header=",".join(names), comments="")
 
 
-def write_csv(folder: Path, log: FlightLog) -> tuple[Path, Path]:
+def write_csv(folder, log):
     """Write a CSV file."""
     _save_csv(folder / "a.csv", ["t", *NAMES], log.time, _values(log))
     return folder / "a.csv", write_mapping(folder, '[time]\ncolumn = "t"\nunit = "s"\n')
 
 
-def write_csv_files(folder: Path, log: FlightLog) -> tuple[Path, Path]:
+def write_csv_files(folder, log):
     """Write two CSV files, that of the sticks 0.5 ms earlier, in ms from 50 s on."""
     flight, values = folder / "flight", _values(log)
     flight.mkdir()

@@ -13,7 +13,7 @@ TAU_THRUST_S = 0.036
 NOISE = {"w": 0.02, "f": 0.3}  # rad/s, m/s^2: idle propellers shake
 
 
-def stands_flies_and_lands(step_s: float = STEP_S, seed: int = 0) -> FlightLog:
+def stands_flies_and_lands(step_s=STEP_S, seed=0):
     """Return a log that stands until TAKE_OFF_S and from LANDING_S on.
 
     Thrust is linear in throttle.
@@ -39,12 +39,12 @@ def stands_flies_and_lands(step_s: float = STEP_S, seed: int = 0) -> FlightLog:
 
 
 def falls(
-    kind: str,
-    noise: float = 1.0,
-    terminal_speed: float = 12.0,
-    throttle: float = 0.0,
-    seed: int = 0,
-) -> FlightLog:
+    kind,
+    noise=1.0,
+    terminal_speed=12.0,
+    throttle=0.0,
+    seed=0,
+):
     """Return a flight of 10 s, a fall of 10 s that does not turn, and a flight of 10 s.
 
     Args: kind: "ballistic", without drag, or "descent", on quadratic drag, until drag carries the
@@ -72,7 +72,7 @@ def falls(
     return FlightLog(STEP_S * np.arange(num_rows), channels, np.zeros(num_rows, int))
 
 
-def with_pose(log: FlightLog) -> FlightLog:
+def with_pose(log):
     """Return the log with level attitude and the velocity that its force integrates to."""
     acc = log["f"] - [0.0, 0.0, GRAVITY]
     is_flying = (log.time >= TAKE_OFF_S) & (log.time < LANDING_S)

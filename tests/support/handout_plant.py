@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.excitation import script
-from flytrack_sysid.log import FlightLog, log_of_states
+from flytrack_sysid.log import log_of_states
 
 GRAVITY = 9.80665
 HOVER = -0.25  # about what holds the weight of ``HandoutPlant``
@@ -29,12 +29,12 @@ class HandoutPlant:
     dt: float = 0.01
     gravity: float = GRAVITY
 
-    def model(self) -> ModelParameters:
+    def model(self):
         """Return what a fit without effects should find."""
         arrays = map(np.array, (self.tau, self.coeffs, self.max_rate))
         return ModelParameters(*arrays, 1.0, self.gravity, self.drain)
 
-    def __call__(self, x: np.ndarray, u: np.ndarray, dt: float | None = None) -> np.ndarray:
+    def __call__(self, x, u, dt=None):
         """Return the state ``dt`` later, (..., 21)."""
         dt = self.dt if dt is None else dt
         x = np.asarray(x, float)
@@ -67,13 +67,13 @@ class HandoutPlant:
         )
 
 
-def rotation(quat: np.ndarray) -> np.ndarray:
+def rotation(quat):
     """Return rotation matrices, body to world, (..., 3, 3)."""
     matrices = Rotation.from_quat(quat.reshape(-1, 4), scalar_first=True).as_matrix()
     return matrices.reshape(*quat.shape[:-1], 3, 3)
 
 
-def excited(plant: HandoutPlant, skip: int = 1, repeat: int = 1, jitter: float = 0.0) -> FlightLog:
+def excited(plant, skip=1, repeat=1, jitter=0.0):
     """Return the log of the excitation on a plant, float64, without noise.
 
     skip, repeat: of commands, for steps of 0.01 s times skip over repeat. jitter: of steps,

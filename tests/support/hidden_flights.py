@@ -1,35 +1,31 @@
 """Flights of hidden plants: scripted as logs, and by given commands in plain floats."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from benchmarks.hidden import Truth, draw_base, fly, measure
+from benchmarks.hidden import draw_base, fly, measure
 from flytrack_bench.hidden import HiddenDrone, Start
-from flytrack_sysid.log import FlightLog
 
 LOW_START = Start((1.0, -2.0, 3.0), 0.7, 23.5, -0.3)
 # The state as the handout has it; what is tracked and what is felt of each step.
 COLUMNS = {"x": 21, "p": 3, "v": 3, "q": 4, "f": 3, "w": 3, "slope": 3}
 
 
-def scripted(
-    seed: int, seconds: float, noise: str = "sensors", **changes: Any
-) -> tuple[Truth, FlightLog]:
+def scripted(seed, seconds, noise="sensors", **changes):
     """Return a plant of a seed, with some fields replaced, and the measured log of its flight."""
     rng = np.random.default_rng(seed)
     truth = replace(draw_base(rng), **changes)
     return truth, measure(fly(truth, seconds, rng), noise, rng)
 
 
-def state_of(plant: HiddenDrone) -> np.ndarray:
+def state_of(plant):
     """Return the handout's vector (21,) of a plant."""
     own = (plant.pos_w, plant.vel_w, plant.acc_w, plant.quat, plant.rates_b, plant.applied)
     return np.concatenate([*own, [plant.battery_v]])
 
 
-def flown_in_floats(truth: Truth, commands: Any, start: Start = LOW_START) -> dict[str, np.ndarray]:
+def flown_in_floats(truth, commands, start=LOW_START):
     """Return ``COLUMNS`` after each command, (num_steps, n)."""
     plant, rows = HiddenDrone(truth, start, np.random.default_rng(5)), []
     for command in np.asarray(commands, float).tolist():
@@ -39,7 +35,7 @@ def flown_in_floats(truth: Truth, commands: Any, start: Start = LOW_START) -> di
     return dict(zip(COLUMNS, parts, strict=True))
 
 
-def random_sticks(num_steps: int, seed: int = 4) -> np.ndarray:
+def random_sticks(num_steps, seed=4):
     """Return steps of the sticks at random, each held for ten steps, (num_steps, 4)."""
     sticks = np.random.default_rng(seed).uniform(-1.0, 1.0, (-(-num_steps // 10), 4)) * [
         0.5,

@@ -7,16 +7,14 @@ from flytrack_sysid import FlightLog
 from tests.support.handout_plant import GRAVITY
 
 
-def motion(seed: int, time: np.ndarray) -> np.ndarray:
+def motion(seed, time):
     """Return smooth motion of three axes, (num_rows, 3): sines of 0.3 to 2.5 Hz."""
     rng = np.random.default_rng(seed)
     rates, phases = rng.uniform(2.0, 15.0, (3, 5)), rng.uniform(0.0, 2.0 * np.pi, (3, 5))
     return np.sin(time[:, None, None] * rates + phases).sum(axis=2)
 
 
-def flight(
-    time: np.ndarray, late_q_s: float = 0.0, late_v_s: float = 0.0, late_p_s: float = 0.0
-) -> FlightLog:
+def flight(time, late_q_s=0.0, late_v_s=0.0, late_p_s=0.0):
     """Return the log of a made-up flight; q, v and p may be written down late."""
     fine = np.arange(time[0] - 1.0, time[-1] + 1.0, 1e-3)
     turns = motion(1, 0.5 * (fine[1:] + fine[:-1])) * 1e-3
@@ -31,7 +29,7 @@ def flight(
     pos_w = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5e-3 * (vel_w[1:] + vel_w[:-1]), axis=0)])
     force_b = attitude.inv().apply(acc_w + np.array([0.0, 0.0, GRAVITY]))
 
-    def at(values: np.ndarray, late_s: float = 0.0) -> np.ndarray:
+    def at(values, late_s=0.0):
         return values[np.round((time - late_s - fine[0]) * 1e3).astype(int)]
 
     channels = {
@@ -49,7 +47,7 @@ def flight(
 TIME_S = 0.01 * np.arange(2000)
 
 
-def noisy(log: FlightLog, seed: int) -> FlightLog:
+def noisy(log, seed):
     """Return a log as sensors would have it."""
     rng = np.random.default_rng(seed)
     sizes = {"w": 0.05, "f": 0.5, "v": 0.02, "p": 0.005, "q": 0.002}

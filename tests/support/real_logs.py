@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from flytrack_sysid import Imported, import_log
+from flytrack_sysid import import_log
 from tests.support.pages import ROOT
 
 VARIABLE = "FLYTRACK_SHARED_DATA"
 CRAZYFLIE, BETAFLIGHT = "crazyflie_rate_flights", "betaflight_acro_log"
 
 
-def shared(name: str) -> Path:
+def shared(name):
     """Return a folder of measured flights; skips the test where it is absent."""
     folder = Path(os.environ.get(VARIABLE, ROOT.parent / "shared" / "data")) / name
     if not folder.is_dir():
@@ -22,7 +22,7 @@ def shared(name: str) -> Path:
 
 
 @cache
-def import_shared(where: str, form: str, mapping: str | None) -> Imported:
+def import_shared(where, form, mapping):
     """Return a measured flight, imported once; where: its folder and file."""
     folder, _, file = where.partition("/")
     return import_log(shared(folder) / file, form, mapping)

@@ -1,16 +1,14 @@
 """Simulated flights with every effect in the model: one compiled program for all tests."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.dynamics import ModelParameters, move, nominal_parameters, read_sensors, sensed
+from flytrack_env.dynamics import move, nominal_parameters, read_sensors, sensed
 from flytrack_env.effects import EFFECTS, MOST_STEPS
-from flytrack_env.plants import Plant, Simulator, SimulatorState
-from flytrack_env.state import BATTERY, QUATERNION, Action, Drone, pack, unpack, unpack_action
+from flytrack_env.plants import Simulator, SimulatorState
+from flytrack_env.state import BATTERY, QUATERNION, Action, pack, unpack, unpack_action
 
 DT, NUM_STEPS = 0.01, 200
 NOMINAL = nominal_parameters()
@@ -21,10 +19,10 @@ _SIMULATOR = Simulator(MOST_STEPS)
 
 
 @jax.jit
-def fly(drone: Drone, commands: jax.Array, model: ModelParameters, dt: float = DT) -> jax.Array:
+def fly(drone, commands, model, dt=DT):
     """Return state, gyro, accelerometer and pose after each command, packed, (num_steps, 37)."""
 
-    def one(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+    def one(state, action):
         moved = move(*state, unpack_action(action), dt, model)
         reading = read_sensors(moved, model)
         after = SimulatorState(moved.after, moved.memories)
@@ -37,11 +35,11 @@ def fly(drone: Drone, commands: jax.Array, model: ModelParameters, dt: float = D
 
 
 def flown(
-    parameters: Any = (),
-    commands: Any = None,
-    drone: Drone | None = None,
-    model: ModelParameters = NOMINAL,
-) -> np.ndarray:
+    parameters=(),
+    commands=None,
+    drone=None,
+    model=NOMINAL,
+):
     """Return a flight, (num_steps, 37), float64, with one effect or a tuple of them."""
     effects = parameters if type(parameters) is tuple else (parameters,)
     full = model._replace(effects=ALL_NEUTRAL.effects).with_effects(*effects)
@@ -54,26 +52,24 @@ def flown(
     ]
 
 
-def flown_by(
-    plant: Plant, model: ModelParameters, start: jax.Array, commands: jax.Array
-) -> jax.Array:
+def flown_by(plant, model, start, commands):
     """Return a plant's packed states after each command, (num_steps, 21)."""
 
-    def one(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+    def one(state, action):
         after = plant.step(state, unpack_action(action), DT, model)
         return after, pack(plant.drone(after))
 
     return jax.lax.scan(one, plant.reset(unpack(start), model), commands)[1]
 
 
-def held(num_steps: int = 1, **sticks: float) -> np.ndarray:
+def held(num_steps=1, **sticks):
     """Return commands (num_steps, 4) that hold sticks; those not named are 0."""
     return np.tile(
         np.array(Action(**{**dict.fromkeys(Action._fields, 0.0), **sticks})), (num_steps, 1)
     )
 
 
-def drone_with(**fields: Any) -> Drone:
+def drone_with(**fields):
     """Return a drone, level and at rest 1 km up, some of whose fields are replaced, float32."""
     x = np.zeros(21, np.float32)
     x[2], x[QUATERNION.start], x[BATTERY] = 1e3, 1.0, 24.0
@@ -82,7 +78,7 @@ def drone_with(**fields: Any) -> Drone:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), drone._replace(**fields))
 
 
-def random_drone(seed: int) -> Drone:
+def random_drone(seed):
     """Return a drone near the ground in a random attitude, fast, with sticks off centre."""
     rng = np.random.default_rng(seed)
     return drone_with(
@@ -94,6 +90,6 @@ def random_drone(seed: int) -> Drone:
     )
 
 
-def random_commands(seed: int, num_steps: int) -> np.ndarray:
+def random_commands(seed, num_steps):
     """Return commands all over the sticks' range, (num_steps, 4)."""
     return np.random.default_rng([seed, 1]).uniform(-1.0, 1.0, (num_steps, 4)).astype(np.float32)

@@ -1,7 +1,6 @@
 """Random logs, and their columns in files, right or wrong."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,14 +11,12 @@ SUFFIXES = (".npz", ".csv")
 NUM_ROWS = 6
 
 
-def read_mapping(name: str) -> str:
+def read_mapping(name):
     """Return the text of a mapping of a file that a test writes."""
     return (MAPPINGS / f"{name}.toml").read_text(encoding="utf-8")
 
 
-def make_log(
-    seed: int = 0, num_rows: int = NUM_ROWS, names: tuple[str, ...] = tuple(CHANNELS)
-) -> FlightLog:
+def make_log(seed=0, num_rows=NUM_ROWS, names=tuple(CHANNELS)):
     """Return a log of random numbers in two segments that every check of a file passes."""
     rng = np.random.default_rng(seed)
     channels = {name: rng.standard_normal((num_rows, len(CHANNELS[name]))) for name in names}
@@ -30,7 +27,7 @@ def make_log(
     return FlightLog(np.cumsum(rng.uniform(1e-3, 0.1, num_rows)), channels, segment)
 
 
-def columns_of(log: FlightLog) -> dict[str, np.ndarray]:
+def columns_of(log):
     """Return the columns of a log's file, by name."""
     columns = {"t": log.time.copy(), "segment": log.segment.copy()}
     for name, values in log.channels.items():
@@ -38,7 +35,7 @@ def columns_of(log: FlightLog) -> dict[str, np.ndarray]:
     return columns
 
 
-def write(path: Path, columns: dict[str, Any]) -> None:
+def write(path, columns):
     """Write columns as they are, right or wrong."""
     if path.suffix == ".npz":
         np.savez(path, **columns)
@@ -48,7 +45,7 @@ def write(path: Path, columns: dict[str, Any]) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def assert_same_log(found: FlightLog, expected: FlightLog) -> None:
+def assert_same_log(found, expected):
     np.testing.assert_array_equal(found.time, expected.time)
     np.testing.assert_array_equal(found.segment, expected.segment)
     assert set(found.channels) == set(expected.channels)

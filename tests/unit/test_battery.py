@@ -1,8 +1,6 @@
 """A model's battery: where episodes start and end, what the policy sees, and what is warned of."""
 
 import json
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import gymnax
@@ -31,13 +29,13 @@ NUM_STARTS = 256
 BATTERY_ROW = 22  # of the observation
 
 
-def craft_model(cells: int, mass_kg: float) -> Any:
+def craft_model(cells, mass_kg):
     volts = (CELL_V[0] * cells, CELL_V[1] * cells)
     return Craft((800.0, 800.0, 500.0), mass_kg, volts).nominal_model("a test")
 
 
 @pytest.mark.parametrize(("cells", "mass_kg"), CRAFTS)
-def test_episodes_stay_within_the_battery_of_the_craft(cells: int, mass_kg: float) -> None:
+def test_episodes_stay_within_the_battery_of_the_craft(cells, mass_kg):
     model = craft_model(cells, mass_kg)
     assert model.battery == Battery(4.2 * cells, 3.4 * cells, 3.4 * cells, 4.2 * cells)
     env, params = gymnax.make("FlyTrack-v0", model=model)
@@ -51,7 +49,7 @@ def test_episodes_stay_within_the_battery_of_the_craft(cells: int, mass_kg: floa
     np.testing.assert_allclose(observations[:, BATTERY_ROW], expected, atol=2e-5)
 
 
-def test_an_episode_ends_at_the_empty_voltage_of_its_craft() -> None:
+def test_an_episode_ends_at_the_empty_voltage_of_its_craft():
     env = FlyTrack(model=craft_model(4, 0.6))
     params = env.default_params
     drone, gate = env.sample_start(jnp.uint32(0), params)
@@ -62,7 +60,7 @@ def test_an_episode_ends_at_the_empty_voltage_of_its_craft() -> None:
         assert bool(info["battery_empty"]) == is_empty
 
 
-def test_gymnasium_takes_the_voltages_of_the_craft() -> None:
+def test_gymnasium_takes_the_voltages_of_the_craft():
     env = gymnasium.make("flytrack_env:FlyTrack-v0", model=craft_model(1, 0.032)).unwrapped
     observation, _ = env.reset(seed=0, options={"battery_v": 4.2})
     assert observation[BATTERY_ROW] == pytest.approx(1.0, abs=1e-4)
@@ -70,7 +68,7 @@ def test_gymnasium_takes_the_voltages_of_the_craft() -> None:
         env.reset(options={"battery_v": 23.0})
 
 
-def write(path: Path, **fields: Any) -> Path:
+def write(path, **fields):
     save_model(path, nominal_parameters(), {})
     document = json.loads(path.read_text(encoding="utf-8"))
     del document["battery"]
@@ -78,7 +76,7 @@ def write(path: Path, **fields: Any) -> Path:
     return path
 
 
-def test_a_model_file_without_a_battery_is_warned_of(tmp_path: Path) -> None:
+def test_a_model_file_without_a_battery_is_warned_of(tmp_path):
     with pytest.warns(BatteryWarning, match=r"m\.json: battery: missing.*handout's 22 to 24 V"):
         assert load_model(write(tmp_path / "m.json")).battery == HANDOUT
 
@@ -96,12 +94,12 @@ def test_a_model_file_without_a_battery_is_warned_of(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_bad_batteries_are_refused(battery: Any, reason: str, tmp_path: Path) -> None:
+def test_bad_batteries_are_refused(battery, reason, tmp_path):
     with pytest.raises(ModelFileError, match=reason):
         load_model(write(tmp_path / "m.json", battery=battery))
 
 
-def test_a_battery_beyond_the_fit_is_warned_of_or_refused() -> None:
+def test_a_battery_beyond_the_fit_is_warned_of_or_refused():
     model = craft_model(4, 0.6)
     near = model.battery._replace(fitted_low_v=16.0)
     with pytest.warns(BatteryWarning, match=r"fitted at 16 to 16.8 V.*from 13.6 to 16.8 V"):

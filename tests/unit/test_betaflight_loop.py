@@ -26,14 +26,14 @@ SETTINGS = {
 }
 
 
-def flown(commands: np.ndarray, loop: BetaflightLoop = RACER) -> np.ndarray:
+def flown(commands, loop=RACER):
     """Return the states (steps, 21) of a craft with the loop, which hovers first."""
     model = NOMINAL._replace(motion=Motion.CONTINUOUS).with_effects(loop)
     start = drone_with(applied=Action(0.0, 0.0, 0.0, -0.22))
     return np.asarray(jax.jit(fly)(start, commands, model))
 
 
-def test_sticks_become_rates_and_hover_stays_one() -> None:
+def test_sticks_become_rates_and_hover_stays_one():
     states = flown(held(SECOND, roll=0.3, pitch=-0.2, yaw=0.5, thrust=-0.22))
     expected = np.deg2rad(np.asarray(NOMINAL.max_rate)) * (0.3, -0.2, 0.5)
     np.testing.assert_allclose(states[-1, RATES], expected, rtol=0.03, atol=0.03)
@@ -43,8 +43,8 @@ def test_sticks_become_rates_and_hover_stays_one() -> None:
     )
 
 
-def test_motors_that_end_trade_thrust_for_rates_and_airmode_adds_it() -> None:
-    def added(thrust: float) -> float:
+def test_motors_that_end_trade_thrust_for_rates_and_airmode_adds_it():
+    def added(thrust):
         """Return by how much full sticks change what is applied of a thrust."""
         sticks = held(8, roll=1.0, pitch=1.0, yaw=1.0, thrust=thrust), held(8, thrust=thrust)
         turning, straight = (flown(commands)[-1, APPLIED_ACTION][3] for commands in sticks)
@@ -62,19 +62,19 @@ def test_motors_that_end_trade_thrust_for_rates_and_airmode_adds_it() -> None:
         ({"sticks_hz": 0.0, "f_roll": 0.0}, np.not_equal),
     ],
 )
-def test_settings_show_in_the_response(change, shows) -> None:
+def test_settings_show_in_the_response(change, shows):
     step = held(12, roll=0.6, thrust=0.2)
     peaks = [flown(step, loop)[:, RATES.start].max() for loop in (RACER._replace(**change), RACER)]
     assert shows(*peaks)
 
 
-def test_a_weak_motor_turns_a_craft_that_climbs_until_the_integral_holds_it() -> None:
+def test_a_weak_motor_turns_a_craft_that_climbs_until_the_integral_holds_it():
     states = flown(held(3 * SECOND, thrust=0.3), RACER._replace(rear_left=0.8))
     assert states[:20, RATES.start].min() < -0.05  # less thrust on the left: it rolls there
     np.testing.assert_allclose(states[-1, RATES], 0.0, atol=0.01)
 
 
-def test_the_loop_takes_the_place_of_lags_in_fits() -> None:
+def test_the_loop_takes_the_place_of_lags_in_fits():
     free = base_of(NOMINAL.with_effects(RACER))
     assert "betaflight_loop.roll_arm" in free and "betaflight_loop.p_roll" not in free
     assert "tau_roll" in base_of(NOMINAL) and "tau_roll" not in free
@@ -82,7 +82,7 @@ def test_the_loop_takes_the_place_of_lags_in_fits() -> None:
     assert np.all((times > 0.005) & (times < 0.05))
 
 
-def test_settings_become_the_loop_and_another_loop_is_none() -> None:
+def test_settings_become_the_loop_and_another_loop_is_none():
     loop = rate_loop(SETTINGS.__getitem__, 100.0)
     assert (loop.sticks_hz, loop.throttle_hz, loop.p_pitch) == (37.0, 20.0, 47.0)
     static = {"gyro_lpf1_dyn_min_hz": "0", "gyro_lpf1_static_hz": "90", "rc_smoothing": "OFF"}

@@ -17,7 +17,7 @@ from tests.support.hidden_flights import scripted
 from tests.support.made_flight import TIME_S, flight, noisy
 
 
-def rms(errors: np.ndarray) -> float:
+def rms(errors):
     return float(np.sqrt(np.mean(errors**2)))
 
 
@@ -76,7 +76,7 @@ LATE_S = 0.013
 SECONDS, POSE_LATE_S = 40.0, 0.024  # of a hidden plant
 
 
-def test_velocity_and_position_come_on_the_clock_of_the_attitude() -> None:
+def test_velocity_and_position_come_on_the_clock_of_the_attitude():
     truth = flight(TIME_S, LATE_S, LATE_S, LATE_S)
     for late_s in (0.0, 0.02):
         logged = noisy(flight(TIME_S, LATE_S, LATE_S + late_s, LATE_S + late_s), seed=1)
@@ -86,7 +86,7 @@ def test_velocity_and_position_come_on_the_clock_of_the_attitude() -> None:
             assert rms(log[name] - truth[name][is_kept]) < bound, name
 
 
-def test_commands_stamped_after_the_turns_they_cause_are_put_before_them() -> None:
+def test_commands_stamped_after_the_turns_they_cause_are_put_before_them():
     plant = HandoutPlant()
     truth = sensors.measure(excited(plant), 1.0, GRAVITY, np.random.default_rng(2))
     for rows in (0, 3, 20):  # of which 3 are less than the plant's lag
@@ -102,8 +102,8 @@ def test_commands_stamped_after_the_turns_they_cause_are_put_before_them() -> No
             assert min(errors) < 0.1 * np.abs(log["u"]).mean()
 
 
-def test_lateness_is_found_where_there_is_one() -> None:
-    def found(late_s: float) -> Moves:
+def test_lateness_is_found_where_there_is_one():
+    def found(late_s):
         truth, log = scripted(3, SECONDS, mocap_late_s=late_s)
         with jax.enable_x64(True):
             return how_it_moves(log, model_of(truth), np.ones(len(log), bool), Motion.HANDOUT)
@@ -114,7 +114,7 @@ def test_lateness_is_found_where_there_is_one() -> None:
 
 
 @pytest.mark.slow
-def test_a_drone_on_time_is_no_simulator_however_little_the_model_explains() -> None:
+def test_a_drone_on_time_is_no_simulator_however_little_the_model_explains():
     """Commands unrelated to the motion stand for a rate loop that the model lacks."""
     log = noisy(flight(TIME_S), seed=1)
     with jax.enable_x64(True):

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.plants import Simulator
-from flytrack_sysid import CollectError, FlightLog, collect, sensors
+from flytrack_sysid import CollectError, collect, sensors
 from flytrack_sysid.excitation import HEIGHTS, KINDS, LARGEST_SPEED
 from flytrack_sysid.split import blocks_of, held_out_rows
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
@@ -104,7 +104,7 @@ def test_held_out_part_has_every_kind_a_clear_step_of_each_axis_and_all_voltages
 
 
 @pytest.fixture(scope="module")
-def truth() -> FlightLog:
+def truth():
     return excited(HandoutPlant())
 
 

@@ -12,9 +12,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
-from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
-from flytrack_sysid import FlightLog
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, vetoes
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
@@ -37,7 +35,7 @@ from flytrack_sysid.diagnosis.summary import stand_in_notes, warnings_of, with_r
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.parameters import THRUST_COEFFS
 from flytrack_sysid.record import make_record
-from flytrack_sysid.replay import Step, replay, start_replay
+from flytrack_sysid.replay import replay, start_replay
 from tests.support.hidden_flights import scripted
 
 SECONDS, DT_S = 40.0, 0.01
@@ -89,7 +87,7 @@ def disturbed(lanes):
     return series[lanes.row] * lanes.is_joined[..., None, None]
 
 
-def correlation(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def correlation(first, second):
     """Return the mean product over rows and lanes where both are there; 0 where none are."""
     product = first * second
     return np.nansum(product, axis=(0, 1)) / np.maximum(np.isfinite(product).sum(axis=(0, 1)), 1)
@@ -142,7 +140,7 @@ def test_lanes_are_only_where_something_is_judged(flown):
     ).all()  # flown for real, also where it is not judged
 
 
-def predictions(step: Step, _: None) -> tuple[jax.Array, ...]:
+def predictions(step, _):
     """Return the body rates, specific force and acceleration after a step."""
     return tuple(map(jnp.stack, (step.after.rates_b, step.moved.context.force_b, step.after.acc_w)))
 
@@ -178,7 +176,7 @@ def test_lanes_agree_with_one_long_replay(flown, lanes):
         assert counts[LEAD_IN_S * RATE].any() and np.abs(error[counts]).max() < 1e-3
 
 
-def evaluate(log: FlightLog, model: ModelParameters) -> None:
+def evaluate(log, model):
     """Run every program that a search for effects in a log needs."""
     problem = Problem.of(lanes_of(log, np.ones(len(log), bool), model), model)
     residuals = problem.residuals(np.repeat(problem.start[None], 3, axis=0))
@@ -190,7 +188,7 @@ def test_logs_of_another_length_rate_and_channels_compile_nothing(flown):
     truth, log = flown
     model, compiled = model_of(truth), []
 
-    def count(event: str, duration_s: float, **_: object) -> None:
+    def count(event, duration_s, **_):
         if event in ("/jax/core/compile/backend_compile_duration", TRACED):
             compiled.append(event)
 

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden import measure
-from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import EFFECTS, AccelerometerBias, LinearDrag
 from flytrack_sysid.diagnosis import report, summary
 from flytrack_sysid.diagnosis.evidence import EVIDENCE
@@ -117,7 +116,7 @@ def test_residuals_are_measured_minus_modelled(flown):
         assert np.abs(found.residuals["right"][name][later]).max() < 1e-3
 
 
-def shown(model: ModelParameters, cause: str) -> ModelParameters:
+def shown(model, cause):
     """Return the model with a cause, far from neutral."""
     if cause in BASE_CAUSES:
         values = dict(zip(names_of(model), to_vector(model), strict=True))

@@ -9,8 +9,6 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.dynamics import collective_thrust
 from flytrack_sysid import FitError, fit
 from flytrack_sysid.estimate import estimate
-from flytrack_sysid.fit import Fit
-from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import (
     BASE,
     DRAIN,
@@ -32,32 +30,32 @@ ACTION, BATTERY_V = np.meshgrid(np.linspace(-1, 1, 21), np.linspace(22, 24, 9))
 
 
 @pytest.fixture(scope="session")
-def exact() -> FlightLog:
+def exact():
     return excited(PLANT)
 
 
 @pytest.fixture(scope="session")
-def noisy(exact) -> FlightLog:
+def noisy(exact):
     return measure(exact, 1.0, GRAVITY, np.random.default_rng(0))
 
 
 @pytest.fixture(scope="session")
-def fitted(noisy) -> Fit:
+def fitted(noisy):
     return fit(noisy)
 
 
-def map_error(found: Fit) -> float:
+def map_error(found):
     """Return the largest error of thrust between -1 and 1 and 22 and 24 V, of full thrust."""
     truth = collective_thrust(ACTION, BATTERY_V, np.array(PLANT.coeffs))
     thrust = collective_thrust(ACTION, BATTERY_V, np.asarray(found.estimate.model.thrust_coeffs))
     return float(np.abs(thrust - truth).max() / truth.max())
 
 
-def tau_error(found: Fit) -> float:
+def tau_error(found):
     return float(np.abs(found.estimate.model.tau / np.array(PLANT.tau) - 1.0).max())
 
 
-def half_widths(found: Fit) -> dict[str, float]:
+def half_widths(found):
     return {name: 0.5 * (high - low) for name, (_, low, high) in found.intervals.items()}
 
 
@@ -123,7 +121,7 @@ def test_intervals_widen_with_fewer_channels_and_with_what_the_model_lacks(noisy
 
 
 @pytest.fixture(scope="session")
-def dragged() -> FlightLog:
+def dragged():
     return excited(replace(PLANT, drag_b=DRAG))
 
 
@@ -134,11 +132,11 @@ def test_drag_is_found(dragged):
     assert tau_error(found) < 1e-4 and map_error(found) < 1e-4 and not found.warnings
 
 
-def scaled(log: FlightLog, channel: str, factors: tuple[float, ...]) -> FlightLog:
+def scaled(log, channel, factors):
     return replace(log, channels={**log.channels, channel: log[channel] * factors})
 
 
-def at_rest(log: FlightLog) -> FlightLog:
+def at_rest(log):
     """Return what a drone on the ground measures while its commands move."""
     rng = np.random.default_rng(0)
     channels = {

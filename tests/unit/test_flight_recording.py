@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
 from flytrack import identification
-from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import LinearDrag, MocapLatency
-from flytrack_sysid import FlightLog, save_log
+from flytrack_sysid import save_log
 from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.result import CONSISTENT, Unexplained
 from flytrack_sysid.flight_recording import write_flight_recording
@@ -32,7 +31,7 @@ SCALED_FORCE = 0.1  # m of an arrow for 1 m/s^2
 
 
 @pytest.fixture(scope="module")
-def flown() -> tuple[ModelParameters, FlightLog]:
+def flown():
     """A plant with drag, as a model without it, and a log of two flights with clocks from 0 on."""
     truth, log = scripted(5, SECONDS, "none", effects={"linear_drag": DRAG._asdict()})
     segment = (np.arange(len(log)) >= SECOND).astype(int)
@@ -42,7 +41,7 @@ def flown() -> tuple[ModelParameters, FlightLog]:
 
 
 @pytest.fixture(scope="module")
-def models(flown) -> dict[str, ModelParameters]:
+def models(flown):
     """Without what the plant has, and with it; and one that flies off."""
     base = flown[0]
     strong = base._replace(thrust_coeffs=50.0 * base.thrust_coeffs)
@@ -50,7 +49,7 @@ def models(flown) -> dict[str, ModelParameters]:
 
 
 @pytest.fixture(scope="module")
-def flights(flown, models) -> dict:
+def flights(flown, models):
     """What is shown, by name."""
     return {flight.name: flight for flight in trajectories.trajectories_of(flown[1], models)}
 
@@ -72,7 +71,7 @@ def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, models
     expected = np.mean([drag_w[rows - 1 + shift] for shift in range(-half, half + 1)], axis=0)
     assert np.abs(expected).max(axis=0).min() > 0.3
 
-    def arrows(name: str, part: str) -> np.ndarray:
+    def arrows(name, part):
         return recording.series(f"/world/residual/{name}", f"Arrows3D:{part}")[is_inside]
 
     np.testing.assert_allclose(arrows("nominal", "vectors") / SCALED_FORCE, expected, atol=0.02)
@@ -92,7 +91,7 @@ def test_ends_of_late_poses_have_no_force(flown, models):
     assert known[SETTLED : SECOND - 5].all() and known[SECOND + SETTLED : -5].all()
 
 
-def distance_m(shown, log) -> np.ndarray:
+def distance_m(shown, log):
     """Return how far a flight is from the measured one at its rows, (T,) m."""
     time_s = trajectories.time_in_line(log)
     rows = np.searchsorted(time_s, shown.time_s - 1e-6)
@@ -120,7 +119,7 @@ def test_a_model_flies_by_itself_and_starts_anew_every_second(flown, flights):
 
 
 @pytest.fixture(scope="module")
-def made() -> FlightLog:
+def made():
     """A made-up flight of 6 s, cut in the middle."""
     return replace(flight(TIME_S[:600]), segment=np.repeat([0, 1], 300))
 
@@ -155,7 +154,7 @@ def test_diagnose_writes_the_recording_or_says_why_not(
     monkeypatch.setattr(identification, "write_diagnosis", lambda folder, *_: [folder / "a.json"])
     out, path = tmp_path / "out", tmp_path / "out" / "flight.rrd"
 
-    def diagnosed(log: FlightLog) -> str:
+    def diagnosed(log):
         save_log(tmp_path / "log.npz", log)
         run("diagnose", tmp_path / "log.npz", "--out", out)
         return capsys.readouterr().out

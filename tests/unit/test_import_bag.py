@@ -4,7 +4,6 @@ import dataclasses
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,17 +29,17 @@ RECORDED_LATE_NS = 7_000_000  # the bag's own times; the stamps are right
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
 
 
-def made(kind: str, *values: Any) -> Any:
+def made(kind, *values):
     """Return a message, by the short name of its type."""
     return next(one for name, one in TYPES.types.items() if name.endswith(f"/{kind}"))(*values)
 
 
-def motion(time: Any) -> Rotation:
+def motion(time):
     """Return a roll from side to side."""
     return Rotation.from_rotvec(np.multiply.outer(0.5 * np.sin(time), [1.0, 0.0, 0.0]))
 
 
-def messages() -> list[tuple[int, str, Any]]:
+def messages():
     """Return stamp, ns, topic and message at 50, 200 and 100 Hz over 5 s, in order of time."""
     stamped = []
     for topic, (kind, step_ns) in KINDS.items():
@@ -61,7 +60,7 @@ def messages() -> list[tuple[int, str, Any]]:
     return sorted(stamped, key=lambda entry: entry[0])
 
 
-def write_ros2(folder: Path, storage: str, is_compressed: bool = False) -> Path:
+def write_ros2(folder, storage, is_compressed=False):
     """Write a bag of ROS 2."""
     unopened = Writer(folder / "bag", version=9, storage_plugin=StoragePlugin[storage])
     if is_compressed:
@@ -77,7 +76,7 @@ def write_ros2(folder: Path, storage: str, is_compressed: bool = False) -> Path:
     return folder / "bag"
 
 
-def write_json(folder: Path) -> Path:
+def write_json(folder):
     """Write an MCAP file of JSON, without stamps."""
     contents = []
     for stamp_ns, topic, message in messages():
@@ -95,7 +94,7 @@ WRITERS = {
 
 
 @pytest.fixture
-def mapping(tmp_path: Path) -> Path:
+def mapping(tmp_path):
     """Return the path of the mapping."""
     (tmp_path / "map.toml").write_text(MAPPING)
     return tmp_path / "map.toml"

@@ -2,16 +2,13 @@
 
 import gzip
 import re
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from flytrack_env.effects import effect_of
 from flytrack_env.state import Action
-from flytrack_sysid import Imported, LogError, import_log
+from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing.betaflight_settings import full_stick_rate, stick_curve
 from tests.support.foreign_logs import BLACKBOX_FULL_STICK_DEG_S as FULL_STICK_DEG_S
 from tests.support.foreign_logs import BLACKBOX_HEADERS, blackbox, flying
@@ -27,19 +24,19 @@ STEP_S = 500e-6
 CASES = table("betaflight_headers")
 
 
-def frames(num_rows: int = 200) -> np.ndarray:
+def frames(num_rows=200):
     """Return frames of a steady turn, the throttle rising."""
     return frames_of(flying(num_rows, STEP_S))
 
 
-def standing() -> np.ndarray:
+def standing():
     """Return frames of a drone that is armed and stands, sticks at rest."""
     rows = frames()
     rows[:, 2:6] = 0
     return rows
 
 
-def log_with(rows: np.ndarray | None = None, names: list[str] = NAMES, **headers: str) -> bytes:
+def log_with(rows=None, names=NAMES, **headers):
     """Return a log with other headers; an empty one is left out."""
     headers = BLACKBOX_HEADERS | headers
     kept = {name: value for name, value in headers.items() if value}
@@ -47,10 +44,10 @@ def log_with(rows: np.ndarray | None = None, names: list[str] = NAMES, **headers
 
 
 @pytest.fixture
-def read(tmp_path: Path) -> Callable[..., Imported]:
+def read(tmp_path):
     """Return the import of logs one after the other, as a flash chip has them."""
 
-    def import_content(*logs: bytes, mapping: str = "", **options: Any) -> Imported:
+    def import_content(*logs, mapping="", **options):
         (tmp_path / "a.bbl").write_bytes(b"".join(logs))
         (tmp_path / "map.toml").write_text(mapping)
         return import_log(tmp_path / "a.bbl", "betaflight", tmp_path / "map.toml", **options)
@@ -86,7 +83,7 @@ def test_rates_at_full_stick_are_the_firmwares(rates_type, rc_rate, super_rate, 
     assert full_stick_rate(rates_type, rc_rate, super_rate, 1998.0) == pytest.approx(deg_s)
 
 
-def of_firmware(rates_type: str, stick: float, rc_rate: float, rate: float, expo: float) -> float:
+def of_firmware(rates_type, stick, rc_rate, rate, expo):
     """Return the setpoint, deg/s, as the firmware computes it."""
     size, expo = abs(stick), expo / 100
     if rates_type == "ACTUAL":

@@ -1,7 +1,6 @@
 """Commands of attitude setpoints and of motors, and the shipped mappings."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ MAPPING = read_mapping("angle_setpoints")
 WITH_GAINS = MAPPING.replace("signs", "gain = [6, 5, 2]\nsigns")
 
 
-def flight() -> dict[str, np.ndarray]:
+def flight():
     """Return columns of rates that follow attitude errors times 6, 5, 2 with a lag of 40 ms."""
     rng = np.random.default_rng(0)
     targets = np.repeat(0.25 * rng.normal(size=(NUM_ROWS // 30, 3)), 30, axis=0)
@@ -36,7 +35,7 @@ def flight() -> dict[str, np.ndarray]:
     return {"t": STEP_S * np.arange(NUM_ROWS), **named, "pwm": named["m0"]}
 
 
-def read(folder: Path, mapping: str, columns: dict[str, np.ndarray] | None = None):
+def read(folder, mapping, columns=None):
     """Return the import of a CSV file."""
     write(folder / "flight.csv", flight() if columns is None else columns)
     (folder / "map.toml").write_text(mapping)

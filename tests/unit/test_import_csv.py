@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env import load_model, nominal_parameters
 from flytrack_env.thrust import collective_thrust
-from flytrack_sysid import FlightLog, LogError, import_log, load_log
+from flytrack_sysid import LogError, import_log, load_log
 from flytrack_sysid.importing.flight import Craft
 from tests.support.foreign_logs import FLIP, flying, write_csv_files
 from tests.support.foreign_logs import write_csv as write_one_csv
@@ -23,7 +23,7 @@ HEADER = "ms,n,e,d,vn,ve,vd,ax,ay,az,p,q,r,qx,qy,qz,qw,ail,ele,rud,thr,mv"
 MAPPING = read_mapping("every_unit")
 
 
-def write_csv(path: Path, log: FlightLog) -> Path:
+def write_csv(path, log):
     """Write a log as others would: NED, FRD, degrees, g, cm, ms, PWM, quaternions x, y, z, w."""
     columns = [
         1e3 * log.time + 5000.0,
@@ -40,7 +40,7 @@ def write_csv(path: Path, log: FlightLog) -> Path:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, truth) -> Path:
+def folder(tmp_path_factory, truth):
     """A folder with ``flight.csv`` of the first 3 s and its ``map.toml``."""
     out = tmp_path_factory.mktemp("csv")
     write_csv(out / "flight.csv", truth.select(slice(300)))

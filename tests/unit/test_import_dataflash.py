@@ -1,30 +1,26 @@
 """ArduPilot's DataFlash logs: instances, other rates, full stick, and other vehicles."""
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from flytrack_sysid import FlightLog, Imported, LogError, import_log
-from tests.support.foreign_logs import COPTER_PARAMETERS, Messages, dataflash, dataflash_messages
+from flytrack_sysid import LogError, import_log
+from tests.support.foreign_logs import COPTER_PARAMETERS, dataflash, dataflash_messages
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed: pip install 'flytrack[logs]'")
 
 
 @pytest.fixture
-def messages(truth: FlightLog) -> Messages:
+def messages(truth):
     """Return the messages of 5 s of the made flight."""
     return dataflash_messages(truth.select(slice(500)))
 
 
 @pytest.fixture
-def read(tmp_path: Path) -> Callable[..., Imported]:
+def read(tmp_path):
     """Return the import of messages."""
 
-    def import_messages(messages: Messages, mapping: str = "", **options: Any) -> Imported:
+    def import_messages(messages, mapping="", **options):
         (tmp_path / "a.bin").write_bytes(dataflash(messages, **options))
         (tmp_path / "map.toml").write_text(mapping)
         return import_log(tmp_path / "a.bin", "dataflash", tmp_path / "map.toml", align=False)
@@ -32,7 +28,7 @@ def read(tmp_path: Path) -> Callable[..., Imported]:
     return import_messages
 
 
-def change(messages: Messages, name: str, **columns: Any) -> list[tuple[Any, ...]]:
+def change(messages, name, **columns):
     """Return the rows of a message with other values in some columns."""
     rows = np.array(messages[name][2])
     for column, value in columns.items():

@@ -6,14 +6,12 @@ import pickle
 import re
 import tarfile
 import zipfile
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from flytrack_sysid import FlightLog, LogError, import_log
+from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing.file_kinds import identify
 from flytrack_sysid.importing.importer import FORMATS
 from tests.support.foreign_logs import WRITERS, flying
@@ -29,12 +27,12 @@ ATTITUDE_AND_PLACE = {"ULog": set("pvq"), "DataFlash": set("pvq")}
 RESOLUTION = {"blackbox": {"u": 1e-3, "w": 0.009, "f": 0.0025, "v_bat": 0.0051}}
 
 
-def test_every_format_has_a_writer() -> None:
+def test_every_format_has_a_writer():
     assert {form for form, _ in WRITERS.values()} == set(FORMATS)
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_a_flight_comes_back(kind: str, truth: FlightLog, tmp_path: Path) -> None:
+def test_a_flight_comes_back(kind, truth, tmp_path):
     form, write = WRITERS[kind]
     path, mapping = write(tmp_path, replace(truth, time=truth.time + 1.0))
     imported = import_log(path, form, mapping, align=False)
@@ -53,14 +51,14 @@ def test_a_flight_comes_back(kind: str, truth: FlightLog, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_ground_is_left_out_and_counted(kind: str, tmp_path: Path) -> None:
+def test_ground_is_left_out_and_counted(kind, tmp_path):
     truth = stands_flies_and_lands()
     form, write = WRITERS[kind]
     path, mapping = write(tmp_path, truth)
     mapping = mapping or tmp_path / "map.toml"
     text = mapping.read_text() if mapping.exists() else ""
 
-    def imported(rows: str) -> tuple[FlightLog, str]:
+    def imported(rows):
         mapping.write_text(f"{text}\n[rows]\n{rows}\n")
         result = import_log(path, form, mapping, align=False)
         return result.log, " ".join(result.notes)
@@ -91,9 +89,7 @@ REFUSED = {"bag": "damaged, cannot be decoded", "CSV": PART_OF_A_ROW, "CSV files
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_whole_rows_of_a_log_that_is_cut_off_are_used_or_it_is_refused(
-    kind: str, tmp_path: Path
-) -> None:
+def test_whole_rows_of_a_log_that_is_cut_off_are_used_or_it_is_refused(kind, tmp_path):
     form, write = WRITERS[kind]
     path, mapping = write(tmp_path, flying(NUM_ROWS))
     largest = max(
@@ -117,13 +113,13 @@ def test_whole_rows_of_a_log_that_is_cut_off_are_used_or_it_is_refused(
 # --- Files of other kinds -------------------------------------------------------------------------
 
 
-def packed(write: Callable[[io.BytesIO], object]) -> bytes:
+def packed(write):
     content = io.BytesIO()
     write(content)
     return content.getvalue()
 
 
-def tar(content: io.BytesIO) -> None:
+def tar(content):
     with tarfile.open(fileobj=content, mode="w") as archive:
         archive.addfile(tarfile.TarInfo("a"), io.BytesIO())
 
@@ -145,14 +141,12 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("kind", OTHERS)
-def test_other_kinds_are_named(kind: str) -> None:
+def test_other_kinds_are_named(kind):
     assert kind in str(identify(OTHERS[kind][:512]))
 
 
 @pytest.mark.parametrize("kind", WRITERS.keys() - {"CSV files"})
-def test_logs_of_other_formats_are_refused_with_the_format_that_reads_them(
-    kind: str, tmp_path: Path
-) -> None:
+def test_logs_of_other_formats_are_refused_with_the_format_that_reads_them(kind, tmp_path):
     form, write = WRITERS[kind]
     path, _ = write(tmp_path, flying())
     assert identify(path.read_bytes()).format == form

@@ -2,20 +2,16 @@
 
 import re
 import sys
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.sandbox import ResourceLimits
-from flytrack_sysid import Imported, LogError, import_log
+from flytrack_sysid import LogError, import_log
 from flytrack_sysid.importing import decoding
 from tests.support.foreign_logs import (
     PX4_PARAMETERS,
-    Topics,
     flying,
     ulog,
     ulog_message,
@@ -31,16 +27,16 @@ SETPOINT, BATTERY = "vehicle_rates_setpoint", "battery_status"
 
 
 @pytest.fixture
-def topics() -> Topics:
+def topics():
     """Return the topics of a flight of 0.8 s from 1 s on."""
     return ulog_topics(flying(NUM_ROWS, STEP_S))
 
 
 @pytest.fixture
-def read(tmp_path: Path) -> Callable[..., Imported]:
+def read(tmp_path):
     """Return the import of topics, or of what a file has."""
 
-    def import_content(content: Any, parameters: Any = PX4_PARAMETERS, full_stick: Any = None):
+    def import_content(content, parameters=PX4_PARAMETERS, full_stick=None):
         content = content if isinstance(content, bytes) else ulog(content, parameters)
         (tmp_path / "a.ulg").write_bytes(content)
         craft = f"[craft]\nmax_rate_deg_s = {full_stick}\n" if full_stick else ""

@@ -1,7 +1,5 @@
 """Crazyflie's uSD logs: the binary format, and commands of torques."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -14,7 +12,7 @@ LEE = 'extends = "crazyflie_lee"\n'
 VECTORS = ("rpy", "rpyd", "omega", "omegar", "torque")
 
 
-def read(folder: Path, content: bytes, mapping: str | None = None):
+def read(folder, content, mapping=None):
     """Return the import of a log with that content."""
     (folder / "log00").write_bytes(content)
     path = write_mapping(folder)
@@ -23,7 +21,7 @@ def read(folder: Path, content: bytes, mapping: str | None = None):
     return import_log(folder / "log00", "usd", path)
 
 
-def events() -> dict[str, tuple[dict[str, str], np.ndarray]]:
+def events():
     """Return sensors at 500 Hz, sticks at 100 Hz, and two voltages."""
     time = 5.0 + 0.002 * np.arange(400)
     sensors = np.column_stack([time, np.rad2deg(np.sin(time)), np.zeros((400, 5))])
@@ -77,7 +75,7 @@ def test_what_is_no_such_log_is_refused(tmp_path, old, new, message):
         read(tmp_path, content.replace(old, new))
 
 
-def lee_log() -> tuple[bytes, np.ndarray]:
+def lee_log():
     """Return a log whose torques follow the law, 10 s at 250 Hz, and its rate setpoints, rad/s."""
     time = 1.0 + 0.004 * np.arange(2500)
     phases = np.array([0.0, 1.0, 2.0])

@@ -2,7 +2,6 @@
 
 import json
 import math
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -35,13 +34,13 @@ WARM = Term("force", "world", (Factor("time", "saturation", (0.05,)),), (0.0, 0.
 LAW = Law((DRAG, FLAP, WARM))
 
 
-def acceleration(effects: Any, **state: Any) -> np.ndarray:
+def acceleration(effects, **state):
     """Return what effects add to the acceleration of one step, world frame."""
     drone = drone_with(**state)
     return (flown(effects, held(), drone) - flown((), held(), drone))[0, 6:9]
 
 
-def test_a_term_along_the_air_brakes_as_its_formula_says() -> None:
+def test_a_term_along_the_air_brakes_as_its_formula_says():
     found = acceleration(LearnedLaw(1.0, 0.0, Law((DRAG,))), vel_w=(3.0, 0.0, 0.0))
     np.testing.assert_allclose(found, [-2.0 * math.exp(-0.5), 0.0, 0.0], atol=1e-4)
     more = acceleration(LearnedLaw(1.0, 1.0, Law((DRAG,))), vel_w=(3.0, 0.0, 0.0))
@@ -50,7 +49,7 @@ def test_a_term_along_the_air_brakes_as_its_formula_says() -> None:
     np.testing.assert_allclose(half, 0.5 * found, atol=1e-4)
 
 
-def test_a_product_turns_the_drone() -> None:
+def test_a_product_turns_the_drone():
     drone = drone_with(vel_w=(3.0, 0.0, 0.0))
     plain, law = (flown(one, held(), drone)[0] for one in ((), LearnedLaw(1.0, 0.0, Law((FLAP,)))))
     thrust = plain[8] + NOMINAL.g
@@ -59,31 +58,31 @@ def test_a_product_turns_the_drone() -> None:
     )
 
 
-def test_time_since_the_start_acts() -> None:
+def test_time_since_the_start_acts():
     flight = flown(LearnedLaw(1.0, 0.0, Law((WARM,))), held(20)) - flown((), held(20))
     expected = 3.0 * (1.0 - np.exp(-0.01 * np.arange(20) / 0.05))
     np.testing.assert_allclose(flight[:, 8], expected, atol=2e-3)
 
 
-def test_neutral_and_empty_are_absent() -> None:
+def test_neutral_and_empty_are_absent():
     plain = flown((), held(5))
     for effect in (LearnedLaw(0.0, 0.0, LAW), LearnedLaw(1.0)):
         np.testing.assert_array_equal(flown(effect, held(5)), plain)
 
 
-def extended() -> Any:
+def extended():
     """Return the nominal model with a law."""
     return NOMINAL.with_effects(LearnedLaw(1.0, 0.0, LAW))
 
 
-def test_files_keep_what_was_learnt(tmp_path: Path) -> None:
+def test_files_keep_what_was_learnt(tmp_path):
     path = tmp_path / "extended_model.json"
     save_model(path, extended(), {})
     assert load_model(path).effects == extended().effects
     assert hash(load_model(path).effects[0].law) == hash(LAW)
 
 
-def test_the_environment_flies_it_and_has_gradients() -> None:
+def test_the_environment_flies_it_and_has_gradients():
     env = make("FlyTrack-v0", model=extended())
     keys = jax.random.split(jax.random.key(0), 16)
     _, states = jax.vmap(env.reset, (0, None))(keys, env.default_params)
@@ -91,11 +90,11 @@ def test_the_environment_flies_it_and_has_gradients() -> None:
     observations = step(keys, states, jnp.zeros((16, 4)), env.default_params)[0]
     assert np.isfinite(observations).all()
 
-    def speed(scale: Any) -> jax.Array:
+    def speed(scale):
         model = env.default_params.model.with_effects(LearnedLaw(scale, 0.0, LAW))
         params = env.default_params.replace(model=model)
 
-        def after(state: Any) -> jax.Array:
+        def after(state):
             return env.drone(env.advance(state, Action(0.0, 0.0, 0.0, 0.0), params)[0]).vel_w.norm()
 
         return jax.vmap(after)(states).sum()
@@ -104,7 +103,7 @@ def test_the_environment_flies_it_and_has_gradients() -> None:
     assert np.isfinite(slope) and slope != 0.0
 
 
-def test_its_spread_can_be_drawn() -> None:
+def test_its_spread_can_be_drawn():
     env = DomainRandomization(make("FlyTrack-v0", model=extended()))
     ends = [(LearnedLaw(None, size, LAW),) for size in (-1.0, 1.0)]
     ranges = RandomizationParams(low=ends[0], high=ends[1])
@@ -118,7 +117,7 @@ def test_its_spread_can_be_drawn() -> None:
     )
 
 
-def test_every_quantity_has_a_value_and_every_shape_a_formula() -> None:
+def test_every_quantity_has_a_value_and_every_shape_a_formula():
     law = Law(
         tuple(
             Term("force", "body", (Factor(name, "power", (1.0, 0.0)),), (0.1, 0.1, 0.1), NO)
@@ -132,9 +131,7 @@ def test_every_quantity_has_a_value_and_every_shape_a_formula() -> None:
 
 
 @pytest.mark.parametrize(("where", "value", "expected"), table("learned_effects")["refused"])
-def test_what_is_not_in_the_grammar_is_refused(
-    tmp_path: Path, where: tuple[Any, ...], value: Any, expected: str
-) -> None:
+def test_what_is_not_in_the_grammar_is_refused(tmp_path, where, value, expected):
     path = tmp_path / "model.json"
     save_model(path, extended(), {})
     document = json.loads(path.read_text())
@@ -149,7 +146,7 @@ def test_what_is_not_in_the_grammar_is_refused(
     assert str(error.value).startswith(f"{path}: effects.learned_law.law")
 
 
-def test_a_file_with_networks_is_refused(tmp_path: Path) -> None:
+def test_a_file_with_networks_is_refused(tmp_path):
     path = tmp_path / "model.json"
     save_model(path, NOMINAL, {})
     document = json.loads(path.read_text())

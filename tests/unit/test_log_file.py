@@ -1,7 +1,6 @@
 """Log files are written and read back, described, or refused with file and reason."""
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -85,7 +84,7 @@ def test_what_would_be_refused_is_not_written(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def log_at(time: np.ndarray, segment: np.ndarray) -> FlightLog:
+def log_at(time, segment):
     return FlightLog(time, {"u": np.zeros((len(time), 4))}, segment)
 
 
@@ -103,15 +102,15 @@ def test_gaps_are_long_steps_within_a_segment():
 # --- Flight log files: every refusal names file and reason, quickly and in little memory ----------
 
 
-def cell(column: str, row: int, value: float) -> Callable[[dict], None]:
+def cell(column, row, value):
     return lambda columns: columns[column].__setitem__(row, value)
 
 
-def rename(old: str, new: str) -> Callable[[dict], None]:
+def rename(old, new):
     return lambda columns: columns.update({new: columns.pop(old)})
 
 
-def segments(*values: float) -> Callable[[dict], None]:
+def segments(*values):
     return lambda columns: columns.update(segment=np.array(values))
 
 

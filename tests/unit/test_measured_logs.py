@@ -1,14 +1,13 @@
 """What a log states (its origin, its pack's voltages) survives and decides how it is replayed."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from flytrack_env import Battery, Motion, blackbox, load_model, nominal_parameters, save_model
 from flytrack_env.dynamics import collective_thrust
-from flytrack_sysid import FlightLog, collect, fit, load_log, save_log, validate
+from flytrack_sysid import collect, fit, load_log, save_log, validate
 from flytrack_sysid.clocks import align_clocks, on_one_clock
 from flytrack_sysid.diagnosis import diagnose_change, joined, motion_of
 from flytrack_sysid.diagnosis.diagnose import split
@@ -39,7 +38,7 @@ CONTINUOUS = NOMINAL._replace(motion=Motion.CONTINUOUS)
 CASES = table("measured_logs")
 
 
-def through_file(log: FlightLog, path: Path) -> FlightLog:
+def through_file(log, path):
     save_log(path, log)
     return load_log(path)
 
@@ -107,7 +106,7 @@ def test_what_a_simulator_flew_is_marked():
 # --- How a log is replayed -----------------------------------------------------------------------
 
 
-def assert_noted(notes: list[str], parts: list[str]) -> None:
+def assert_noted(notes, parts):
     """Assert that there are as many notes as parts, each with its part."""
     for note, part in zip(notes, parts, strict=True):
         assert part in note
@@ -155,7 +154,7 @@ def test_logs_of_different_origin_are_refused():
 # --- Voltage --------------------------------------------------------------------------------------
 
 
-def four_cells(battery_v: float | None = None) -> FlightLog:
+def four_cells(battery_v=None):
     """Return flights of a 4S craft that was fed 15.4 V; the log has another voltage or none."""
     half = 0.5 * FORCE_PER_VOLT * MIDDLE_V
     plant = HandoutPlant(coeffs=(half, half, 0.0, 0.0, 0.0, 0.0), max_rate=CRAFT.max_rate_deg_s)

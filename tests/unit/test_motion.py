@@ -1,7 +1,5 @@
 """How a model moves within a step: continuous motion against a hidden plant's in fine parts."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,16 +34,14 @@ START[13:16] = np.radians(FULL_RATES) * START[16:19]
 AT_REST = state_of(HiddenDrone(Truth(TAU, COEFFS), LOW_START, np.random.default_rng(0)))
 
 
-def held_commands() -> np.ndarray:
+def held_commands():
     """Return the pilot's commands, (num_holds, 4); the first is what ``AT_REST`` has applied."""
     commands = np.random.default_rng(5).uniform(-0.9, 0.9, (round(SECONDS / COMMAND_S), 4))
     commands[0] = AT_REST[16:20]
     return commands
 
 
-def flown(
-    model: ModelParameters, dt: float, start: Any = START
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def flown(model, dt, start=START):
     """Return states (num_steps, 21), gyro and accelerometer (num_steps, 3), at steps of ``dt``."""
     commands = np.repeat(held_commands(), round(COMMAND_S / dt), axis=0)
     with jax.enable_x64(True):
@@ -53,7 +49,7 @@ def flown(
     return rows[:, :21], rows[:, 21:24], rows[:, 24:27]
 
 
-def reference(model: ModelParameters) -> tuple[np.ndarray, ...]:
+def reference(model):
     """Return position, velocity, attitude and specific force, body, at every 20 ms.
 
     Those of a hidden plant in parts of 0.05 ms; its motion is that of SciPy's integrator.
@@ -67,7 +63,7 @@ def reference(model: ModelParameters) -> tuple[np.ndarray, ...]:
     return tuple(flight[name] for name in "pvqf")
 
 
-def errors(model: ModelParameters, dt: float, exact: tuple[np.ndarray, ...]) -> np.ndarray:
+def errors(model, dt, exact):
     """Return the largest errors of position, velocity, attitude and specific force."""
     every = round(COMMAND_S / dt)
     states, _, forces_b = (rows[every - 1 :: every] for rows in flown(model, dt, AT_REST))

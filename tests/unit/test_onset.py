@@ -17,7 +17,7 @@ AFTER = (np.arange(BLOCKS) >= np.arange(6, 55)[:, None]).astype(
 )  # a tenth is left on each side
 
 
-def scores(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def scores(rng):
     """Return scores and information of blocks with four columns."""
     slopes = rng.standard_normal((BLOCKS, 30, 4)) @ np.array(
         [[1.0, 0.3, 0.5, 0.0], [0.0, 1.0, 0.0, 0.4], [0.0, 0.0, 1.0, 0.2], [0.0, 0.0, 0.0, 1.0]]
@@ -54,7 +54,7 @@ def test_only_logs_of_one_clock_can_show_when():
 FREE = ("given", "first", "second")
 
 
-def half_widths(scores: np.ndarray, information: np.ndarray) -> np.ndarray:
+def half_widths(scores, information):
     """Return half widths of intervals from scores of seconds (BLOCKS, 3) and information."""
     seen = object.__new__(Linearization)
     seen.places, seen.total, seen.score_by_block = [0, 1, 2], information, scores

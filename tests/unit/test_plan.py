@@ -1,6 +1,5 @@
 """What to fly next: manoeuvres that show what a hovering log could not, once they are flown."""
 
-from collections.abc import Iterator
 from functools import cache
 from typing import NamedTuple
 
@@ -10,7 +9,7 @@ import pytest
 
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.plants import Simulator
-from flytrack_sysid import FlightLog, collect
+from flytrack_sysid import collect
 from flytrack_sysid.diagnosis.identifiability import Question, advise
 from flytrack_sysid.diagnosis.lanes import lanes_of
 from flytrack_sysid.diagnosis.problem import Problem
@@ -47,7 +46,7 @@ class Logged(NamedTuple):
     linearization: Linearization
 
 
-def logged(log: FlightLog) -> Logged:
+def logged(log):
     lanes = lanes_of(log, np.ones(len(log), bool), MODEL)
     state = SearchState(Problem.of(lanes, MODEL).with_noise(NOISE))
     model = FittedModel((), state.problem.start, 0.0, tuple(state.base_places))
@@ -55,14 +54,14 @@ def logged(log: FlightLog) -> Logged:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def in_float64() -> Iterator[None]:
+def in_float64():
     """Diagnose in float64; collecting flies float32 anyway."""
     with jax.enable_x64(True):
         yield
 
 
 @pytest.fixture(scope="module")
-def hover() -> Logged:
+def hover():
     """Twenty seconds of hover, the nose in one direction."""
     first = flights_of(["headings"], hover_action(MODEL))[0]
     return logged(collect(Simulator(), script=script_of([first] * 8)).without("uprev"))
@@ -84,7 +83,7 @@ def test_what_is_advised_shows_once_it_is_flown(hover):
     kinds = np.array(script.kinds)[log.segment]
 
     @cache
-    def told(name: str) -> np.ndarray:
+    def told(name):
         return logged(log.select(kinds == name)).linearization.by_block.sum(axis=0)
 
     advice = advise(hover.problem, hover.model, hover.linearization, WANTED)

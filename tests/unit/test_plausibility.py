@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from flytrack_sysid.log import CHANNELS, FlightLog, LogError
+from flytrack_sysid.log import CHANNELS, LogError
 from flytrack_sysid.plausibility import FEWEST_ROWS, GRAVITY, check_plausible, find_problems
 from flytrack_sysid.sensors import measure, specific_force_b
 from tests.support.handout_plant import HandoutPlant, excited
@@ -16,7 +16,7 @@ from tests.support.tables import table
 
 
 @pytest.fixture(scope="module")
-def logs() -> dict[str, FlightLog]:
+def logs():
     """The same flights as they are, and as sensors measure them."""
     exact = excited(HandoutPlant())
     clean = replace(exact, channels={**exact.channels, "f": specific_force_b(exact, GRAVITY)})
@@ -33,14 +33,14 @@ class Change(NamedTuple):
     order: Any = slice(None)
     columns: str = ""
 
-    def apply(self, log: FlightLog) -> FlightLog:
+    def apply(self, log):
         """Return the log that is wrong."""
         if self.channel == "t":
             return replace(log, time=self.scale * log.time)
         values = log[self.channel][:, self.order] * np.array(self.scale) + self.offset
         return replace(log, channels={**log.channels, self.channel: values})
 
-    def named(self) -> str:
+    def named(self):
         """Return the columns that the problem names."""
         return self.columns or ", ".join(CHANNELS[self.channel])
 

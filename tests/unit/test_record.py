@@ -11,7 +11,7 @@ from flytrack_sysid.log import FlightLog
 from flytrack_sysid.record import fill_gaps
 
 
-def ramp(*lost: int, rows: int = 12, slope: float = 0.02) -> FlightLog:
+def ramp(*lost, rows=12, slope=0.02):
     """Return a log with evenly changing commands that turns about x, with some rows lost."""
     time = np.arange(rows) * 0.01
     u = np.outer(time / 0.01 * slope, [1.0, -1.0, 2.0, 0.0])

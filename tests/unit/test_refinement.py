@@ -23,7 +23,7 @@ BIAS = next(one for one in CANDIDATES if one.effect == "accelerometer_bias")
 CIRCLE_S, RADIUS_M = 4.0, 1.0
 
 
-def problem_of(truth, log: FlightLog) -> Problem:
+def problem_of(truth, log):
     """Return the problem of a plant's log and its team's model."""
     model = model_of(truth)
     return Problem.of(lanes_of(log, ~held_out_rows(log), model), model)
@@ -82,7 +82,7 @@ def test_a_late_gyro_starts_flights_at_the_rates_of_their_time(step_s):
     assert np.all(own <= 1.05 * base) and np.all(own[:4, rates] < 0.8 * base[:4, rates])
 
 
-def circle() -> FlightLog:
+def circle():
     """Return a level flight on one circle, always the same, whatever the commands say."""
     rng = np.random.default_rng(7)
     time = np.arange(0.0, 10.0 * CIRCLE_S, 0.01)

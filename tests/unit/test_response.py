@@ -23,7 +23,7 @@ NEUTRAL = (
 MODEL = nominal_parameters()._replace(tau=TAU).with_effects(*NEUTRAL)
 
 
-def test_a_first_order_lag_takes_ln_2_of_its_time_constant_and_delays_add() -> None:
+def test_a_first_order_lag_takes_ln_2_of_its_time_constant_and_delays_add():
     np.testing.assert_allclose(half_response_s(MODEL), TAU * np.log(2.0), atol=1e-5)
     late = MODEL.with_effects(
         effects.CommandDelay(0.0137, 0.021, -0.02), effects.ThrustLagAsymmetry(2.0)
@@ -34,7 +34,7 @@ def test_a_first_order_lag_takes_ln_2_of_its_time_constant_and_delays_add() -> N
 
 
 @pytest.mark.parametrize(("lag_s", "damping"), [(0.0135, 0.23), (0.03, 2.0)])
-def test_a_second_order_behind_the_lag(lag_s: float, damping: float) -> None:
+def test_a_second_order_behind_the_lag(lag_s, damping):
     frequency = 2.0 * damping / lag_s
     both = np.polymul([TAU[1], 1.0], [1.0 / frequency**2, lag_s, 1.0])
     time, risen = signal.step(([1.0], both), T=np.linspace(0.0, 0.3, 30001))
@@ -44,7 +44,7 @@ def test_a_second_order_behind_the_lag(lag_s: float, damping: float) -> None:
     np.testing.assert_allclose(found[[0, 2, 3]], plain[[0, 2, 3]], atol=1e-5)
 
 
-def test_a_limit_on_acceleration_delays_large_steps_only() -> None:
+def test_a_limit_on_acceleration_delays_large_steps_only():
     full_s, tau = 0.2, TAU[0]
     model = MODEL.with_effects(effects.RateSlewLimit(roll_s=full_s), effects.RateExpo(yaw=0.4))
     small, full = half_response_s(model), half_response_s(model, FULL_STEP)
@@ -54,13 +54,13 @@ def test_a_limit_on_acceleration_delays_large_steps_only() -> None:
     np.testing.assert_allclose(full[1:3], small[1:3], atol=1e-5)  # the curve comes before the lag
 
 
-def test_what_turns_the_drone_anyway_and_what_its_sensors_read_do_not_matter() -> None:
+def test_what_turns_the_drone_anyway_and_what_its_sensors_read_do_not_matter():
     still = MODEL.with_effects(
         effects.MotorImbalance(0.01, -0.02), effects.GyroScale(1.1, 0.9, 1.0)
     )
     np.testing.assert_allclose(half_response_s(still), half_response_s(MODEL), atol=1e-7)
 
 
-def test_a_drone_that_does_not_answer_has_no_time() -> None:
+def test_a_drone_that_does_not_answer_has_no_time():
     found = half_response_s(MODEL._replace(thrust_coeffs=np.zeros(6)))
     assert np.isnan(found[3]) and np.isfinite(found[:3]).all()

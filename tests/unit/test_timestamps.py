@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +30,7 @@ class Fault(NamedTuple):
     notes: Sequence[str] = ()
     error_s: float = 2e-6
 
-    def stamps(self) -> np.ndarray:
+    def stamps(self):
         """Return what is written in place of the right stamps, s."""
         stamps = STAMPS_S.copy()
         if self.period_s:  # starts again at 0 two rows after the one at which the others fail
@@ -41,7 +40,7 @@ class Fault(NamedTuple):
         stamps[first : first + len(self.values)] = self.values
         return stamps
 
-    def segments(self) -> tuple[int, ...]:
+    def segments(self):
         """Return how many rows each segment has."""
         return (ROW, NUM_ROWS - ROW) if self.is_split else (NUM_ROWS - self.num_lost,)
 
@@ -50,7 +49,7 @@ FAULTS = {name: Fault(**fields) for name, fields in table("clock_faults").items(
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_what_fits_is_kept_and_the_rest_is_counted(name: str) -> None:
+def test_what_fits_is_kept_and_the_rest_is_counted(name):
     fault = FAULTS[name]
     clock = read_clock("a.log", "the gyro", fault.stamps())
     times = put_on_one_line("a.log", {"w": clock}, "w")["w"]
@@ -71,7 +70,7 @@ FAST = ("a stray stamp an hour later", "set back by 1.5 s", "a roll-over of us")
 
 @pytest.mark.parametrize("fault", slow_but(FAST, FAULTS))
 @pytest.mark.parametrize("kind", WRITERS)
-def test_every_format_reads_its_clock(kind: str, fault: str, tmp_path: Path) -> None:
+def test_every_format_reads_its_clock(kind, fault, tmp_path):
     form, write = WRITERS[kind]
     expected = FAULTS[fault]
     stamps = expected.stamps()
@@ -91,7 +90,7 @@ def test_every_format_reads_its_clock(kind: str, fault: str, tmp_path: Path) -> 
     assert all(part in notes for part in expected.notes)
 
 
-def test_what_is_no_clock_is_refused() -> None:
+def test_what_is_no_clock_is_refused():
     random_s = np.random.default_rng(0).uniform(0.0, 1e3, 500)
     with pytest.raises(
         LogError, match=r"a\.log: time of w: found \d+ jumps in 500 stamps, expected steps of"
@@ -108,14 +107,14 @@ def test_what_is_no_clock_is_refused() -> None:
         (ROW, -1.5, "clock of q: set back 1 times, that of w 0 times; which rows belong"),
     ],
 )
-def test_streams_that_share_no_time_are_refused(first: int, shift_s: float, message: str) -> None:
+def test_streams_that_share_no_time_are_refused(first, shift_s, message):
     shifted = Fault((first, NUM_ROWS), shift_s).stamps()
     clocks = {"w": read_clock("a.log", "w", STAMPS_S), "q": read_clock("a.log", "q", shifted)}
     with pytest.raises(LogError, match=message):
         put_on_one_line("a.log", clocks, "w")
 
 
-def test_streams_of_other_rates_are_set_back_together() -> None:
+def test_streams_of_other_rates_are_set_back_together():
     """A slow stream has no row near the jump; later rows of both stay together."""
     set_back = Fault((ROW, NUM_ROWS), -1.5).stamps()
     clocks = {

@@ -8,17 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from flytrack_env.dynamics import ModelParameters, nominal_parameters
+from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import CommandDelay, QuadraticDrag
 from flytrack_env.state import STATE_SIZE, unpack
-from flytrack_sysid.log import FlightLog, log_of_states
+from flytrack_sysid.log import log_of_states
 from flytrack_sysid.prediction import columns, predict
 from flytrack_sysid.prediction_errors import QUANTITIES
 from flytrack_sysid.record import LARGEST_DOUBT, fill_gaps
 from flytrack_sysid.sensors import specific_force_b
 from flytrack_sysid.split import held_out_rows
 from flytrack_sysid.steps import MOST_PER_AXIS
-from flytrack_sysid.validate import Validation, validate
+from flytrack_sysid.validate import validate
 from flytrack_sysid.validation_report import text_of
 from tests.support.simulated_flights import fly as simulated
 
@@ -28,7 +28,7 @@ HOVER = -0.25
 TRUTH = nominal_parameters()._replace(tau=np.array([0.02, 0.03, 0.06, 0.045], np.float32))
 
 
-def scripts() -> tuple[np.ndarray, np.ndarray]:
+def scripts():
     """Return starts (5, 21) and commands (5, num_rows, 4): stick steps, thrust, fast flight."""
     time = np.arange(NUM_ROWS) * DT
     commands = np.zeros((5, NUM_ROWS, 4))
@@ -45,7 +45,7 @@ def scripts() -> tuple[np.ndarray, np.ndarray]:
     return starts, commands
 
 
-def fly(truth: ModelParameters) -> FlightLog:
+def fly(truth):
     """Return the log of the script's flights on a model, in float64."""
     flights = []
     with jax.enable_x64(True):
@@ -57,16 +57,16 @@ def fly(truth: ModelParameters) -> FlightLog:
 
 
 @pytest.fixture(scope="module")
-def log() -> FlightLog:
+def log():
     return fly(TRUTH)
 
 
 @pytest.fixture(scope="module")
-def exact(log) -> Validation:
+def exact(log):
     return validate(TRUTH, log)
 
 
-def nrmse(validation: Validation) -> dict[str, float | None]:
+def nrmse(validation):
     """Return the NRMSE of every judged channel."""
     return {name: error.nrmse for name, error in validation.one_step.channels.items()}
 
