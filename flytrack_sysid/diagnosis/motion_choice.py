@@ -28,7 +28,7 @@ from flytrack_sysid.clocks import PAIRS, offset_between
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import Lanes, lanes_of
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, read_poses
-from flytrack_sysid.diagnosis.problem import SEARCHED, Problem, blocks_of, robust_weight
+from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_weight
 from flytrack_sysid.diagnosis.score_test import Linearization, solve
 from flytrack_sysid.diagnosis.search import refine
 from flytrack_sysid.log import FlightLog, usual_step
@@ -94,13 +94,12 @@ def problem_of(
     logged: FlightLog,
     model: ModelParameters,
     late_s: float,
-    effects: Sequence[Effect] = SEARCHED,
 ) -> Problem:
     """Return the problem of lanes of a corrected log, whose poses were logged late."""
     late = None
     if late_s:
         lanes, late = judged_as_logged(lanes, corrected, logged, late_s, model.motion)
-    return Problem.of(lanes, model, effects, late)
+    return Problem.of(lanes, model, late=late)
 
 
 class Seen(NamedTuple):
@@ -126,7 +125,7 @@ class Seen(NamedTuple):
         """Return the problem of a log that moves so."""
         model, late_s = self.model._replace(motion=moves.motion), max(moves.late_s, 0.0)
         in_time = read_poses(self.log, late_s)[0]
-        return problem_of(self.lanes(in_time), in_time, self.log, model, late_s, LOOK_ALIKES)
+        return problem_of(self.lanes(in_time), in_time, self.log, model, late_s)
 
 
 def _places(problem: Problem, moves: Moves) -> list[int]:
@@ -141,13 +140,12 @@ def _places(problem: Problem, moves: Moves) -> list[int]:
 
 
 def _fit(seen: Seen, moves: Moves, last: Trial | None = None) -> Trial:
-    """Return a fit, from that of a similar lateness if there is one."""
+    """Return a fit, from that of another motion or a similar lateness if there is one."""
     problem = seen.problem(moves)
-    if last is None:
-        vector = problem.start.copy()
-        vector[problem.names.index(IMU_LATENCY)] += max(-moves.late_s, 0.0)
-    else:
-        vector = last.vector
+    vector = (problem.start if last is None else last.vector).copy()
+    if last is None or last.moves.motion is not moves.motion:
+        latency = problem.names.index(IMU_LATENCY)
+        vector[latency] = problem.start[latency] + max(-moves.late_s, 0.0)
     noise = None if last is None else last.problem.noise
     if noise is None:
         noise = noises.first_guess(problem.lanes, problem.residuals(vector[None])[0])
@@ -258,7 +256,8 @@ def _known_around(log: FlightLog, moves: Sequence[Moves]) -> np.ndarray:
 
 def _chosen(seen: Seen, late: Sequence[Moves]) -> Moves:
     """Return the likeliest of several; those that come near the best are fitted further."""
-    trials = [_fit(seen, moves) for moves in late]
+    first = _fit(seen, late[0])
+    trials = [first, *(_fit(seen, moves, first) for moves in late[1:])]
     misfits = _misfits(trials)
     trials = [
         _fit_lateness(seen, trial) if misfit < min(misfits) + NEAR else trial
