@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from typing import Any
 
 import jax
 import numpy as np
@@ -48,9 +49,11 @@ def measure_process(seed: int, count: int) -> None:
     """Diagnose some of the cases in this process, and print a line of JSON for each."""
     keep_compiled_programs()
     counts: Counter[str] = Counter()
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda event, duration_s, **_: counts.update([event])
-    )
+
+    def note_event(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        counts.update([event])
+
+    jax.monitoring.register_event_duration_secs_listener(note_event)
     for number, (seconds, effects) in enumerate(CASES[:count]):
         log = make_log(seed + number, seconds, effects)
         counts.clear()
@@ -68,7 +71,7 @@ def measure_process(seed: int, count: int) -> None:
         print(json.dumps(line), flush=True)
 
 
-def start_process(cache: str, seed: int, count: int) -> list[dict]:
+def start_process(cache: str, seed: int, count: int) -> list[dict[str, Any]]:
     """Return the lines of a new process with a folder for compiled programs."""
     code = (
         f"from benchmarks.diagnosis_speed import measure_process; measure_process({seed}, {count})"

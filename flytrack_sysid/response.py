@@ -13,6 +13,7 @@ from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import ACTION_SIZE, Action, Drone
 from flytrack_sysid.parameters import from_vector, in_batches, to_vector
+from flytrack_sysid.trace_cache import keep_trace
 
 SMALL_STEP, FULL_STEP = 1e-3, 1.0  # of a stick, from its centre; no limit acts on the small one
 STEP_S, WATCHED_S = 1e-3, 1.5
@@ -45,7 +46,7 @@ def half_responses(vectors: np.ndarray, like: ModelParameters, stick_step: float
     return in_batches(lambda part: _half_responses(part, like, stick_step), vectors, BATCH)
 
 
-@jax.jit
+@keep_trace
 def _half_responses(vectors: jax.Array, like: ModelParameters, stick_step: jax.Array) -> jax.Array:
     return jax.vmap(lambda vector: _of_model(from_vector(vector, like), stick_step))(vectors)
 

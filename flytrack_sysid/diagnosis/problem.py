@@ -33,7 +33,8 @@ from flytrack_sysid.diagnosis.lanes import AXES, LANE_S, NUM_AXES, Lanes, lead_i
 from flytrack_sysid.diagnosis.lateness import Late
 from flytrack_sysid.parameters import TAUS, from_vector, names_of, range_of, to_vector
 from flytrack_sysid.record import Record
-from flytrack_sysid.replay import ReplayState, Step, replay, start_replay
+from flytrack_sysid.replay import Step, replay, start_replay
+from flytrack_sysid.trace_cache import keep_trace
 
 # What a replay can show, whatever the craft: it is fed with poses, so that how late these are has
 # to be known before.
@@ -89,25 +90,33 @@ def _of_step(step: Step, measured: Measured) -> jax.Array:
     return jnp.stack([jnp.stack(direct), jnp.stack(level)], axis=-1)
 
 
+States = tuple[jax.Array, ...]  # leaves of the states of pairs, (NUM_PAIRS, ...)
+
+
 @jax.jit
-def _start_states(vectors: jax.Array, like: ModelParameters, row: Record) -> ReplayState:
+def _start_states(vectors: jax.Array, like: ModelParameters, row: Record) -> States:
     """Return the states before the first rows of pairs; row: leaves (NUM_PAIRS, ...)."""
-    return jax.vmap(lambda vector, row: start_replay(from_vector(vector, like), row))(vectors, row)
+    start = jax.vmap(lambda vector, row: start_replay(from_vector(vector, like), row))
+    return tuple(jax.tree.leaves(start(vectors, row)))
 
 
-@jax.jit
+@keep_trace
 def _replay_rows(
-    vectors: jax.Array, like: ModelParameters, states: ReplayState, rows: Rows
-) -> tuple[ReplayState, jax.Array]:
+    vectors: jax.Array, like: ModelParameters, states: States, rows: Rows
+) -> tuple[States, jax.Array]:
     """Return the states of pairs after some rows, and (rows, NUM_PAIRS, NUM_AXES, 2) residuals.
 
     vectors: (NUM_PAIRS, parameters), the model of each pair, in the order of
     ``parameters.names_of(like)``. rows: leaves (rows, NUM_PAIRS, ...), the lane of each pair.
     """
 
-    def of_pair(vector: jax.Array, state: ReplayState, rows: Rows) -> Any:
+    def of_pair(vector: jax.Array, leaves: States, rows: Rows) -> Any:
         model = from_vector(vector, like)
-        return replay(model, state, rows.row, rows.gyro_b, _of_step, rows.later)
+        first = jax.tree.map(lambda leaf: leaf[0], rows.row)
+        structure = jax.tree.structure(jax.eval_shape(start_replay, model, first))
+        state = jax.tree.unflatten(structure, leaves)
+        state, residuals = replay(model, state, rows.row, rows.gyro_b, _of_step, rows.later)
+        return tuple(jax.tree.leaves(state)), residuals
 
     return jax.vmap(of_pair, in_axes=(0, 0, 1), out_axes=(0, 1))(vectors, states, rows)
 

@@ -45,6 +45,7 @@ from flytrack_sysid.prediction_windows import (
     make_windows,
     prediction_errors,
 )
+from flytrack_sysid.trace_cache import keep_trace
 
 BATCH = 8  # models at once
 SPACING_S, SHORT_SPACING_S = 0.25, 0.05
@@ -121,7 +122,7 @@ def sureness(differences: np.ndarray) -> np.ndarray:
     return differences.sum(axis=0) / np.maximum(spread, 1e-300)
 
 
-@jax.jit
+@keep_trace
 def _errors(vectors: jax.Array, like: ModelParameters, windows: Windows) -> jax.Array:
     return jax.vmap(lambda vector: prediction_errors(from_vector(vector, like), windows))(vectors)
 

@@ -1,0 +1,106 @@
+"""Traced programs on the disk, so that the next process need not trace them again.
+
+To trace a program of all effects takes longer than to read what it compiles to: JAX finds compiled
+programs by their code, which has to be traced first. So the code is kept beside them
+(``jax.export``), by the sources of what may be traced, the structure of the arguments and their
+shapes.
+"""
+
+import contextlib
+import functools
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import flytrack_env
+from flytrack_env import fusion
+from flytrack_env.compile_cache import FOLDER
+from flytrack_env.files import write_atomically
+
+UNKEPT = "LearnedLaw"  # an effect whose structure the text of a tree does not tell
+
+
+def keep_trace(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return ``jax.jit`` of a function of trees of arrays whose traces are kept on the disk.
+
+    Only where compiled programs are kept, too (``flytrack_env.compile_cache``), and only for calls
+    that are not traced themselves.
+    """
+    program = jax.jit(function)
+    known: dict[Any, Callable[..., Any]] = {}
+
+    @functools.wraps(function)
+    def call(*args: Any) -> Any:
+        leaves, structure = jax.tree.flatten(args)
+        folder = getattr(jax.config, FOLDER)
+        if folder is None or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            return program(*args)
+        kinds = tuple((np.shape(leaf), np.result_type(leaf)) for leaf in leaves)
+        key = structure, kinds, jax.config.read("jax_enable_x64")
+        if key not in known:
+            known[key] = _load(function, structure, kinds, Path(folder) / "traced")
+        return known[key](*leaves)
+
+    return call
+
+
+def _load(
+    function: Callable[..., Any], structure: Any, kinds: tuple[Any, ...], folder: Path
+) -> Callable[..., Any]:
+    """Return the program of leaves, from the disk or traced and put there."""
+
+    def of_leaves(*leaves: Any) -> Any:
+        return function(*jax.tree.unflatten(structure, leaves))
+
+    of_leaves.__name__ = function.__name__
+    program, text = jax.jit(of_leaves), str(structure)
+    if UNKEPT in text:
+        return program
+    path = folder / _digest(function, text, kinds)
+    kept = _read(path)
+    if kept is not None:
+        exported = jax.export.deserialize(kept)
+    else:
+        shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds]
+        exported = jax.export.export(program)(*shapes)
+        content = exported.serialize()
+        with contextlib.suppress(OSError):  # a full disk, or a folder that is begun afresh
+            write_atomically(path, hashlib.sha256(content).digest() + content)
+    return jax.jit(exported.call)
+
+
+def _read(path: Path) -> bytearray | None:
+    """Return a trace on the disk; None if there is none, or a damaged one."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    size = hashlib.sha256().digest_size
+    is_whole = hashlib.sha256(content[size:]).digest() == content[:size]
+    return bytearray(content[size:]) if is_whole else None
+
+
+def _digest(function: Callable[..., Any], structure: str, kinds: tuple[Any, ...]) -> str:
+    """Return the name of a trace: whatever the code depends on."""
+    settings = (
+        jax.config.read("jax_enable_x64"),
+        jax.default_backend(),
+        os.environ.get(fusion.SWITCH),
+    )
+    parts = (_sources(), function.__module__, function.__qualname__, structure, kinds, settings)
+    return hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()
+
+
+@functools.cache
+def _sources() -> str:
+    """Return a digest of JAX's version and of all modules that may be traced."""
+    digest = hashlib.sha256(jax.__version__.encode())
+    for package in (Path(flytrack_env.__file__).parent, Path(__file__).parent):
+        for path in sorted(package.rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
