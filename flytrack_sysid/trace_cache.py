@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 import flytrack_env
 from flytrack_env import fusion
@@ -40,7 +39,8 @@ def keep_trace(function: Callable[..., Any]) -> Callable[..., Any]:
         folder = getattr(jax.config, FOLDER)
         if folder is None or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return program(*args)
-        kinds = tuple((np.shape(leaf), np.result_type(leaf)) for leaf in leaves)
+        types = map(jax.typeof, leaves)
+        kinds = tuple((one.shape, one.dtype) for one in types)
         key = structure, kinds, jax.config.read("jax_enable_x64")
         if key not in known:
             known[key] = _load(function, structure, kinds, Path(folder) / "traced")
