@@ -247,7 +247,9 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
     assert refined is not None, "refined_within_range comes first"
     selection = reduced(judged.selection, refined)
     problem, model = selection.state.problem, selection.model
-    state, linearization = selection.state.linearized(model.vector)
+    # Intervals are of the model itself: those of ground_effect were a third too short with slopes
+    # of a model nearby.
+    state, linearization = selection.state.linearized(model.vector, max_distance=0.0)
     effects = summary.effect_causes(selection, test, linearization)
     in_base, lost_in_base = summary.base_causes(selection, test, linearization, effects)
     contradicted = [

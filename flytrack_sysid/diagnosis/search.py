@@ -128,13 +128,16 @@ class SearchState:
         """Return the state with another noise, (6, NUM_AXES)."""
         return replace(self, problem=self.problem.with_noise(noise))
 
-    def linearized(self, vector: np.ndarray) -> tuple["SearchState", Linearization]:
+    def linearized(
+        self, vector: np.ndarray, max_distance: float = STALE
+    ) -> tuple["SearchState", Linearization]:
         """Return the state that has a linearization along everything, and the linearization.
 
-        Slopes of a nearby linearization are used again.
+        Slopes of one that is near, within ``max_distance`` of chi2, are used again.
         """
         problem, last = self.problem, self.linearization
-        if last is not None and last.places == self.every_place and last.distance(vector) < STALE:
+        is_same = last is not None and last.places == self.every_place
+        if last is not None and is_same and last.distance(vector) <= max_distance:
             if last.noise is not problem.noise:
                 last = Linearization(problem, last.slopes, last.probes)
             found = last.moved(vector)
