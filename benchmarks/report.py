@@ -218,8 +218,8 @@ def record_trials(
         path: file of lines.
         trials: named tuples.
         measure: returns what is measured of a trial.
-        programs_kept: trials after which compiled programs are forgotten, since a process may map
-            only so many into its memory; None for never.
+        programs_kept: trials after which compiled programs are dropped, None for never; the system
+            limits how many memory mappings a process may have.
     """
     commit = commit_of_checkout()  # before lines change a file
     machine = f"{platform.machine()}, {os.cpu_count()} cores, jax {version('jax')}"

@@ -1,7 +1,7 @@
 """Policies of other trainers for ``flytrack bench``: ``clients.entries:sb3_0`` is that of seed 0.
 
-Each is trained when it is asked for, on FlyTrack-v0, by the settings of this folder and for so many
-steps.
+Each policy is trained on FlyTrack-v0 at its first use, with the settings and number of steps of
+this folder.
 """
 
 from collections.abc import Callable

@@ -1,8 +1,8 @@
 """Offsets between the clocks of sensors that measure the same motion.
 
 Only sensors are compared: attitude with gyroscope, velocity with accelerometer, position with
-velocity. Commands are not: how late the motion follows them is the plant's lag. But a drone that
-turns before it is told to has commands from a clock that is late. A slow estimator looks like a
+velocity. Commands are not: how late the motion follows them is the plant's lag. But if a
+drone turns before its command, the clock of the commands is late. A slow estimator looks like a
 late clock and is corrected as one.
 
 Of a pair, one is the integral of the other. Both are taken as changes over the same windows of 0.1

@@ -32,9 +32,9 @@ def pin(free_cores: Any) -> None:
 def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any] | None:
     """Return a job's result, from its file if it has finished; an unfinished job starts again.
 
-    What it prints goes to a log in the job's folder, and so does the traceback of an error, of
-    which None comes back. Programs are forgotten, since a process may map only so many into its
-    memory.
+    What it prints goes to a log in the job's folder, and so does the traceback of an error, and
+    the result is None. Compiled programs are dropped afterwards: the system limits how many memory
+    mappings a process may have.
     """
     folder = out / job
     if (folder / RESULT).exists():

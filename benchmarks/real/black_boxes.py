@@ -149,10 +149,10 @@ class _Network(nn.Module):
 def fit_network(rows: Rows) -> BlackBox:
     """Return the base with a network for its residual, stopped early by every fourth block."""
 
-    def inputs_of(rows: Rows) -> np.ndarray:
+    def stack_inputs(rows: Rows) -> np.ndarray:
         return np.c_[_latest(rows), rows.base, rows.vel_b]
 
-    inputs, residual = inputs_of(rows), rows.target - rows.base
+    inputs, residual = stack_inputs(rows), rows.target - rows.base
     mean, spread, size = inputs.mean(axis=0), inputs.std(axis=0) + 1e-9, residual.std(axis=0)
     inputs = ((inputs - mean) / spread).astype(np.float32)
     residual = (residual / size).astype(np.float32)
@@ -183,7 +183,7 @@ def fit_network(rows: Rows) -> BlackBox:
     apply = jax.jit(module.apply)
 
     def black_box(rows: Rows) -> np.ndarray:
-        scaled = ((inputs_of(rows) - mean) / spread).astype(np.float32)
+        scaled = ((stack_inputs(rows) - mean) / spread).astype(np.float32)
         return rows.base + size * np.asarray(apply(best, scaled), float)
 
     return black_box

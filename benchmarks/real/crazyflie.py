@@ -140,11 +140,11 @@ def measure_fold(folder: Path, policy: str, seconds: float) -> dict[str, Any]:
         "by_flight": error_ratios(
             results["refitted_base"], results["extended"], log.segment[windows.start]
         ),
-        "values": {} if fit is None else values_of(problem, fit),
+        "values": {} if fit is None else read_values(problem, fit),
     }
 
 
-def values_of(problem: Problem, fit: Any) -> dict[str, list[float]]:
+def read_values(problem: Problem, fit: Any) -> dict[str, list[float]]:
     """Return the fitted parameters by name: value and half of the 95 % interval."""
     pairs = zip(fit.places, fit.half_widths, strict=True)
     return {problem.names[i]: [float(fit.vector[i]), float(half)] for i, half in pairs}
@@ -192,7 +192,7 @@ def fit_policies(
         half_s = half_responses(fit.vector[None], problem.like, SMALL_STEP)[0]
         times = dict(zip(STICKS, half_s.tolist(), strict=True))
         result.append(
-            {"policy": policy, "values": values_of(problem, fit), "half_response_s": times}
+            {"policy": policy, "values": read_values(problem, fit), "half_response_s": times}
         )
     return result
 

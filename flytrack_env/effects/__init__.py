@@ -83,8 +83,7 @@ EFFECTS: tuple[Effect, ...] = (
 # Last, what a log has shown beyond all of these.
 ORDER = (*EFFECTS, LEARNED_LAW)
 ROUNDING = 1e-5  # of float32 times
-# Delays that are drawn around those of a model are longer by this factor and so many seconds, at
-# most.
+# Largest delay that is drawn around a model's: this factor times it, plus these seconds.
 DRAWN_LONGER, DRAWN_LATER_S = 1.25, 0.02
 BY_NAME = {effect.name: effect for effect in ORDER}
 _BY_CLASS = {effect.parameters: effect for effect in ORDER}
