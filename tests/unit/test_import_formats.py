@@ -145,7 +145,7 @@ def test_other_kinds_are_named(kind):
     assert kind in str(identify(OTHERS[kind][:512]))
 
 
-@pytest.mark.parametrize("kind", WRITERS.keys() - {"CSV files"})
+@pytest.mark.parametrize("kind", [kind for kind in WRITERS if kind != "CSV files"])
 def test_logs_of_other_formats_are_refused_with_the_format_that_reads_them(kind, tmp_path):
     form, write = WRITERS[kind]
     path, _ = write(tmp_path, flying())
