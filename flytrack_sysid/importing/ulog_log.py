@@ -199,10 +199,19 @@ def _best_instance(
     path: Path, name: str, instances: dict[int, dict[str, np.ndarray]], fields: tuple[str, ...]
 ) -> tuple[Samples, Clock, list[str]] | None:
     """Return ``_samples_of`` the topic instance with most valid samples; the first of equals."""
-    found = [_samples_of(path, name, topic, fields) for topic in instances.values()]
-    return max(
-        (one for one in found if one is not None), key=lambda one: len(one[0].times), default=None
-    )
+    found = {
+        number: samples
+        for number, topic in instances.items()
+        if (samples := _samples_of(path, name, topic, fields)) is not None
+    }
+    if not found:
+        return None
+    used = max(found, key=lambda number: len(found[number][0].times))
+    samples, clock, faults = found[used]
+    others = ", ".join(str(number) for number in found if number != used)
+    if others:
+        faults = [*faults, f"instance {used} of {name} is used, not {others}"]
+    return samples, clock, faults
 
 
 def _samples_of(

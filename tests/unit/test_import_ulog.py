@@ -100,9 +100,11 @@ def test_the_battery_that_is_measured_is_used(topics, read, first_v, second_v):
     fields, rows = topics[BATTERY]
     packs = [[(row[0], volts) for row in rows] for volts in (first_v, second_v)]
     topics[BATTERY] = (fields, *packs)
-    log = read(topics).log
-    expected = next((volts for volts in (first_v, second_v) if volts > 0.0), None)
+    found = read(topics)
+    log, expected = found.log, next((volts for volts in (first_v, second_v) if volts > 0.0), None)
     assert ("v_bat" in log) == (expected is not None)
+    note = "instance 0 of battery_status is used, not 1"
+    assert any(note in one for one in found.notes) == (min(first_v, second_v) > 0.0)
     assert expected is None or log["v_bat"][:, 0] == pytest.approx(expected)
 
 
