@@ -136,8 +136,10 @@ class Diagnose:
 
     logs: Annotated[Paths, arg(metavar="LOG [LOG ...]", help_behavior_hint="(at least one)")]
     """Flight logs to learn from."""
-    out: Path
-    """The folder of the report."""
+    out: OptionalPath = None
+    """The folder of the report; without --quick."""
+    quick: bool = False
+    """Print only the first look, and what it did not check."""
     model: OptionalPath = None
     """The model to diagnose, .json; default: the nominal model."""
     hold_out: SomeLogs = ()

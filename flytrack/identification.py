@@ -16,7 +16,15 @@ from flytrack_env.model_file import ModelFileError
 from flytrack_env.plants import Plant
 from flytrack_env.progress import ProgressBar
 from flytrack_sysid.collect import CollectError, collect
-from flytrack_sysid.diagnosis import diagnose, diagnose_change, joined, motion_of, write_diagnosis
+from flytrack_sysid.diagnosis import (
+    NOT_CHECKED,
+    diagnose,
+    diagnose_change,
+    first_look,
+    joined,
+    motion_of,
+    write_diagnosis,
+)
 from flytrack_sysid.diagnosis import text_of as text_of_diagnosis
 from flytrack_sysid.diagnosis.identifiability import next_flight
 from flytrack_sysid.diagnosis.report import traces_of
@@ -144,8 +152,16 @@ def run_diagnose(flags: Diagnose) -> None:
     held_out = np.arange(len(log)) >= sum(map(len, train)) if test else None
     model = None if flags.model is None else load_model(flags.model)
     motion = None if flags.motion == "auto" else Motion(flags.motion)
-    rest = (model, held_out, ProgressBar("stages"), motion)
-    found = diagnose_change(logs, before, *rest) if before else diagnose(logs, *rest)
+    if flags.quick:
+        print(f"{first_look(logs, model, held_out, motion).text()}\n{NOT_CHECKED}")
+        return
+    if flags.out is None:
+        raise ValueError("--out: missing, expected a folder for the report, or --quick")
+    bar = ProgressBar("stages")
+    if before:
+        found = diagnose_change(logs, before, model, held_out, bar, motion)
+    else:
+        found = diagnose(logs, model, held_out, bar, motion, lambda look: bar.write(look.text()))
     written = write_diagnosis(flags.out, found, log)
     print(text_of_diagnosis(found))
     recording = flags.out / RECORDING_NAME

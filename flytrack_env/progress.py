@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on a terminal, a line every 30 s elsewhere.
+"""Progress of long work: a bar on a terminal, a line every 10 s elsewhere.
 
 tqdm comes with the extras.
 """
@@ -8,7 +8,7 @@ from typing import Any, TextIO
 
 from tqdm import tqdm
 
-LINE_EVERY_S = 30.0
+LINE_EVERY_S = 10.0
 LINE = "{desc}{n_fmt} of {total_fmt}{unit}, {elapsed} so far, {remaining} left{postfix}"
 
 
@@ -48,3 +48,8 @@ class ProgressBar:
         self.bar.update(done - self.bar.n)
         if done == total:
             self.bar.close()
+
+    def write(self, text: str) -> None:
+        """Print text above the bar, at once."""
+        self.bar.write(text)
+        sys.stdout.flush()

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +15,14 @@ from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis import summary
 from flytrack_sysid.diagnosis.beyond import with_and_without, with_learned
-from flytrack_sysid.diagnosis.lanes import Lanes, lanes_of, thinned, voltages_of
+from flytrack_sysid.diagnosis.first_look import FirstLook
+from flytrack_sysid.diagnosis.lanes import (
+    Lanes,
+    at_usual_rate,
+    lanes_of,
+    thinned,
+    voltages_of,
+)
 from flytrack_sysid.diagnosis.late_poses import with_late_poses
 from flytrack_sysid.diagnosis.lateness import read_poses
 from flytrack_sysid.diagnosis.learned import find_learned
@@ -30,7 +38,12 @@ from flytrack_sysid.diagnosis.outliers import outlier_notes, outliers_of
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Refined, reduced, refine
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis
-from flytrack_sysid.diagnosis.search import SearchState, search
+from flytrack_sysid.diagnosis.search import (
+    FittedModel,
+    SearchState,
+    extended,
+    with_noise_of,
+)
 from flytrack_sysid.diagnosis.size import split_by_size
 from flytrack_sysid.diagnosis.vetoes import (
     Selection,
@@ -45,7 +58,7 @@ from flytrack_sysid.log_motion import check_same_origin, motion_notes, required_
 from flytrack_sysid.log_voltage import battery_of_craft, voltage_notes, with_voltage
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
-STAGES = ("search", "vetoes", "refinement", "summary")
+STAGES = ("first look", "search", "vetoes", "refinement", "summary")
 Report = Callable[[int, int], None]
 
 
@@ -76,14 +89,19 @@ def diagnose(
     held_out: np.ndarray | None = None,
     report: Report = lambda done, stages: None,
     motion: Motion | None = None,
+    show: Callable[[FirstLook], None] = lambda look: None,
 ) -> Diagnosis:
     """Diagnose a model from a log: causes, what is unexplained or not identifiable, errors.
 
-    log: one or several, taken together. model: the simulator's nominal one if None; causes are
-    differences from it. held_out: (num_rows,) bool, rows to judge by and not to learn from; the
-    last of every four blocks of at most 5 s if None. report: called with stages done and to do.
-    motion: how the log moves within a step, whatever the model says; if None, continuously where
-    the log is measured, else by likelihood.
+    Args:
+        log: one or several, taken together.
+        model: the simulator's nominal one if None; causes are differences from it.
+        held_out: (num_rows,) bool, rows to judge by and not to learn from; the last of every four
+            blocks of at most 5 s if None.
+        report: called with stages done and to do.
+        motion: how the log moves within a step, whatever the model says; if None, continuously
+            where the log is measured, else by likelihood.
+        show: called with the first look, before the search.
 
     Raises:
         DiagnosisError: a log with neither gyro nor attitude; ``held_out`` of another shape.
@@ -91,7 +109,10 @@ def diagnose(
     # Matrices are small: threads of BLAS wait for each other longer than they work.
     with threadpool_limits(1, "blas"), jax.enable_x64(True):
         parts = split(log, model, held_out, motion)
-        selection = select_model(parts)
+        report(1, len(STAGES))
+        state, base = begun(parts)
+        show(FirstLook.of(state, base))
+        selection = select(*extended(state, base, base))
         # Drones, and who is late, are told by their clocks; two simulator's steps only by what they
         # leave. A measured log is continuous, and never gets here.
         if (
@@ -102,26 +123,39 @@ def diagnose(
             likelier = likelier_motion(selection.state.problem, selection.model.vector)
             if likelier is not parts.moves.motion:
                 parts = split(log, model, held_out, likelier)
-                selection = select_model(parts)
-        report(1, len(STAGES))
+                state, base = begun(parts)
+                selection = select(*extended(state, base, base))
+        report(2, len(STAGES))
         judged = judged_in_time(selection, parts)
         selection, test = judged.selection, held_out_under(judged.selection, parts.test)
-        report(2, len(STAGES))
-        judged = refined_within_range(judged, test, parts)
         report(3, len(STAGES))
+        judged = refined_within_range(judged, test, parts)
+        report(4, len(STAGES))
         found = summarize(judged, parts._replace(test=test))
         nominal = nominal_parameters() if model is None else model
         found = replace(found, nominal=nominal._replace(motion=found.extended.motion))
         found = with_late_poses(
             found, parts.moves, (selection.state.problem, test), parts.as_logged
         )
-        report(4, len(STAGES))
+        report(5, len(STAGES))
     return found
 
 
-def select_model(parts: Split) -> Selection:
-    """Return the model that is selected from the rows to learn from."""
-    return select(*search(SearchState.start(parts.log, parts.train)))
+def first_look(
+    log: FlightLog | Sequence[FlightLog],
+    model: ModelParameters | None = None,
+    held_out: np.ndarray | None = None,
+    motion: Motion | None = None,
+) -> FirstLook:
+    """Return what ``diagnose`` shows first, and nothing else; arguments and errors are its own."""
+    with threadpool_limits(1, "blas"), jax.enable_x64(True):
+        return FirstLook.of(*begun(split(log, model, held_out, motion)))
+
+
+def begun(parts: Split) -> tuple[SearchState, FittedModel]:
+    """Return the search before it: the noise of the rows to learn from, and the base."""
+    state = SearchState.start(parts.log, parts.train)
+    return with_noise_of(state, state.fitted((), state.problem.start))
 
 
 def split(
@@ -151,8 +185,9 @@ def split(
     warnings += voltage_notes(log, model.battery)
     log = with_voltage(log, model)
     model = model._replace(battery=battery_of_craft(log, model.battery))
-    log, is_kept, notes = with_causal_commands(log, model)
-    warnings, out = [*warnings, *notes], out[is_kept]
+    for cleaned in (partial(with_causal_commands, model=model), at_usual_rate):
+        log, is_kept, notes = cleaned(log)
+        warnings, out = [*warnings, *notes], out[is_kept]
     with_motion = how_it_moves(log, model, ~out, motion)
     model = model._replace(motion=with_motion.motion)
     corrected, is_known = read_poses(log, with_motion.late_s)

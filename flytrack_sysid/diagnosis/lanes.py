@@ -6,21 +6,23 @@ with a lead-in of the second before it, and all lanes are replayed at once: many
 in sequence.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.log import FlightLog
+from flytrack_sysid.log import FlightLog, usual_step
 from flytrack_sysid.log_voltage import with_voltage
 from flytrack_sysid.record import Record, is_applied_certain, make_record, measured_channels
 
 LEAD_IN_S, LANE_S = 1, 5
 PIECES = LEAD_IN_S + LANE_S  # of a second each, the lead-in first
 FEWEST_ROWS_PER_S = 20
+MOST_RATE_HZ = 250.0  # a rate loop takes 10 to 50 ms: more rows cost more and show no more of it
 # replayed without lead-ins: all of their slopes are in memory at once, some 50 kB a row
-MOST_ROWS = 30_000
+MOST_ROWS = 15_000
 LANES_PADDED_TO = 2  # logs of about the same length share one compiled program
 # Axes of a residual: rotation x, y, z, force x, y, z (all world), battery. Channels of an axis: a
 # direct one, and a level, whose rate of change the direct one measures.
@@ -144,6 +146,26 @@ def lanes_of(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Lane
     return make_lanes(
         with_voltage(log, model), judged, np.asarray(model.tau, float), float(model.g)
     )
+
+
+def at_usual_rate(log: FlightLog) -> tuple[FlightLog, np.ndarray, list[str]]:
+    """Return a log with at most about 250 rows a second, its rows in the log, and a note on that.
+
+    Rows between those that are kept are left out; commands are their means until the next row.
+    """
+    rate_hz = 1.0 / float(np.median(usual_step(log)))
+    every = max(round(rate_hz / MOST_RATE_HZ), 1)
+    if every == 1:
+        return log, np.ones(len(log), bool), []
+    begins = np.flatnonzero(log.is_start())
+    since_start = np.arange(len(log)) - begins[np.cumsum(log.is_start()) - 1]
+    is_kept = since_start % every == 0
+    starts = np.flatnonzero(is_kept)
+    number = np.diff(np.append(starts, len(log)))[:, None]
+    kept = log.select(is_kept)
+    command = np.add.reduceat(log["u"], starts, axis=0) / number
+    note = f"of {rate_hz:.4g} rows a second, one in {every} was used, with the mean of the commands"
+    return replace(kept, channels={**kept.channels, "u": command}), is_kept, [note]
 
 
 def voltages_of(lanes: Lanes) -> tuple[float, float] | None:

@@ -29,7 +29,13 @@ from flytrack_sysid.diagnosis.score_test import (
     inflation_of,
     solve,
 )
-from flytrack_sysid.diagnosis.search import PER_PARAMETER, FittedModel, SearchState, search
+from flytrack_sysid.diagnosis.search import (
+    PER_PARAMETER,
+    FittedModel,
+    SearchState,
+    extended,
+    with_noise_of,
+)
 from flytrack_sysid.diagnosis.vetoes import Selection, select
 from flytrack_sysid.log import FlightLog
 
@@ -376,7 +382,8 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     state, model = _likeliest_side(
         selection, first, [one.candidate.effect for one in near[:MOST_NEAR]]
     )
-    state, base, model = search(_at_best_row(state, test, model, first.row))
+    state, model = with_noise_of(_at_best_row(state, test, model, first.row), model)
+    state, base, model = extended(state, state.fitted((), selection.base.vector), model)
     named = tuple(one for one in state.problem.windows if one.effect in model.effects)
     now, before = (
         {row for one in windows for row in (one.start, one.end)}
@@ -399,7 +406,6 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
 def misfit(selection: Selection, problem: Problem) -> float:
     """Return minus twice the log likelihood of a problem under a selection and its noise."""
     state, lanes = selection.state, problem.lanes
-    assert state.problem.noise is not None
     left = replace(problem, windows=state.problem.windows).residuals(selection.model.vector[None])[
         0
     ]

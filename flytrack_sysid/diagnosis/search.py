@@ -8,7 +8,7 @@ import numpy as np
 
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import voltages_of
-from flytrack_sysid.diagnosis.problem import SEARCHED, Problem
+from flytrack_sysid.diagnosis.problem import NUM_PAIRS, SEARCHED, Problem
 from flytrack_sysid.diagnosis.score_test import (
     Candidate,
     Gain,
@@ -30,10 +30,12 @@ PROMISING = 0.7  # of the threshold, to first order
 SHARE_OF_WAY = (0.02, 1.5)  # to a probe, at which a fit starts
 KEPT_PROMISE = 0.6  # of a gain to first order: a fit that comes to less may have gone astray
 SATURATED_SHARES = np.array([0.0, 1.0, 0.5, 0.2])  # of the step to everything at once
-# Gauss-Newton: rounds, the least gain of a round, shares of a step tried at once, and after how
-# much gain slopes are taken again; gains in minus twice the log likelihood.
-MOST_ROUNDS, LEAST_GAIN, STALE = 30, 0.05, 30.0
-STEP_SHARES = np.array([1.0, 0.5, 0.2, 0.05])
+# Gauss-Newton: rounds, the least gain of a round, and after how much gain slopes are taken again;
+# gains in minus twice the log likelihood.
+MOST_ROUNDS, LEAST_GAIN, STALE = 30, 0.2, 30.0
+TRIAL_ROUNDS = 5  # after which a fit says whether it is worth carrying on
+# Of a step, tried one after the other until one gains a part of what first order promises.
+STEP_SHARES, PART_OF_PROMISE = np.array([1.0, 0.5, 0.2, 0.05]), 0.25
 
 
 class FittedModel(NamedTuple):
@@ -156,24 +158,30 @@ class SearchState:
         candidates: Sequence[Candidate],
         vector: np.ndarray,
         nearby: Linearization | None = None,
+        limit: float = np.inf,
     ) -> FittedModel:
         """Return the best fit of the model with these effects, starting from a vector.
 
-        nearby: as in ``refine``.
+        nearby, limit: as in ``refine``.
         """
         effects = [place for one in candidates for place in self.problem.index(one.fields)]
         places = self.base_places + effects
-        vector, cost = refine(self.problem, vector, places, nearby)
+        vector, cost = refine(self.problem, vector, places, nearby, limit)
         return FittedModel(tuple(candidates), vector, cost, tuple(places))
 
 
 def refine(
-    problem: Problem, vector: np.ndarray, places: Sequence[int], nearby: Linearization | None = None
+    problem: Problem,
+    vector: np.ndarray,
+    places: Sequence[int],
+    nearby: Linearization | None = None,
+    limit: float = np.inf,
 ) -> tuple[np.ndarray, float]:
     """Minimise the cost along some places by Gauss-Newton; return the vector and its cost.
 
     Slopes are kept while little is gained: residuals cost a tenth of them. nearby: a linearization
-    whose slopes serve at first.
+    whose slopes serve at first. limit: of the cost; a fit that is above it after a few rounds ends
+    there.
     """
     places = list(places)
     if nearby is None:
@@ -181,23 +189,41 @@ def refine(
     else:
         now = nearby.narrowed(places).moved(vector)
     since, is_fresh = now.cost, nearby is None
-    for _ in range(MOST_ROUNDS):
-        tried = np.repeat(now.vector[None], len(STEP_SHARES), axis=0)
-        tried[:, places] += STEP_SHARES[:, None] * now.step_inside()
-        tried = problem.clipped(tried)
-        white = problem.whitened_residuals(*tried)
-        costs = costs_of(problem, tried, white)
-        best = int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))
-        gained = now.cost - costs[best]
+    for number in range(MOST_ROUNDS):
+        if number == TRIAL_ROUNDS and now.cost > limit:
+            break
+        gained, later = _step(problem, now)
         if gained > 0.0:
-            now = now.moved(tried[best], white[best])
-            is_fresh = False
+            now, is_fresh = later, False
         if gained < LEAST_GAIN:
             if is_fresh or since - now.cost < STALE:
                 break
             now = Linearization(problem, problem.slopes(now.vector, places))
             since, is_fresh = now.cost, True
     return now.vector, float(now.cost)
+
+
+def _step(problem: Problem, now: Linearization) -> tuple[float, Linearization]:
+    """Return what the best share of a step gains, and the linearization after it.
+
+    As many shares are tried at once as are replayed at once.
+    """
+    step, at_once = now.step_inside(), max(NUM_PAIRS // problem.lanes.row.shape[1], 1)
+    promised = float(step @ now.score)
+    best, gained = now, -np.inf
+    for first in range(0, len(STEP_SHARES), at_once):
+        shares = STEP_SHARES[first : first + at_once]
+        tried = np.repeat(now.vector[None], len(shares), axis=0)
+        tried[:, now.places] += shares[:, None] * step
+        tried = problem.clipped(tried)
+        white = problem.whitened_residuals(*tried)
+        costs = costs_of(problem, tried, white)
+        place = int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))
+        if now.cost - costs[place] > gained:
+            best, gained = now.moved(tried[place], white[place]), now.cost - costs[place]
+        if gained > PART_OF_PROMISE * promised:
+            break
+    return gained, best
 
 
 class Scored(NamedTuple):
@@ -232,27 +258,30 @@ def score_candidates(
 
 
 def add_effect(
-    state: SearchState, linearization: Linearization, model: FittedModel, scored: Scored
+    state: SearchState,
+    linearization: Linearization,
+    model: FittedModel,
+    scored: Scored,
+    limit: float = np.inf,
 ) -> FittedModel:
     """Return the model with an effect more, fitted from where first order says.
 
     An effect that is looked for at a probe also starts there, if it came to much less than
-    promised.
+    promised. limit: as in ``refine``.
     """
     problem, (candidate, gain) = state.problem, scored
     candidates = model.joined_by(candidate)
     if not candidate.probes:
         vector = model.vector.copy()
         vector[problem.index(candidate.fields)] += gain.step
-        return state.fitted(candidates, problem.clipped(vector), linearization)
-    best = state.fitted(candidates, _on_the_way(problem, model, scored))
+        return state.fitted(candidates, problem.clipped(vector), linearization, limit)
+    best = state.fitted(candidates, _on_the_way(problem, model, scored), limit=limit)
     if model.cost - best.cost < KEPT_PROMISE * gain.chi2:
         at_probes = model.vector
         for probe, share in zip(candidate.probes, gain.step, strict=False):
             at_probes = probe.placed_in(problem, at_probes) if share > 0.0 else at_probes
-        best = min(
-            best, state.fitted(candidates, problem.clipped(at_probes)), key=lambda one: one.cost
-        )
+        other = state.fitted(candidates, problem.clipped(at_probes), limit=limit)
+        best = min(best, other, key=lambda one: one.cost)
     return best
 
 
@@ -282,7 +311,7 @@ def add_best(
         near = [one for one in ranked[:MOST_REFITTED] if one.merit > CLOSE * ranked[0].merit]
         best: tuple[float, FittedModel] | None = None
         for one in near:
-            trial = add_effect(state, linearization, model, one)
+            trial = add_effect(state, linearization, model, one, limit=-np.inf)
             gain = (model.cost - trial.cost) / one.gain.inflation
             merit = gain - PER_PARAMETER * one.gain.num_parameters
             if gain > threshold(one.gain.num_parameters) and (best is None or merit > best[0]):
@@ -319,25 +348,29 @@ def saturated_residuals(linearization: Linearization) -> np.ndarray:
     return left[int(np.nanargmin(costs_of(problem, tried, problem.whiten(left))))]
 
 
-def search(state: SearchState) -> tuple[SearchState, FittedModel, FittedModel]:
-    """Return the state with its noise, the refitted base, and the model with effects.
+def with_noise_of(state: SearchState, model: FittedModel) -> tuple[SearchState, FittedModel]:
+    """Return the state with the noise that a model and everything it may lack leave, and its fit.
+
+    The fit is the model's own, under that noise.
+    """
+    state, linearization = state.linearized(model.vector)
+    left = saturated_residuals(linearization)
+    state = state.with_noise(noises.fit_noise(state.problem.lanes, left, state.problem.noise))
+    state, linearization = state.linearized(model.vector)
+    return state, state.fitted(model.candidates, model.vector, linearization)
+
+
+def extended(
+    state: SearchState, base: FittedModel, model: FittedModel
+) -> tuple[SearchState, FittedModel, FittedModel]:
+    """Return the state with its noise, the refitted base, and the model with effects added.
 
     Noise and effects take turns: a large effect hides small ones as long as its remainder passes
     for noise.
     """
-    lanes = state.problem.lanes
-    base = state.fitted((), state.problem.start)
-    state, linearization = state.linearized(base.vector)
-    state = state.with_noise(noises.fit_noise(lanes, saturated_residuals(linearization)))
-    state, linearization = state.linearized(base.vector)
-    base = model = state.fitted((), base.vector, linearization)
     while True:
         state, more = add_effects(state, model)
         if more is model:
             return state, base, model
-        state, linearization = state.linearized(more.vector)
-        noise = noises.fit_noise(lanes, saturated_residuals(linearization), state.problem.noise)
-        state = state.with_noise(noise)
-        state, linearization = state.linearized(more.vector)
-        model = state.fitted(more.candidates, more.vector, linearization)
+        state, model = with_noise_of(state, more)
         base = state.fitted((), base.vector)

@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
+from flytrack.cli import main
 from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, vetoes
 from flytrack_sysid.diagnosis import noise as noises
@@ -20,6 +21,7 @@ from flytrack_sysid.diagnosis.lanes import (
     LANE_S,
     LEAD_IN_S,
     NUM_AXES,
+    at_usual_rate,
     lanes_of,
     make_lanes,
     thinned,
@@ -33,6 +35,7 @@ from flytrack_sysid.diagnosis.result import Cause, Estimated
 from flytrack_sysid.diagnosis.search import SearchState
 from flytrack_sysid.diagnosis.summary import stand_in_notes, warnings_of, with_refined_values
 from flytrack_sysid.diagnosis.vetoes import Selection
+from flytrack_sysid.log_file import save_log
 from flytrack_sysid.parameters import THRUST_COEFFS
 from flytrack_sysid.record import make_record
 from flytrack_sysid.replay import replay, start_replay
@@ -205,6 +208,29 @@ def test_logs_of_another_length_rate_and_channels_compile_nothing(flown):
             evaluate(other, model)
     jax.monitoring.unregister_event_duration_listener(count)
     assert compiled == []
+
+
+def test_a_fast_log_keeps_rows_at_a_usual_rate_and_the_means_of_its_commands(flown):
+    log = replace(flown[1], time=0.2 * flown[1].time)  # 500 Hz
+    segment = np.where(np.arange(len(log)) < 1001, 0, 1)
+    slower, is_kept, (note,) = at_usual_rate(replace(log, segment=segment))
+    assert note.startswith("of 500 rows a second, one in 2 was used")
+    np.testing.assert_array_equal(np.flatnonzero(is_kept)[499:503], [998, 1000, 1001, 1003])
+    np.testing.assert_array_equal(slower["w"], log["w"][is_kept])
+    np.testing.assert_allclose(slower["u"][:500], 0.5 * (log["u"][:1000:2] + log["u"][1:1001:2]))
+    np.testing.assert_array_equal(slower["u"][500], log["u"][1000])
+    as_it_was, is_kept, notes = at_usual_rate(flown[1])
+    assert as_it_was is flown[1] and is_kept.all() and notes == []
+
+
+def test_the_first_look_ranks_what_is_hidden_and_says_what_it_did_not_check(tmp_path, capsys):
+    _, log = scripted(5, 20.0, effects={"linear_drag": {"d_x": 0.3, "d_y": 0.4, "d_z": 0.1}})
+    save_log(tmp_path / "log.npz", log)
+    main(["diagnose", str(tmp_path / "log.npz"), "--motion", "handout", "--quick"])
+    text = capsys.readouterr().out
+    base, first = text.index("The base refitted: tau_roll = "), text.index("  linear_drag: ")
+    assert base < first < text.index("Not checked: ")
+    assert first == text.index("  ") and [*tmp_path.iterdir()] == [tmp_path / "log.npz"]
 
 
 def test_a_log_without_turns_is_refused(flown):
