@@ -166,7 +166,6 @@ class Channels(Problem):
 
     def whiten(self, left: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
         """Return residuals over their noise."""
-        assert self.noise is not None, "a noise comes first"
         return left / self.noise[axes]
 
     def spread(self, vector: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from flytrack_bench.hidden import Truth
 from flytrack_bench.hidden.drone import SECONDS_PER_MINUTE
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis.lanes import NUM_AXES, lanes_of
-from flytrack_sysid.diagnosis.model_selection import MOST_RIVALS, ablate
+from flytrack_sysid.diagnosis.model_selection import MOST_RIVALS, ablate_all
 from flytrack_sysid.diagnosis.noise import fit_noise
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import CANDIDATES
@@ -137,9 +137,8 @@ def known(
         fitted = fit_all(state, effects)
         state, linearization = state.linearized(fitted.vector)
         result = {}
-        for candidate in fitted.candidates:
-            ablation = ablate(state, fitted, linearization, candidate.effect)
-            result[candidate.effect] = _known(ablation.gain, ablation.rivals)
+        for effect, ablation in ablate_all(state, fitted, linearization).items():
+            result[effect] = _known(ablation.gain, ablation.rivals)
         if "thrust_scale" in effects:
             result["thrust_scale"] = _scale_known(state, fitted)
     return result

@@ -28,7 +28,7 @@ from flytrack_sysid.diagnosis.diagnose import (
     split,
     summarize,
 )
-from flytrack_sysid.diagnosis.model_selection import EQUIVALENT, Marginal, ablate
+from flytrack_sysid.diagnosis.model_selection import EQUIVALENT, Marginal, ablate_all
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import DRIFT, Cause, Diagnosis, Estimated, Unexplained
 from flytrack_sysid.diagnosis.score_test import (
@@ -305,10 +305,7 @@ def selection_of(later: Estimate, earlier: Estimate) -> Selection:
     Its unexplained part is what was not unexplained, or much less, in the earlier log.
     """
     state, model = later.state, later.model
-    ablations = {
-        name: ablate(state, model, later.linearization, name) for name in sorted(model.effects)
-    }
-    ablations = {one.effect: ablations[one.effect] for one in model.candidates}
+    ablations = ablate_all(state, model, later.linearization)
     rest, past = (
         find_unexplained(one.state.problem, one.model, one.base.vector)[0].shares
         for one in (later, earlier)

@@ -80,9 +80,9 @@ def thinned_problem(problem: Problem) -> Problem:
     Hundreds of terms are tried.
     """
     lanes = thinned(problem.lanes, max(MOST_ROWS // len(problem.lanes.row), 2))
-    if lanes is problem.lanes or problem.late is not None or problem.noise is None:
+    if lanes is problem.lanes or problem.late is not None:
         return problem
-    return problem.with_lanes(lanes).with_noise(problem.noise)
+    return problem.with_lanes(lanes)
 
 
 def _predicts(

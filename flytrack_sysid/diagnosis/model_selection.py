@@ -66,6 +66,11 @@ class Ablation(NamedTuple):
         """The gain over its inflation."""
         return self.gain / self.inflation
 
+    @property
+    def margin(self) -> float:
+        """By how much the gain exceeds what chance brings about."""
+        return self.robust - threshold(self.num_parameters)
+
 
 def without_effect(state: SearchState, model: FittedModel, effect: str) -> FittedModel:
     """Return the model without an effect, refitted."""
@@ -76,11 +81,50 @@ def without_effect(state: SearchState, model: FittedModel, effect: str) -> Fitte
 def ablate(
     state: SearchState, model: FittedModel, linearization: Linearization, effect: str
 ) -> Ablation:
-    """Return what an effect of a model is worth; linearization: of the model, along everything."""
+    """Return what an effect of a model is worth, without rivals.
+
+    linearization: of the model, along everything.
+    """
     less = without_effect(state, model, effect)
+    columns = [linearization.column(field) for field in model.candidate(effect).fields]
+    own = linearization.gain(columns, linearization.columns_at(model.places, without=columns))
+    inflation, determined = (1.0, 1) if own is None else (own.inflation, own.num_parameters)
+    return Ablation(less.cost - model.cost, inflation, determined, {}, {}, less)
+
+
+def ablate_all(
+    state: SearchState, model: FittedModel, linearization: Linearization
+) -> dict[str, Ablation]:
+    """Return what every effect of a model is worth, and its rivals in its place."""
+    alone = [ablate(state, model, linearization, one.effect) for one in model.candidates]
+    return with_rivals(state, model, linearization, alone)
+
+
+def with_rivals(
+    state: SearchState,
+    model: FittedModel,
+    linearization: Linearization,
+    ablations: Sequence[Ablation],
+) -> dict[str, Ablation]:
+    """Return ablations, in the order of the model's effects, with their rivals, by effect."""
+    effects = (one.effect for one in model.candidates)
+    return {
+        effect: _with_rivals(state, model, linearization, effect, one)
+        for effect, one in zip(effects, ablations, strict=True)
+    }
+
+
+def _with_rivals(
+    state: SearchState,
+    model: FittedModel,
+    linearization: Linearization,
+    effect: str,
+    ablation: Ablation,
+) -> Ablation:
+    """Return the ablation of an effect with what its rivals are worth in its place."""
+    less, gain, limit = ablation.without, ablation.gain, model.cost + NEARLY
     # Slopes with the effect serve without it: rivals that come near are refitted.
     nearby = linearization.moved(less.vector)
-    gain = less.cost - model.cost
     rivals: dict[str, float] = {}
     swaps: dict[str, FittedModel] = {}
     ranked = [
@@ -91,32 +135,35 @@ def ablate(
         rivals[rival] = gain - one.gain.chi2
         share = PROBE_SHARE if one.candidate.probes else NEAR_SHARE
         if number < MOST_RIVALS and rivals[rival] < max(NEARLY, share * gain):
-            swaps[rival] = add_effect(state, nearby, less, one)
+            swaps[rival] = add_effect(state, nearby, less, one, limit)
             rivals[rival] = swaps[rival].cost - model.cost
     # Without the effect the rest may have moved so far that slopes say nothing of a rival like it.
     beside = separation(linearization, model, effect).beside
     for one in ranked:
         rival = one.candidate.effect
         if rival not in swaps and beside.get(rival, np.inf) < EQUIVALENT:
-            swaps[rival] = with_candidate(state, model, effect, one.candidate)
+            swaps[rival] = with_candidate(state, model, effect, one.candidate, limit)
             rivals[rival] = swaps[rival].cost - model.cost
     for other in other_groups(linearization, model, effect):
         swaps[effect] = min(
-            with_candidate(state, model, effect, other), swaps.get(effect, model), key=price
+            with_candidate(state, model, effect, other, limit),
+            swaps.get(effect, model),
+            key=price,
         )
-    columns = [linearization.column(field) for field in model.candidate(effect).fields]
-    own = linearization.gain(columns, linearization.columns_at(model.places, without=columns))
-    inflation, determined = (1.0, 1) if own is None else (own.inflation, own.num_parameters)
-    return Ablation(gain, inflation, determined, rivals, swaps, less)
+    return ablation._replace(rivals=rivals, swaps=swaps)
 
 
 def with_candidate(
-    state: SearchState, model: FittedModel, effect: str, other: Candidate
+    state: SearchState, model: FittedModel, effect: str, other: Candidate, limit: float
 ) -> FittedModel:
-    """Return the model with a candidate in an effect's place, refitted from where it is."""
+    """Return the model with a candidate in an effect's place, refitted from where it is.
+
+    limit: as in ``search.refine``.
+    """
     candidates = [other if one.effect == effect else one for one in model.candidates]
     dropped = {*model.candidate(effect).fields} - {*other.fields}
-    return state.fitted(candidates, state.problem.at_start(model.vector, sorted(dropped)))
+    vector = state.problem.at_start(model.vector, sorted(dropped))
+    return state.fitted(candidates, vector, limit=limit)
 
 
 def other_groups(linearization: Linearization, model: FittedModel, effect: str) -> list[Candidate]:
@@ -152,15 +199,12 @@ def select_effects(
     """Return the model with unneeded effects removed and better ones swapped in, and ablations."""
     while True:
         state, linearization = state.linearized(model.vector)
-        ablations = {
-            one.effect: ablate(state, model, linearization, one.effect) for one in model.candidates
-        }
-        margins = {
-            name: one.robust - threshold(one.num_parameters) for name, one in ablations.items()
-        }
-        if margins and min(margins.values()) < 0.0:
-            model = without_effect(state, model, min(margins, key=lambda name: margins[name]))
+        alone = [ablate(state, model, linearization, one.effect) for one in model.candidates]
+        weakest = min(alone, key=lambda one: one.margin, default=None)
+        if weakest is not None and weakest.margin < 0.0:
+            model = weakest.without
             continue
+        ablations = with_rivals(state, model, linearization, alone)
         swaps = [swap for one in ablations.values() for swap in one.swaps.values()]
         best = min((*swaps, *with_lags_anew(state, model)), key=price, default=model)
         if price(best) >= price(model) - CLEARLY_CHEAPER:
@@ -354,9 +398,10 @@ def _best_instead(
     limit = model.cost + PER_PARAMETER * len(fields)
     best = less if less.cost < limit else None
     for one in score_candidates(state, nearby, less)[:MOST_REFITTED]:
-        if less.cost - one.gain.chi2 > limit + less.cost * HOPELESS and not one.candidate.probes:
+        hopeless = limit + less.cost * HOPELESS
+        if less.cost - one.gain.chi2 > hopeless and not one.candidate.probes:
             continue
-        trial = add_effect(state, nearby, less, one)
+        trial = add_effect(state, nearby, less, one, hopeless)
         cost = trial.cost + PER_PARAMETER * one.candidate.num_priced
         if cost < limit:
             state, determined = is_determined(state, trial, one.candidate.fields)

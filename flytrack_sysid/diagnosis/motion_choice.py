@@ -297,7 +297,6 @@ def likelier_motion(problem: Problem, vector: np.ndarray) -> Motion:
     one. Of 18 plants (benchmarks.beyond, seed 43) this was chosen on one, and only there another
     won afterwards.
     """
-    assert problem.noise is not None
 
     def misfit(motion: Motion) -> float:
         moving = replace(problem, like=problem.like._replace(motion=motion))

@@ -15,7 +15,7 @@ nothing wanders, a level counts from the first row to the last; where much wande
 increments do.
 """
 
-from functools import partial
+from functools import cached_property, partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -193,21 +193,26 @@ class Whitener:
     """The filter of a noise for rows of lanes: a linear map for residuals and their slopes."""
 
     def __init__(self, lanes: Lanes, log_noise: np.ndarray):
+        self._lanes, self._log_noise = lanes, log_noise
+
+    @cached_property
+    def _parts(self) -> dict[int, dict[int, tuple[Gains, jax.Array]]]:
+        """The gains and what counts, by first lane and first row."""
         nothing = jnp.zeros((NUM_LANES, NUM_AXES))
-        self._parts: dict[int, dict[int, tuple[Gains, jax.Array]]] = {}
-        for lane, parts in cut_to_size(conditions_of(lanes)).items():
-            state, self._parts[lane] = Variances(nothing, nothing, nothing), {}
+        found: dict[int, dict[int, tuple[Gains, jax.Array]]] = {}
+        for lane, parts in cut_to_size(conditions_of(self._lanes)).items():
+            state, found[lane] = Variances(nothing, nothing, nothing), {}
             for begin, rows in parts.items():
-                state, gains = _gains_of_rows(log_noise, state, rows)
-                self._parts[lane][begin] = gains, rows.counts
-        self._shape = lanes.row.shape
+                state, gains = _gains_of_rows(self._log_noise, state, rows)
+                found[lane][begin] = gains, rows.counts
+        return found
 
     def __call__(self, residuals: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
         """Return residuals (models, rows, lanes, axes, 2) as innovations of variance 1.
 
         They are 0 where nothing counts. axes: which of ``NUM_AXES`` they are.
         """
-        num_models, (num_rows, num_lanes) = len(residuals), self._shape
+        num_models, (num_rows, num_lanes) = len(residuals), self._lanes.row.shape
         filled = -num_models % NUM_MODELS, -num_rows % NUM_ROWS, -num_lanes % NUM_LANES
         size = np.add((num_models, num_rows, num_lanes), filled)
         values = np.zeros((size[1], size[0], size[2], NUM_AXES, 2))
@@ -331,6 +336,11 @@ class Likelihood:
 def floors_of(lanes: Lanes) -> np.ndarray:
     """Return the least noise of each channel, (2, NUM_AXES): of its last digit, or of float32."""
     return np.maximum(FLOORS, lanes.quanta * UNIFORM)
+
+
+def least_noise(lanes: Lanes) -> np.ndarray:
+    """Return the logarithms of the least noise, (6, NUM_AXES), with which a problem begins."""
+    return _bounds(lanes)[0]
 
 
 def first_guess(lanes: Lanes, left: np.ndarray) -> np.ndarray:

@@ -122,49 +122,49 @@ def _replay_rows(
 
 
 class Batch(NamedTuple):
-    """Some of the lanes, each repeated to make ``NUM_PAIRS`` pairs of a model and a lane.
+    """What ``NUM_PAIRS`` pairs of a model and a lane are replayed with.
 
-    lanes: of the log. first: their first rows. parts: all their rows, ``NUM_ROWS`` at a time.
+    first: the first row of each pair's lane. parts: all rows, ``NUM_ROWS`` at a time.
     """
 
-    lanes: slice
     first: Record
     parts: tuple[Rows, ...]
 
-    @property
-    def num_lanes(self) -> int:
-        """How many lanes there are."""
-        return self.lanes.stop - self.lanes.start
 
-    @property
-    def num_models(self) -> int:
-        """How many models are replayed at once."""
-        return NUM_PAIRS // self.num_lanes
+class Batches:
+    """The batches of lanes: pairs of all lanes and the first model, then of the second, and so on.
 
+    One size serves logs of any length, rate and channels.
+    """
 
-def batches_of(lanes: Lanes) -> tuple[Batch, ...]:
-    """Return the batches of lanes, of one size, whatever the length, rate and channels of a log."""
-    num_rows, num_lanes = lanes.row.shape
-    nowhere = np.zeros((num_rows, num_lanes, 3))
-    record, gyro_b = lanes.record, lanes.measured.get("w", nowhere + np.nan)
-    force_b = lanes.measured.get("f", nowhere)
-    measured = Measured(record.quat, record.vel_w, record.battery_v, gyro_b, force_b)
-    result = []
-    for start in range(0, num_lanes, NUM_PAIRS):
-        chosen = slice(start, min(start + NUM_PAIRS, num_lanes))
-        pair = start + np.arange(NUM_PAIRS) % (chosen.stop - start)
+    def __init__(self, lanes: Lanes):
+        nowhere = np.zeros((*lanes.row.shape, 3))
+        record, gyro_b = lanes.record, lanes.measured.get("w", nowhere + np.nan)
+        force_b = lanes.measured.get("f", nowhere)
+        self._record, self._gyro_b = record, gyro_b
+        self._measured = Measured(record.quat, record.vel_w, record.battery_v, gyro_b, force_b)
+        self._num_rows, self._num_lanes = lanes.row.shape
+        self._known: dict[int, Batch] = {}
 
-        def at(first: int, values: Any, pair: np.ndarray = pair) -> Any:
-            row = np.minimum(first + np.arange(NUM_ROWS), num_rows - 1)
+    def at(self, first_pair: int) -> Batch:
+        """Return the batch that begins with a pair, made once for each lane it begins with."""
+        first_lane = first_pair % self._num_lanes
+        if first_lane not in self._known:
+            self._known[first_lane] = self._beginning_with(first_lane)
+        return self._known[first_lane]
+
+    def _beginning_with(self, first_lane: int) -> Batch:
+        pair = (first_lane + np.arange(NUM_PAIRS)) % self._num_lanes
+
+        def at(first: int, values: Any) -> Any:
+            row = np.minimum(first + np.arange(NUM_ROWS), self._num_rows - 1)
             return jax.tree.map(lambda leaf: jnp.asarray(leaf[row[:, None], pair]), values)
 
         parts = tuple(
-            Rows(at(first, record), at(first, gyro_b), at(first + 1, measured))
-            for first in range(0, num_rows - 1, NUM_ROWS)
+            Rows(at(row, self._record), at(row, self._gyro_b), at(row + 1, self._measured))
+            for row in range(0, self._num_rows - 1, NUM_ROWS)
         )
-        first_row = jax.tree.map(lambda leaf, pair=pair: jnp.asarray(leaf[0, pair]), lanes.record)
-        result.append(Batch(chosen, first_row, parts))
-    return tuple(result)
+        return Batch(jax.tree.map(lambda leaf: jnp.asarray(leaf[0, pair]), self._record), parts)
 
 
 class Window(NamedTuple):
@@ -198,7 +198,7 @@ class Problem:
 
     like: the nominal model with every effect, float64. given_effects: those that the nominal model
     has. low, high, scale: of each parameter, its bounds and the size of its steps. noise: (6,
-    NUM_AXES), as of ``noise.fit_noise``, and its filter; None before ``with_noise``. late:
+    NUM_AXES), as of ``noise.fit_noise``, and its filter; the least one before ``with_noise``. late:
     of lanes whose poses were corrected. windows: of the effects that act for a part of the log
     only.
     """
@@ -211,11 +211,11 @@ class Problem:
     low: np.ndarray
     high: np.ndarray
     scale: np.ndarray
-    noise: np.ndarray | None = None
-    whitener: noises.Whitener | None = None
+    batches: Batches
+    noise: np.ndarray
+    whitener: noises.Whitener
     late: Late | None = None
     windows: tuple[Window, ...] = ()
-    batches: tuple[Batch, ...] = ()
 
     @classmethod
     def of(
@@ -225,7 +225,7 @@ class Problem:
         effects: Sequence[Effect] = SEARCHED,
         late: Late | None = None,
     ) -> Self:
-        """Return the problem of lanes and a nominal model, without a noise.
+        """Return the problem of lanes and a nominal model, with the least noise.
 
         effects: those that the model may have.
         """
@@ -234,6 +234,7 @@ class Problem:
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), every)
         names, start = names_of(like), to_vector(like)
         low, high = np.array([range_of(name)[:2] for name in names]).T
+        noise = noises.least_noise(lanes)
         return cls(
             lanes=lanes,
             like=like,
@@ -243,18 +244,20 @@ class Problem:
             low=low,
             high=np.minimum(high, _longest(names, lanes)),
             scale=np.array([_scale(name, value) for name, value in zip(names, start, strict=True)]),
+            batches=Batches(lanes),
+            noise=noise,
+            whitener=noises.Whitener(lanes, noise),
             late=late,
-            batches=batches_of(lanes),
         )
 
-    def with_noise(self, noise: np.ndarray | None) -> "Problem":
-        """Return the same problem, weighted by a noise, (6, NUM_AXES), which must not be None."""
-        assert noise is not None, "with_noise comes first"
+    def with_noise(self, noise: np.ndarray) -> "Problem":
+        """Return the same problem, weighted by a noise, (6, NUM_AXES)."""
         return replace(self, noise=noise, whitener=noises.Whitener(self.lanes, noise))
 
     def with_lanes(self, lanes: Lanes) -> "Problem":
         """Return the same problem of other lanes."""
-        return replace(self, lanes=lanes, batches=batches_of(lanes))
+        whitener = noises.Whitener(lanes, self.noise)
+        return replace(self, lanes=lanes, batches=Batches(lanes), whitener=whitener)
 
     def with_law(self, law: LearnedLaw) -> "Problem":
         """Return the problem whose vectors end with the numbers of a law.
@@ -280,7 +283,6 @@ class Problem:
     @property
     def fitted_noise(self) -> noises.Noise:
         """The noise in the sensors' units."""
-        assert self.noise is not None, "with_noise comes first"
         return noises.noise_of(self.noise)
 
     @property
@@ -306,15 +308,13 @@ class Problem:
 
     def _replayed(self, vectors: np.ndarray) -> np.ndarray:
         rows, lanes = self.lanes.row.shape
-        result = np.zeros((len(vectors), rows, lanes, NUM_AXES, 2))
-        for batch in self.batches:
-            for first in range(0, len(vectors), batch.num_models):
-                last = min(first + batch.num_models, len(vectors))
-                model = np.minimum(first + np.arange(NUM_PAIRS) // batch.num_lanes, last - 1)
-                found = self._replay_pairs(vectors[model], batch)
-                found = found[:, : (last - first) * batch.num_lanes]
-                found = found.reshape(rows - 1, last - first, batch.num_lanes, NUM_AXES, 2)
-                result[first:last, 1:, batch.lanes] = np.swapaxes(found, 0, 1)
+        number = len(vectors) * lanes
+        pairs = np.zeros((rows, number, NUM_AXES, 2))
+        for first in range(0, number, NUM_PAIRS):
+            own = np.minimum(first + np.arange(NUM_PAIRS), number - 1)
+            found = self._replay_pairs(vectors[own // lanes], self.batches.at(first))
+            pairs[1:, first : first + NUM_PAIRS] = found[:, : number - first]
+        result = np.swapaxes(pairs.reshape(rows, len(vectors), lanes, NUM_AXES, 2), 0, 1)
         result *= self.lanes.is_joined[..., None, None]
         for name, axes in zip(("w", "f"), AXES, strict=False):
             if name not in self.lanes.measured:
@@ -359,7 +359,6 @@ class Problem:
 
     def whiten(self, left: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
         """Return residuals (num_models, rows, lanes, axes, 2) of some axes as innovations."""
-        assert self.whitener is not None, "with_noise comes first"
         return self.whitener(left, axes)
 
     def whitened_residuals(self, *vectors: np.ndarray) -> np.ndarray:

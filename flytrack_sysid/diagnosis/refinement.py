@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, LearnedLaw
-from flytrack_sysid.diagnosis.model_selection import ablate
+from flytrack_sysid.diagnosis.model_selection import ablate_all
 from flytrack_sysid.diagnosis.onset import ended
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import (
@@ -630,7 +630,7 @@ def _narrowed(selection: Selection, kept: Sequence[Candidate]) -> Selection:
     state = replace(state, held=tuple(one for one in state.held if one.effect not in removed))
     model = state.fitted(kept, state.problem.without(model.vector, removed))
     state, linearization = state.linearized(model.vector)
-    ablations = {one.effect: ablate(state, model, linearization, one.effect) for one in kept}
+    ablations = ablate_all(state, model, linearization)
     return selection._replace(state=state, model=model, ablations=ablations)
 
 

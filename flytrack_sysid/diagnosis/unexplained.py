@@ -529,7 +529,6 @@ def waves_of(problem: Problem, model: FittedModel, lines: Sequence[Line]) -> dic
 
 def stochastic_shares(problem: Problem, model: FittedModel) -> dict[str, float]:
     """Return the size of a clear wandering disturbance over the sensor's noise, by side."""
-    assert problem.noise is not None
     left = problem.residuals(model.vector[None])[0]
     noise = problem.fitted_noise
     felt = np.asarray(noise.coupling) > FELT
