@@ -14,7 +14,14 @@ import numpy as np
 
 from flytrack_env import effects
 from flytrack_env.battery import Battery
-from flytrack_env.effects import StepContext
+from flytrack_env.effects.base import (
+    AccelerometerContext,
+    BatteryContext,
+    CommandContext,
+    ForceContext,
+    RatesContext,
+    StepContext,
+)
 from flytrack_env.fusion import compute_once
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
@@ -122,36 +129,55 @@ def turn_by(quat: Quaternion, angle_b: Vec3) -> Quaternion:
 
 def start_rates(drone: Drone, params: ModelParameters) -> Vec3:
     """Return the steady body rates, rad/s, of a drone's applied action."""
-    rates_b = body_rates(drone.applied, params.max_rate)
-    if not effects.acts(params.effects, "rates"):
-        return rates_b
-    applied, axes = drone.applied, drone.quat.axes()
-    # Held this long, the rates settle to the same values under every motion.
-    context = StepContext(
-        drone=drone, command=applied, dt=HELD_S, applied=applied, body_axes_w=axes
-    )
     memories = effects.start_memories(params.effects, drone)
-    context = _with_thrust(context, params, memories)
-    return effects.fold_rates(params.effects, memories, rates_b, context, ())[0]
+    held = Action(0.0, 0.0, 0.0, 0.0)
+    # Held this long, the rates settle to the same values under every motion.
+    at_once = params._replace(motion=Motion.HANDOUT)
+    return _rates(drone, memories, drone.applied, held, HELD_S, at_once)[-1]
 
 
-def _with_thrust(
-    context: StepContext, params: ModelParameters, memories: tuple[Any, ...]
-) -> StepContext:
-    """Return the context with the results of the stages air and thrust."""
+def _rates(
+    drone: Drone,
+    memories: tuple[Any, ...],
+    applied: Action,
+    applied_slope: Action,
+    elapsed_s: Scalar,
+    params: ModelParameters,
+    first_rates: tuple[Vec3, ...] = (),
+) -> tuple[Vec3, ...]:
+    """Return the body rates of an applied action before each effect, and after all of them.
+
+    drone: at the beginning of the step. first_rates: the result there, where this is later.
+    """
+    rates_b = body_rates(applied, params.max_rate)
+    if not effects.acts(params.effects, "rates"):
+        return (rates_b,) * (len(params.effects) + 1)
+    force = _force_context(drone, memories, applied, drone.quat.axes(), params)
+    context = RatesContext(force, applied_slope, elapsed_s, params.motion, rates_b)
+    return effects.fold_rates(params.effects, memories, context, first_rates)
+
+
+def _force_context(
+    drone: Drone,
+    memories: tuple[Any, ...],
+    applied: Action,
+    body_axes_w: tuple[Vec3, Vec3, Vec3],
+    params: ModelParameters,
+) -> ForceContext:
+    """Return what the stage force sees: the results of the stages air and thrust."""
     air_w = Vec3(0.0, 0.0, 0.0)
     if effects.acts(params.effects, "air"):
-        air_w = compute_once(effects.fold("air", params.effects, memories, air_w, context))
-    context = context._replace(air_w=air_w)
-    thrust = collective_thrust(
-        context.applied.thrust, context.drone.battery_v, params.thrust_coeffs
-    )
+        air_w = compute_once(effects.fold("air", params.effects, memories, air_w, drone))
+    airspeed_w = drone.vel_w - air_w
+    airspeed_b = Vec3(*(axis.dot(airspeed_w) for axis in body_axes_w))
+    thrust = collective_thrust(applied.thrust, drone.battery_v, params.thrust_coeffs)
+    context = ForceContext(drone, applied, body_axes_w, airspeed_b, thrust / params.m)
     thrust = effects.fold("thrust", params.effects, memories, thrust, context)
     return context._replace(thrust_acc=compute_once(thrust / params.m))
 
 
 def _forces(
-    context: StepContext, params: ModelParameters, memories: tuple[Any, ...]
+    context: ForceContext, params: ModelParameters, memories: tuple[Any, ...]
 ) -> tuple[Vec3, Vec3]:
     """Return acceleration, world, and specific force, body, m/s^2, with what effects add."""
     axes, thrust_acc = context.body_axes_w, context.thrust_acc
@@ -167,11 +193,11 @@ def _forces(
 
 
 class Moved(NamedTuple):
-    """A step: the drone after it, what effects remember then, and what they see of its end."""
+    """A step: the drone after it, what effects remember then, and what an accelerometer reads."""
 
     after: Drone
     memories: tuple[Any, ...]
-    context: StepContext
+    context: AccelerometerContext
 
 
 def advance(
@@ -193,40 +219,57 @@ def move(
     return _move_at_once(drone, memories, command, dt, params)
 
 
-def _taus(params: ModelParameters) -> Action:
-    return Action(*(params.tau[i] for i in range(ACTION_SIZE)))
+class _Response(NamedTuple):
+    """How the actuators respond in a span of a step.
+
+    applied: the action at its end, with the memories of effects that replace the lag. acting: the
+    command that acts. tau: its lag, s.
+    """
+
+    applied: Action
+    memories: tuple[Any, ...]
+    acting: Action
+    tau: Action
 
 
-def _beginning(drone: Drone, command: Action, dt: Scalar, params: ModelParameters) -> StepContext:
-    """Return the context of a step that begins."""
-    return StepContext(
-        drone=drone,
-        command=command,
-        dt=dt,
-        motion=params.motion,
-        full_stick_b=body_rates(Action(1.0, 1.0, 1.0, 0.0), params.max_rate),
-        thrust_coeffs=params.thrust_coeffs,
-    )
-
-
-def _applied(
+def _respond(
     drone: Drone,
     memories: tuple[Any, ...],
+    command: Action,
     dt: Scalar,
-    tau: Action,
+    span: tuple[float, float],
     params: ModelParameters,
-    context: StepContext,
-) -> tuple[Action, tuple[Any, ...]]:
-    """Return the applied action after ``dt``, and the memories of effects that replace the lag."""
-    lagged = lag(drone.applied, context.acting, dt, tau)
-    if not effects.acts(params.effects, "respond"):
-        return compute_once(lagged), memories
-    return compute_once(effects.respond(params.effects, memories, lagged, context))
+) -> _Response:
+    """Return the response to a command; drone: at the beginning of the span."""
+    full_stick_b = body_rates(Action(1.0, 1.0, 1.0, 0.0), params.max_rate)
+    context = CommandContext(
+        drone, command, dt, span, params.motion, full_stick_b, params.thrust_coeffs
+    )
+    acting = effects.fold("command", params.effects, memories, command, context)
+    context = context._replace(command=acting)
+    tau = Action(*(params.tau[i] for i in range(ACTION_SIZE)))
+    tau = effects.fold("lag", params.effects, memories, tau, context)
+    applied = lag(drone.applied, acting, (span[1] - span[0]) * dt, tau)
+    if effects.acts(params.effects, "respond"):
+        applied, memories = compute_once(
+            effects.respond(params.effects, memories, applied, context)
+        )
+    else:
+        applied = compute_once(applied)
+    return _Response(applied, memories, acting, tau)
 
 
-def _drained(drone: Drone, elapsed_s: Scalar, params: ModelParameters) -> Scalar:
-    """Return the battery voltage after a time, before what effects add."""
-    return drone.battery_v - params.battery_drain_v_per_min / SECONDS_PER_MINUTE * elapsed_s
+def _voltage(
+    drone: Drone,
+    memories: tuple[Any, ...],
+    applied: Action,
+    elapsed_s: Scalar,
+    params: ModelParameters,
+) -> Scalar:
+    """Return the battery voltage a time after the beginning of a step, at an applied action."""
+    drained = drone.battery_v - params.battery_drain_v_per_min / SECONDS_PER_MINUTE * elapsed_s
+    context = BatteryContext(drone.applied, applied)
+    return effects.fold("battery", params.effects, memories, drained, context)
 
 
 def _move_at_once(
@@ -237,28 +280,21 @@ def _move_at_once(
     The thrust is that of the lagged action *after* the step. The acceleration uses the attitude
     *before* it (handout, equations 1 to 4), or, semi-implicit, the attitude after it.
     """
-    context = _beginning(drone, command, dt, params)
-
-    def fold(stage: str, value: Any) -> Any:  # sees the context of the moment
-        return effects.fold(stage, params.effects, memories, value, context)
-
-    acting = fold("command", command)
-    context = context._replace(acting=acting)
-    tau = fold("lag", _taus(params))
-    applied, memories = _applied(drone, memories, dt, tau, params, context)
-    context = context._replace(applied=applied, body_axes_w=compute_once(drone.quat.axes()))
-    context = _with_thrust(context, params, memories)
+    applied, memories, acting, _ = _respond(drone, memories, command, dt, (0.0, 1.0), params)
+    axes = compute_once(drone.quat.axes())
+    context = _force_context(drone, memories, applied, axes, params)
+    slope = Action(*((to - now) / dt for to, now in zip(applied, drone.applied, strict=True)))
     rates_b = body_rates(applied, params.max_rate)
-    rates_b, inputs = effects.fold_rates(params.effects, memories, rates_b, context, ())
-    context = context._replace(rates_b=rates_b)
+    rates_context = RatesContext(context, slope, dt, params.motion, rates_b)
+    rates = effects.fold_rates(params.effects, memories, rates_context)
+    rates_b = rates[-1]
     quat = integrate_attitude(drone.quat, rates_b, dt)
     if params.motion is Motion.SEMI_IMPLICIT:
         quat = compute_once(quat)
-        context = _with_thrust(
-            context._replace(body_axes_w=compute_once(quat.axes())), params, memories
-        )
+        axes = compute_once(quat.axes())
+        context = _force_context(drone, memories, applied, axes, params)
     acc_w, force_b = _forces(context, params, memories)
-    acc_w, context = compute_once(acc_w), context._replace(force_b=force_b)
+    acc_w = compute_once(acc_w)
     after = Drone(
         pos_w=drone.pos_w + drone.vel_w.scale(dt) + acc_w.scale(0.5 * dt * dt),
         vel_w=drone.vel_w + acc_w.scale(dt),
@@ -266,69 +302,64 @@ def _move_at_once(
         quat=quat,
         rates_b=rates_b,
         applied=applied,
-        battery_v=fold("battery", _drained(drone, dt, params)),
+        battery_v=_voltage(drone, memories, applied, dt, params),
     )
-    later = effects.remember(params.effects, memories, context, inputs, inputs)
-    return Moved(compute_once(after), later, context)
+    step_context = StepContext(
+        drone, command, acting, dt, params.motion, rates_b, force_b, None, (rates[0], rates[0])
+    )
+    later = effects.remember(params.effects, memories, step_context, rates, rates)
+    reading = AccelerometerContext(
+        dt,
+        rates_b=(drone.rates_b + rates_b).scale(0.5),
+        angular_acc_b=(rates_b - drone.rates_b).scale(1.0 / dt),
+        force_b=force_b,
+    )
+    return Moved(compute_once(after), later, reading)
 
 
 class _Instant(NamedTuple):
-    """A moment within a continuous step, by what follows from the commands alone."""
+    """A moment within a continuous step, by what follows from the commands alone.
+
+    rates: body rates before each effect, and after all of them.
+    """
 
     applied: Action
     battery_v: Scalar
-    context: StepContext
-    rate_inputs: tuple[Any, ...]
+    rates: tuple[Vec3, ...]
 
 
 def _lag_within_step(
     drone: Drone, memories: tuple[Any, ...], command: Action, dt: Scalar, params: ModelParameters
-) -> tuple[tuple[_Instant, _Instant, _Instant], tuple[Any, ...]]:
+) -> tuple[tuple[_Instant, _Instant, _Instant], _Response]:
     """Return the beginning, middle and end of a step under a held command.
 
-    Each has the applied action, the battery voltage and the inputs of the body rates. The lag is
-    exact for commands held over half a step; of a delayed one, each half has its mean. The memories
-    are those of effects that replace the lag.
+    The lag is exact for commands held over half a step; of a delayed one, each half has its mean.
+    The response is that of the second half.
     """
-    beginning = _beginning(drone, command, dt, params)
-
-    def after_half(
-        span: tuple[float, float], applied: Action, memories: tuple[Any, ...]
-    ) -> tuple[Action, tuple[Any, ...], Action, Action]:
-        now = beginning._replace(drone=drone._replace(applied=applied), span=span)
-        acting = effects.fold("command", params.effects, memories, command, now)
-        now = now._replace(acting=acting)
-        tau = effects.fold("lag", params.effects, memories, _taus(params), now)
-        return *_applied(now.drone, memories, 0.5 * dt, tau, params, now), acting, tau
 
     def instant(
-        applied: Action, elapsed_s: Scalar, acting: Action, tau: Action, first: tuple[Any, ...] = ()
+        applied: Action,
+        elapsed_s: Scalar,
+        response: _Response,
+        first_rates: tuple[Vec3, ...] = (),
     ) -> _Instant:
-        slope = Action(*((to - now) / t for to, now, t in zip(acting, applied, tau, strict=True)))
-        context = beginning._replace(
-            dt=elapsed_s, acting=acting, applied=applied, applied_slope=slope
-        )
-        volts = effects.fold(
-            "battery", params.effects, memories, _drained(drone, elapsed_s, params), context
-        )
-        rates_b = body_rates(applied, params.max_rate)
-        if effects.acts(params.effects, "rates"):
-            context = context._replace(body_axes_w=drone.quat.axes())
-            context = _with_thrust(context, params, memories)
-        rates_b, inputs = effects.fold_rates(params.effects, memories, rates_b, context, first)
-        return _Instant(applied, volts, context._replace(rates_b=rates_b), inputs)
+        now = zip(response.acting, applied, response.tau, strict=True)
+        slope = Action(*((target - current) / tau for target, current, tau in now))
+        volts = _voltage(drone, memories, applied, elapsed_s, params)
+        rates = _rates(drone, memories, applied, slope, elapsed_s, params, first_rates)
+        return _Instant(applied, volts, rates)
 
     half = 0.5 * dt
-    middle, response, acting, tau = after_half((0.0, 0.5), drone.applied, memories)
-    end, response, later, later_tau = after_half((0.5, 1.0), middle, response)
-    at_first = instant(drone.applied, 0.0, acting, tau)
-    inputs = at_first.rate_inputs
-    found = (
-        at_first,
-        instant(middle, half, later, later_tau, inputs),
-        instant(end, dt, later, later_tau, inputs),
+    first = _respond(drone, memories, command, dt, (0.0, 0.5), params)
+    middle = drone._replace(applied=first.applied)
+    second = _respond(middle, first.memories, command, dt, (0.5, 1.0), params)
+    beginning = instant(drone.applied, 0.0, first)
+    instants = (
+        beginning,
+        instant(first.applied, half, second, beginning.rates),
+        instant(second.applied, dt, second, beginning.rates),
     )
-    return found, response
+    return instants, second
 
 
 def _move_continuously(
@@ -342,7 +373,7 @@ def _move_continuously(
     moment.
     """
     instants, response = _lag_within_step(drone, memories, command, dt, params)
-    rates_0, rates_m, rates_1 = (compute_once(one.context.rates_b) for one in instants)
+    rates_0, rates_m, rates_1 = (compute_once(instant.rates[-1]) for instant in instants)
     # Of the first half, from the parabola through the three rates.
     angle_m = (rates_0.scale(5.0) + rates_m.scale(8.0) - rates_1).scale(dt / 24.0)
     angle_1 = (rates_0 + rates_m.scale(4.0) + rates_1).scale(dt / 6.0)
@@ -359,12 +390,13 @@ def _move_continuously(
             vel_w,
             drone.acc_w,
             quat,
-            instant.context.rates_b,
+            instant.rates[-1],
             instant.applied,
             instant.battery_v,
         )
-        context = instant.context._replace(drone=there, body_axes_w=compute_once(quat.axes()))
-        return compute_once(_forces(_with_thrust(context, params, memories), params, memories))
+        axes = compute_once(quat.axes())
+        context = _force_context(there, memories, instant.applied, axes, params)
+        return compute_once(_forces(context, params, memories))
 
     half, vel_w = 0.5 * dt, drone.vel_w
     acc_0, _ = force_at(instants[0], drone.quat, vel_w, 0.0)
@@ -383,12 +415,22 @@ def _move_continuously(
     turning = (rates_0 - rates_m.scale(4.0) + rates_1.scale(3.0)).scale(
         1.0 / dt
     )  # the parabola's slope
-    context = instants[2].context._replace(
-        force_b=force_1, angular_acc_b=turning, middle_rates_b=rates_m, middle_force_b=force_m
+    first, last = instants[0].rates, instants[2].rates
+    middle_b = rates_m, force_m
+    context = StepContext(
+        drone,
+        command,
+        response.acting,
+        dt,
+        params.motion,
+        last[-1],
+        force_1,
+        middle_b,
+        (first[0], last[0]),
     )
-    inputs = instants[0].rate_inputs, instants[2].rate_inputs
-    later = effects.remember(params.effects, response, context, *inputs)
-    return Moved(compute_once(after), later, context)
+    later = effects.remember(params.effects, response.memories, context, first, last)
+    reading = AccelerometerContext(dt, last[-1], turning, force_1)
+    return Moved(compute_once(after), later, reading)
 
 
 def observe_rates(
@@ -422,15 +464,7 @@ def read_gyro(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: Model
 
     memories: of the effects, up to this drone. dt: s, the step between readings.
     """
-    context = StepContext(
-        drone=drone,
-        command=drone.applied,
-        dt=dt,
-        motion=params.motion,
-        applied=drone.applied,
-        rates_b=drone.rates_b,
-    )
-    return effects.fold("gyro", params.effects, memories, drone.rates_b, context)
+    return effects.fold("gyro", params.effects, memories, drone.rates_b, dt)
 
 
 def sensed(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: ModelParameters) -> Drone:
@@ -439,8 +473,7 @@ def sensed(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: ModelPar
     memories: of the effects, up to this drone. dt: s, the step between readings.
     """
     pose = effects.Pose(drone.pos_w, drone.vel_w, drone.quat)
-    context = StepContext(drone=drone, command=drone.applied, dt=dt, motion=params.motion)
-    pose = effects.fold("pose", params.effects, memories, pose, context)
+    pose = effects.fold("pose", params.effects, memories, pose, dt)
     return drone._replace(**pose._asdict(), rates_b=read_gyro(drone, memories, dt, params))
 
 

@@ -11,7 +11,15 @@ import numpy as np
 from flytrack_env.effects.accelerometer_bias import ACCELEROMETER_BIAS, AccelerometerBias
 from flytrack_env.effects.accelerometer_scale import ACCELEROMETER_SCALE, AccelerometerScale
 from flytrack_env.effects.actual_rates import ACTUAL_RATES, ActualRates
-from flytrack_env.effects.base import STAGES, Effect, Pose, Range, StepContext
+from flytrack_env.effects.base import (
+    STAGES,
+    CommandContext,
+    Effect,
+    Pose,
+    Range,
+    RatesContext,
+    StepContext,
+)
 from flytrack_env.effects.betaflight_loop import BETAFLIGHT_LOOP, BetaflightLoop
 from flytrack_env.effects.betaflight_rates import BETAFLIGHT_RATES, BetaflightRates
 from flytrack_env.effects.command_delay import COMMAND_DELAY, MOST_STEPS, USUAL_STEPS, CommandDelay
@@ -176,7 +184,7 @@ def fold(
     effects: tuple[Any, ...],
     memories: tuple[Any, ...],
     value: Any,
-    context: StepContext,
+    context: Any,
 ) -> Any:
     """Return a stage's value after all effects of a model that act there, in order."""
     for parameters, memory in zip(effects, memories, strict=True):
@@ -187,7 +195,7 @@ def fold(
 
 
 def respond(
-    effects: tuple[Any, ...], memories: tuple[Any, ...], lagged: Any, context: StepContext
+    effects: tuple[Any, ...], memories: tuple[Any, ...], lagged: Any, context: CommandContext
 ) -> tuple[Any, tuple[Any, ...]]:
     """Return the applied action at the end of a span of the step, and the effects' memories."""
     found = list(memories)
@@ -201,42 +209,41 @@ def respond(
 def fold_rates(
     effects: tuple[Any, ...],
     memories: tuple[Any, ...],
-    rates_b: Any,
-    context: StepContext,
-    first_inputs: tuple[Any, ...],
-) -> tuple[Any, tuple[Any, ...]]:
-    """Return the value of the stage rates as ``fold`` does, and what each effect was given.
+    context: RatesContext,
+    first_rates: tuple[Any, ...] = (),
+) -> tuple[Any, ...]:
+    """Return the value of the stage rates before each effect, and last, after all of them.
 
-    first_inputs: what each was given at the beginning of the step; empty where that is now.
+    The first is ``context.first_input_b``. first_rates: the same at the beginning of the step;
+    empty where that is now.
     """
-    inputs = []
-    for place, (parameters, memory) in enumerate(zip(effects, memories, strict=True)):
-        inputs.append(rates_b)
-        first_b = first_inputs[place] if first_inputs else rates_b
-        rates_b = fold(
-            "rates", (parameters,), (memory,), rates_b, context._replace(first_input_b=first_b)
-        )
-    return rates_b, tuple(inputs)
+    rates = [context.first_input_b]
+    for index, (parameters, memory) in enumerate(zip(effects, memories, strict=True)):
+        first_b = first_rates[index] if first_rates else rates[-1]
+        seen = context._replace(first_input_b=first_b)
+        rates.append(fold("rates", (parameters,), (memory,), rates[-1], seen))
+    return tuple(rates)
 
 
 def remember(
     effects: tuple[Any, ...],
     memories: tuple[Any, ...],
     context: StepContext,
-    first_inputs: tuple[Any, ...],
-    inputs: tuple[Any, ...],
+    first_rates: tuple[Any, ...],
+    rates: tuple[Any, ...],
 ) -> tuple[Any, ...]:
     """Return what the effects of a model remember after a step.
 
-    first_inputs, inputs: what each was given at the stage rates, at the beginning and at the end of
-    the step.
+    first_rates, rates: as from ``fold_rates``, at the beginning and at the end of the step.
     """
-    found = []
-    for parameters, memory, *given in zip(effects, memories, first_inputs, inputs, strict=True):
+    later = []
+    for parameters, memory, *inputs_b in zip(effects, memories, first_rates, rates, strict=False):
         kept = effect_of(parameters).memory
-        seen = context._replace(first_input_b=given[0], input_b=given[1])
-        found.append(kept.remember(parameters, memory, seen) if kept and kept.remember else memory)
-    return tuple(found)
+        if kept and kept.remember:
+            seen = context._replace(rate_inputs_b=tuple(inputs_b))
+            memory = kept.remember(parameters, memory, seen)
+        later.append(memory)
+    return tuple(later)
 
 
 def observe(
@@ -289,7 +296,6 @@ __all__ = [
     "RateSlewLimit",
     "RotorDrag",
     "SecondOrderRates",
-    "StepContext",
     "ThrustLagAsymmetry",
     "ThrustScale",
     "ThrustTilt",

@@ -5,26 +5,36 @@ another unit, each with its **neutral** value as default) and one ``Effect`` tha
 act. A model carries the parameters of the effects that it has; the simulator folds them, in the
 order of ``flytrack_env.effects.EFFECTS``, at the stages of a step, and then of reading the sensors:
 
-=============  =====================  ====================================================  ========
-stage          value                  what it is                                            acts on
-=============  =====================  ====================================================  ========
-command        ``Action``             the command that the rate loop and motors get         command
-lag            ``Action``, s          time constants of the first-order lag                 actuator
-respond        ``Action``             the applied action, in place of the lagged one        actuator
-air            ``Vec3``, m/s, world   velocity of the air                                   force
-thrust         scalar, N              collective thrust along body z                        actuator
-rates          ``Vec3``, rad/s        body rates of the lagged action                       actuator
-force          ``Vec3``, m/s^2, body  specific force beside thrust; starts at 0             force
-battery        scalar, V              battery voltage after the step                        battery
-gyro           ``Vec3``, rad/s        what the gyro reads of the body rates                 sensor
-accelerometer  ``Vec3``, m/s^2, body  what the accelerometer says of the specific force     sensor
-pose           ``Pose``, world        position, velocity and attitude as they are reported  sensor
-=============  =====================  ====================================================  ========
+=============  ====================================  ========  ====================================
+stage          value                                 acts on   context: what a hook may look at
+=============  ====================================  ========  ====================================
+command        ``Action``: what rate loop, motors    command   ``CommandContext``
+               get
+lag            ``Action``, s: time constants of the  actuator  ``CommandContext``
+               first-order lag
+respond        ``Action``: the applied action, in    actuator  ``CommandContext``
+               place of the lagged one
+air            ``Vec3``, m/s, world: velocity of     force     ``Drone`` of the moment
+               the air
+thrust         scalar, N: collective thrust along    actuator  ``ForceContext``
+               body z
+rates          ``Vec3``, rad/s: body rates of the    actuator  ``RatesContext``
+               lagged action
+force          ``Vec3``, m/s^2, body: specific       force     ``ForceContext``
+               force beside thrust; starts at 0
+battery        scalar, V: voltage after the step     battery   ``BatteryContext``
+gyro           ``Vec3``, rad/s: the gyro's reading   sensor    time between readings, s
+accelerometer  ``Vec3``, m/s^2, body: the reading    sensor    ``AccelerometerContext``
+               of the specific force
+pose           ``Pose``, world: position, velocity   sensor    time between readings, s
+               and attitude as reported
+=============  ====================================  ========  ====================================
 
+A step of continuous motion folds the stages at several moments; the context is that of the moment.
 Readings do not change the flight. ``flytrack_env.dynamics.read_sensors`` and ``sensed`` compute
 them after the step, with the memories after it.
 
-A hook takes the effect's parameters, its memory, the value so far and the ``StepContext``, and
+A hook takes the effect's parameters, its memory, the value so far and the stage's context, and
 returns the value. At neutral parameters it returns the value bit for bit, so that neutral equals
 absent.
 """
@@ -32,6 +42,9 @@ absent.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
+
+import jax
+import numpy as np
 
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
@@ -52,8 +65,6 @@ STAGES = {
     "pose": "sensor",
 }
 
-NOT_YET: Any = None  # in place of a value that a later stage of the step computes
-
 
 class Pose(NamedTuple):
     """Position, m, velocity, m/s, and attitude, body to world."""
@@ -63,52 +74,112 @@ class Pose(NamedTuple):
     quat: Quaternion
 
 
-class StepContext(NamedTuple):
-    """What an effect may look at; a field is ``NOT_YET`` before the stage that fills it.
+class CommandContext(NamedTuple):
+    """What acts before the lag: a command in a span of the step.
 
-    drone: before the step. command: as given, before any effect. dt: s. motion: of the model.
-    acting: the command after the stage command. full_stick_b: body rates of full sticks, rad/s.
-    thrust_coeffs: of the model's thrust map. applied: the lagged action after the step.
-    body_axes_w: the body's x, y, z axes before the step. air_w: after the stage air, m/s.
-    thrust_acc: collective thrust over mass, after the stage thrust, m/s^2. rates_b: after the stage
-    rates, rad/s. force_b: specific force of the step, thrust and all else but gravity, in the body
-    frame before it, after the stage force, m/s^2. At the stages gyro and pose only dt, applied and
-    rates_b are those of the step; drone is the one after it.
-
-    A step of continuous motion folds the stages at several moments; applied, rates_b and force_b
-    are those of the moment, and dt is the time since the beginning of the step at the stages rates
-    and battery. span: shares of the step between which the command acts; the value of the stage
-    command is its mean there. applied_slope: change of the applied action at the moment, 1/s.
-    angular_acc_b: rad/s^2, at the end. middle_rates_b, middle_force_b: as rates_b and force_b, in
-    the middle of the step. first_input_b, input_b: what the effect is given at the stage rates at
-    the beginning of the step, and at its end where it remembers the step, rad/s.
+    Attributes:
+        drone: at the beginning of the span.
+        command: as given; at the stages lag and respond, as it acts.
+        dt: length of the step, s.
+        span: shares of the step between which the command acts. The value of the stage command is
+            its mean there.
+        motion: of the model.
+        full_stick_b: body rates of full sticks, rad/s.
+        thrust_coeffs: of the model's thrust map.
     """
 
     drone: Drone
     command: Action
     dt: Scalar
-    motion: Motion = Motion.HANDOUT
-    acting: Action = NOT_YET
-    full_stick_b: Vec3 = NOT_YET
-    thrust_coeffs: Any = NOT_YET
-    applied: Action = NOT_YET
-    body_axes_w: tuple[Vec3, Vec3, Vec3] = NOT_YET
-    air_w: Vec3 = NOT_YET
-    thrust_acc: Scalar = NOT_YET
-    rates_b: Vec3 = NOT_YET
-    force_b: Vec3 = NOT_YET
-    span: tuple[float, float] = (0.0, 1.0)
-    applied_slope: Action = NOT_YET
-    angular_acc_b: Vec3 = NOT_YET
-    middle_rates_b: Vec3 = NOT_YET
-    middle_force_b: Vec3 = NOT_YET
-    first_input_b: Vec3 = NOT_YET
-    input_b: Vec3 = NOT_YET
+    span: tuple[float, float]
+    motion: Motion
+    full_stick_b: Vec3
+    thrust_coeffs: jax.Array | np.ndarray
 
-    def airspeed_b(self) -> Vec3:
-        """Return the velocity through the air, body frame, m/s; from the stage thrust on."""
-        airspeed_w = self.drone.vel_w - self.air_w
-        return Vec3(*(axis.dot(airspeed_w) for axis in self.body_axes_w))
+
+class ForceContext(NamedTuple):
+    """What pushes the drone at a moment.
+
+    Attributes:
+        drone: at the moment; its applied action is that before the step.
+        applied: the lagged action at the moment.
+        body_axes_w: the body's x, y, z axes.
+        airspeed_b: velocity through the air, body frame, m/s.
+        thrust_acc: collective thrust over mass, m/s^2; at the stage thrust, before its effects.
+    """
+
+    drone: Drone
+    applied: Action
+    body_axes_w: tuple[Vec3, Vec3, Vec3]
+    airspeed_b: Vec3
+    thrust_acc: Scalar
+
+
+class RatesContext(NamedTuple):
+    """What turns the drone at a moment.
+
+    Attributes:
+        force: what pushes it.
+        applied_slope: change of the applied action, 1/s.
+        dt: time since the beginning of the step, s.
+        motion: of the model.
+        first_input_b: what the effect was given at the beginning of the step, rad/s.
+    """
+
+    force: ForceContext
+    applied_slope: Action
+    dt: Scalar
+    motion: Motion
+    first_input_b: Vec3
+
+
+class BatteryContext(NamedTuple):
+    """The applied action at the beginning of the step, and at the moment."""
+
+    first: Action
+    applied: Action
+
+
+class AccelerometerContext(NamedTuple):
+    """The motion that an accelerometer reads after a step, in the body frame.
+
+    Attributes:
+        dt: length of the step, s.
+        rates_b: at its end; of a simulator that takes each quantity once, the step's mean, rad/s.
+        angular_acc_b: at its end, or the step's mean, rad/s^2.
+        force_b: specific force: thrust and all else but gravity, m/s^2.
+    """
+
+    dt: Scalar
+    rates_b: Vec3
+    angular_acc_b: Vec3
+    force_b: Vec3
+
+
+class StepContext(NamedTuple):
+    """What an effect may remember of a step.
+
+    Attributes:
+        drone: before the step.
+        command: as given.
+        acting: the command after the stage command; of a continuous step, in its second half.
+        dt: length of the step, s.
+        motion: of the model.
+        rates_b: after the step, rad/s.
+        force_b: specific force of the step, of a continuous one at its end, body frame, m/s^2.
+        middle_b: rates and specific force in the middle of a continuous step.
+        rate_inputs_b: what the effect was given at the stage rates, at the beginning and the end.
+    """
+
+    drone: Drone
+    command: Action
+    acting: Action
+    dt: Scalar
+    motion: Motion
+    rates_b: Vec3
+    force_b: Vec3
+    middle_b: tuple[Vec3, Vec3] | None
+    rate_inputs_b: tuple[Vec3, Vec3]
 
 
 class Range(NamedTuple):
@@ -123,7 +194,7 @@ class Range(NamedTuple):
     unit: str
 
 
-Hook = Callable[[Any, Any, Any, StepContext], Any]
+Hook = Callable[[Any, Any, Any, Any], Any]
 
 
 def on_rate_sticks(curve: Callable[..., Scalar]) -> Hook:
@@ -132,7 +203,7 @@ def on_rate_sticks(curve: Callable[..., Scalar]) -> Hook:
     The effect's parameters are the curve's other arguments, three axes of each.
     """
 
-    def command(parameters: Any, memory: None, sticks: Action, context: StepContext) -> Action:
+    def command(parameters: Any, memory: None, sticks: Action, context: CommandContext) -> Action:
         thirds = (parameters[start : start + 3] for start in range(0, len(parameters), 3))
         roll, pitch, yaw = map(curve, sticks[:3], *thirds)
         return sticks._replace(roll=roll, pitch=pitch, yaw=yaw)
@@ -140,12 +211,12 @@ def on_rate_sticks(curve: Callable[..., Scalar]) -> Hook:
     return command
 
 
-def scaled(factors: Any, memory: None, vector: Vec3, context: StepContext) -> Vec3:
+def scaled(factors: Any, memory: None, vector: Vec3, context: Any) -> Vec3:
     """Return a vector times a factor per axis: the hook of an effect that has these factors."""
     return Vec3(*(factor * part for factor, part in zip(factors, vector, strict=True)))
 
 
-def shifted(offsets: Any, memory: None, vector: Vec3, context: StepContext) -> Vec3:
+def shifted(offsets: Any, memory: None, vector: Vec3, context: Any) -> Vec3:
     """Return a vector plus an offset per axis: the hook of an effect that has these offsets."""
     return vector + Vec3(*offsets)
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from flytrack_env.effects.base import Effect, Memory, Range, Search, StepContext
+from flytrack_env.effects.base import CommandContext, Effect, Memory, Range, Search
 from flytrack_env.fusion import one_kernel
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Action, Drone
@@ -429,14 +429,14 @@ def _substep(state: Turn, given: Given) -> Turn:
 
 
 def _respond(
-    loop: BetaflightLoop, memory: Loop, lagged: Action, context: StepContext
+    loop: BetaflightLoop, memory: Loop, lagged: Action, context: CommandContext
 ) -> tuple[Action, Loop]:
     """Return the applied action and the memory at the end of a span in which a command acts."""
     begin, end = context.span
     num_substeps = round(NUM_SUBSTEPS * (end - begin))
     full, acting, frames = (
         jnp.stack(context.full_stick_b) / PER_DEGREE,
-        context.acting,
+        context.command,
         memory.frames,
     )
     if begin == 0.0:  # a frame of the receiver comes with the step

@@ -5,7 +5,14 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Memory, Range, Search, StepContext
+from flytrack_env.effects.base import (
+    CommandContext,
+    Effect,
+    Memory,
+    Range,
+    Search,
+    StepContext,
+)
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action, Drone
 
@@ -69,20 +76,29 @@ def late(
 
 
 def delayed(
-    delay: CommandDelay, past: PastCommands, command: Action, context: StepContext
+    delay: CommandDelay,
+    past: PastCommands,
+    command: Action,
+    dt: Scalar,
+    span: tuple[float, float] = (0.0, 1.0),
 ) -> Action:
-    """Return the command that acts: the mean of what arrives during the span."""
+    """Return the command that acts: the mean of what arrives during the span of a step."""
     by_channel = zip(*(command, *past), strict=True)
     return Action(
         *(
-            late(values, delay_s, context.dt, context.span)
+            late(values, delay_s, dt, span)
             for values, delay_s in zip(by_channel, dead_times(delay), strict=True)
         )
     )
 
 
-def remember(delay: CommandDelay, past: PastCommands, context: StepContext) -> PastCommands:
-    """Return the memory after a step."""
+def _command(
+    delay: CommandDelay, past: PastCommands, command: Action, context: CommandContext
+) -> Action:
+    return delayed(delay, past, command, context.dt, context.span)
+
+
+def _remember(delay: CommandDelay, past: PastCommands, context: StepContext) -> PastCommands:
     return (context.command, *past[:-1])
 
 
@@ -101,8 +117,8 @@ COMMAND_DELAY = Effect(
     source="assumption: constant within a flight; the link comes first, then what the flight "
     "controller makes of the sticks",
     max_steps=dict.fromkeys(CommandDelay._fields, LONGEST_STEPS),
-    hooks={"command": delayed},
-    memory=Memory(start=start, remember=remember),
+    hooks={"command": _command},
+    memory=Memory(start=start, remember=_remember),
     search=Search(
         probes={
             "delay_s": (0.005, 0.01, 0.02, 0.03, 0.05),

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from flytrack_env.effects.base import StepContext
+from flytrack_env.effects.base import ForceContext
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Action
 from flytrack_env.validation import Fields, choose, convert
@@ -29,7 +29,7 @@ XYZ = 3
 
 
 class Moment(NamedTuple):
-    """The inputs of a law: scalars or arrays of one shape; units, frames as in ``StepContext``.
+    """The inputs of a law: scalars or arrays of one shape; units, frames as in ``ForceContext``.
 
     time_s: since the start of the flight.
     """
@@ -50,14 +50,14 @@ class Flight(NamedTuple):
     time_s: Scalar
 
 
-def moment_of(context: StepContext, flight: Flight | None) -> Moment:
-    """Return what a law may look at, of the context of the stages rates and force."""
+def moment_of(context: ForceContext, flight: Flight | None) -> Moment:
+    """Return what a law may look at, at the stages rates and force."""
     drone = context.drone
     return Moment(
         drone.pos_w,
         drone.rates_b,
         context.body_axes_w,
-        context.airspeed_b(),
+        context.airspeed_b,
         context.applied,
         context.thrust_acc,
         drone.battery_v,

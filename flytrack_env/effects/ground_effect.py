@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, Search, StepContext
+from flytrack_env.effects.base import Effect, ForceContext, Range, Search
 from flytrack_env.quaternion import Scalar
 
 
@@ -18,7 +18,7 @@ class GroundEffect(NamedTuple):
     height_m: Scalar = 0.3
 
 
-def _thrust(ground: GroundEffect, memory: None, thrust_n: Scalar, context: StepContext) -> Scalar:
+def _thrust(ground: GroundEffect, memory: None, thrust_n: Scalar, context: ForceContext) -> Scalar:
     heights = jnp.maximum(context.drone.pos_w.z, 0.0) / ground.height_m
     return thrust_n * (1.0 + ground.gain / (1.0 + heights * heights))
 

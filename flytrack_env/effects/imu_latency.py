@@ -5,9 +5,15 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Memory, Range, Search, StepContext
+from flytrack_env.effects.base import (
+    AccelerometerContext,
+    Effect,
+    Memory,
+    Range,
+    Search,
+    StepContext,
+)
 from flytrack_env.effects.command_delay import USUAL_STEPS, late
-from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Drone
 
@@ -48,29 +54,29 @@ def _late(
     present: Vec3,
     past: Sequence[Vec3],
     bends: Sequence[Vec3],
-    context: StepContext,
+    dt: Scalar,
 ) -> Vec3:
     """Return the reading of the delayed time: on the parabola of its step, a line in a simulator.
 
     past: the readings with the present ones first, as they were without later effects.
     """
     by_axis = zip(*(present, *past[1:]), strict=True)
-    line = Vec3(*(late(values, latency.latency_s, context.dt) for values in by_axis))
-    steps = latency.latency_s / context.dt
+    line = Vec3(*(late(values, latency.latency_s, dt) for values in by_axis))
+    steps = latency.latency_s / dt
     for age, bend in enumerate(bends[:-1]):
         share = jnp.clip(steps - age, 0.0, 1.0)
         line = line + bend.scale(4.0 * share * (1.0 - share))
     return line
 
 
-def _gyro(latency: ImuLatency, past: PastReadings, rates_b: Vec3, context: StepContext) -> Vec3:
-    return _late(latency, rates_b, past.rates_b, past.rate_bends_b, context)
+def _gyro(latency: ImuLatency, past: PastReadings, rates_b: Vec3, dt: Scalar) -> Vec3:
+    return _late(latency, rates_b, past.rates_b, past.rate_bends_b, dt)
 
 
 def _accelerometer(
-    latency: ImuLatency, past: PastReadings, force_b: Vec3, context: StepContext
+    latency: ImuLatency, past: PastReadings, force_b: Vec3, context: AccelerometerContext
 ) -> Vec3:
-    return _late(latency, force_b, past.forces_b, past.force_bends_b, context)
+    return _late(latency, force_b, past.forces_b, past.force_bends_b, context.dt)
 
 
 def remember(latency: ImuLatency, past: PastReadings, context: StepContext) -> PastReadings:
@@ -88,9 +94,10 @@ def remember(latency: ImuLatency, past: PastReadings, context: StepContext) -> P
 
     forces_b = tuple(or_first(force_b) for force_b in past.forces_b[:-1])
     rate_bend_b = force_bend_b = Vec3(*(jnp.zeros_like(rate) for rate in context.rates_b))
-    if context.motion is Motion.CONTINUOUS:
-        rate_bend_b = bend(past.rates_b[0], context.middle_rates_b, context.rates_b)
-        force_bend_b = bend(forces_b[0], context.middle_force_b, context.force_b)
+    if context.middle_b is not None:
+        middle_rates_b, middle_force_b = context.middle_b
+        rate_bend_b = bend(past.rates_b[0], middle_rates_b, context.rates_b)
+        force_bend_b = bend(forces_b[0], middle_force_b, context.force_b)
     return PastReadings(
         rates_b=(context.rates_b, *past.rates_b[:-1]),
         forces_b=(context.force_b, *forces_b),

@@ -2,8 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, Search, StepContext
-from flytrack_env.motion import Motion
+from flytrack_env.effects.base import AccelerometerContext, Effect, Range, Search
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -15,18 +14,12 @@ class ImuOffset(NamedTuple):
     z: Scalar = 0.0
 
 
-def _accelerometer(offset: ImuOffset, memory: None, force_b: Vec3, context: StepContext) -> Vec3:
-    """Return the reading with the rates at the end of a continuous step, else with the mean ones.
-
-    The change of rates from one step to the next is centred there.
-    """
-    arm_b, before = Vec3(*offset), context.drone.rates_b
-    if context.motion is Motion.CONTINUOUS:
-        rates_b, angular_acc_b = context.rates_b, context.angular_acc_b
-    else:
-        rates_b = (before + context.rates_b).scale(0.5)
-        angular_acc_b = (context.rates_b - before).scale(1.0 / context.dt)
-    return force_b + (rates_b.cross(rates_b.cross(arm_b)) + angular_acc_b.cross(arm_b))
+def _accelerometer(
+    offset: ImuOffset, memory: None, force_b: Vec3, context: AccelerometerContext
+) -> Vec3:
+    arm_b, rates_b = Vec3(*offset), context.rates_b
+    turning_b = context.angular_acc_b.cross(arm_b)
+    return force_b + (rates_b.cross(rates_b.cross(arm_b)) + turning_b)
 
 
 IMU_OFFSET = Effect(

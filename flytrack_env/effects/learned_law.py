@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Memory, Range, Search, StepContext
+from flytrack_env.effects.base import Effect, ForceContext, Memory, Range, Search, StepContext
 from flytrack_env.effects.grammar import Flight, Law, law_from_json, moment_of
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Drone
@@ -33,7 +33,7 @@ def _remember(parameters: LearnedLaw, flight: Flight | None, context: StepContex
 
 
 def _add_terms(
-    parameters: LearnedLaw, acts: str, flight: Flight | None, value_b: Vec3, context: StepContext
+    parameters: LearnedLaw, acts: str, flight: Flight | None, value_b: Vec3, context: ForceContext
 ) -> Vec3:
     terms = [term for term in parameters.law.terms if term.acts == acts]
     if not terms:
@@ -58,7 +58,7 @@ LEARNED_LAW = Effect(
             parameters, "force", flight, value, context
         ),
         "rates": lambda parameters, flight, value, context: _add_terms(
-            parameters, "rate", flight, value, context
+            parameters, "rate", flight, value, context.force
         ),
     },
     memory=Memory(start=_start, remember=_remember),

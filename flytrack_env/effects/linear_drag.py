@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, Search, StepContext
+from flytrack_env.effects.base import Effect, ForceContext, Range, Search
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -14,8 +14,8 @@ class LinearDrag(NamedTuple):
     d_z: Scalar = 0.0
 
 
-def _force(drag: LinearDrag, memory: None, force_b: Vec3, context: StepContext) -> Vec3:
-    airspeed_b = context.airspeed_b()
+def _force(drag: LinearDrag, memory: None, force_b: Vec3, context: ForceContext) -> Vec3:
+    airspeed_b = context.airspeed_b
     return force_b - Vec3(drag.d_x * airspeed_b.x, drag.d_y * airspeed_b.y, drag.d_z * airspeed_b.z)
 
 

@@ -36,12 +36,12 @@ def _same_sign(quat: Quaternion, like: Quaternion) -> Quaternion:
     return Quaternion(*(sign * part for part in quat))
 
 
-def _pose(latency: MocapLatency, past: PastPoses, pose: Pose, context: StepContext) -> Pose:
+def _pose(latency: MocapLatency, past: PastPoses, pose: Pose, dt: Scalar) -> Pose:
     """Return the mean of the poses between which the delayed time lies, by their nearness."""
     poses = (pose, *(one._replace(quat=_same_sign(one.quat, pose.quat)) for one in past))
 
     def mean(*vectors: tuple[Scalar, ...]) -> list[Scalar]:
-        return [late(parts, latency.latency_s, context.dt) for parts in zip(*vectors, strict=True)]
+        return [late(parts, latency.latency_s, dt) for parts in zip(*vectors, strict=True)]
 
     pos_w, vel_w, quat = (mean(*vectors) for vectors in zip(*poses, strict=True))
     is_late = jnp.asarray(latency.latency_s) > 0.0

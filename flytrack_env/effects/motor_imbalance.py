@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, Range, RatesContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -13,8 +13,8 @@ class MotorImbalance(NamedTuple):
     pitch: Scalar = 0.0
 
 
-def _rates(imbalance: MotorImbalance, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
-    thrust_acc = context.thrust_acc
+def _rates(imbalance: MotorImbalance, memory: None, rates_b: Vec3, context: RatesContext) -> Vec3:
+    thrust_acc = context.force.thrust_acc
     return Vec3(
         rates_b.x + imbalance.roll * thrust_acc, rates_b.y + imbalance.pitch * thrust_acc, rates_b.z
     )

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, Search, StepContext
+from flytrack_env.effects.base import Effect, ForceContext, Range, Search
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -20,8 +20,8 @@ class QuadraticDrag(NamedTuple):
     shared: Scalar = 1.0
 
 
-def _force(drag: QuadraticDrag, memory: None, force_b: Vec3, context: StepContext) -> Vec3:
-    airspeed_b = context.airspeed_b()
+def _force(drag: QuadraticDrag, memory: None, force_b: Vec3, context: ForceContext) -> Vec3:
+    airspeed_b = context.airspeed_b
     whole = drag.shared * airspeed_b.norm()
     own = 1.0 - drag.shared
     coefficients = zip((drag.k_x, drag.k_y, drag.k_z), airspeed_b, strict=True)

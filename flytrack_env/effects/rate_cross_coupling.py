@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, Search, StepContext
+from flytrack_env.effects.base import Effect, Range, RatesContext, Search
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -13,7 +13,7 @@ class RateCrossCoupling(NamedTuple):
     from_pitch: Scalar = 0.0
 
 
-def _rates(coupling: RateCrossCoupling, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
+def _rates(coupling: RateCrossCoupling, memory: None, rates_b: Vec3, context: RatesContext) -> Vec3:
     leak = coupling.from_roll * rates_b.x + coupling.from_pitch * rates_b.y
     return rates_b._replace(z=rates_b.z + leak)
 

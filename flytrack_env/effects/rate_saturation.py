@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, Search, StepContext
+from flytrack_env.effects.base import CommandContext, Effect, Range, Search
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action
 
@@ -24,7 +24,9 @@ class RateSaturation(NamedTuple):
     softness: Scalar = 0.5
 
 
-def _command(limit: RateSaturation, memory: None, sticks: Action, context: StepContext) -> Action:
+def _command(
+    limit: RateSaturation, memory: None, sticks: Action, context: CommandContext
+) -> Action:
     def limited(stick: Scalar, lost: Scalar) -> Scalar:
         reachable = 1.0 - lost
         bend = 1.0 / (reachable * reachable) - 1.0

@@ -4,7 +4,14 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Memory, Range, Search, StepContext
+from flytrack_env.effects.base import (
+    CommandContext,
+    Effect,
+    Memory,
+    Range,
+    Search,
+    StepContext,
+)
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action, Drone
@@ -34,7 +41,7 @@ def start(limit: RateSlewLimit, drone: Drone) -> Setpoint:
 
 
 def _command(
-    limit: RateSlewLimit, setpoint: Setpoint, sticks: Action, context: StepContext
+    limit: RateSlewLimit, setpoint: Setpoint, sticks: Action, context: CommandContext
 ) -> Action:
     """Return the limited sticks.
 

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, Search, StepContext
+from flytrack_env.effects.base import Effect, ForceContext, Range, Search
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -12,8 +12,8 @@ class RotorDrag(NamedTuple):
     h: Scalar = 0.0
 
 
-def _force(drag: RotorDrag, memory: None, force_b: Vec3, context: StepContext) -> Vec3:
-    airspeed_b = context.airspeed_b()
+def _force(drag: RotorDrag, memory: None, force_b: Vec3, context: ForceContext) -> Vec3:
+    airspeed_b = context.airspeed_b
     lean = drag.h * context.thrust_acc
     return Vec3(force_b.x - lean * airspeed_b.x, force_b.y - lean * airspeed_b.y, force_b.z)
 

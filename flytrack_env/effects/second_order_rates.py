@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Memory, Range, Search, StepContext
+from flytrack_env.effects.base import Effect, Memory, Range, RatesContext, Search, StepContext
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Drone
@@ -73,44 +73,50 @@ class _Input(NamedTuple):
     slope: Scalar
 
 
-def _input(lag_s: Scalar, before: Scalar, now: Scalar, context: StepContext) -> _Input:
+def _input(lag_s: Scalar, before: Scalar, now: Scalar, dt: Scalar, motion: Motion) -> _Input:
     """Return the input that a step sees: held over a simulator's step, else changing evenly.
 
     The response to one that changes evenly follows ``lag_s`` behind it.
     """
-    if context.motion is not Motion.CONTINUOUS:
+    if motion is not Motion.CONTINUOUS:
         return _Input(now, now, 0.0)
-    slope = (now - before) / jnp.maximum(context.dt, SHORTEST_STEP_S)
+    slope = (now - before) / jnp.maximum(dt, SHORTEST_STEP_S)
     return _Input(before - lag_s * slope, now - lag_s * slope, slope)
 
 
 def _turned(
-    loop: SecondOrderRates, memory: Turning, inputs_b: Vec3, context: StepContext
+    loop: SecondOrderRates,
+    memory: Turning,
+    inputs_b: tuple[Vec3, Vec3],
+    dt: Scalar,
+    motion: Motion,
 ) -> Turning:
-    """Return rates and slopes after the step, at whose end the loop is given these inputs."""
+    """Return rates and slopes ``dt`` after the beginning of a step, of the inputs at both times."""
 
     def follow(
         lag_s: Scalar, damping: Scalar, first: Scalar, new: Scalar, old: Scalar, slope: Scalar
     ) -> tuple[Scalar, Scalar]:
-        left, given = _response(lag_s, damping, context.dt), _input(lag_s, first, new, context)
+        left, given = _response(lag_s, damping, dt), _input(lag_s, first, new, dt, motion)
         offset, change, is_lag = old - given.first, slope - given.slope, lag_s > SHORTEST_S
         after = given.last + left.offset * offset + left.offset_of_slope * change
         slope_after = given.slope + left.slope_of_offset * offset + left.slope * change
         # Without a lag, nothing may change.
         return jnp.where(is_lag, after, new), jnp.where(is_lag, slope_after, 0.0)
 
-    axes = zip(loop[:3], loop[3:], context.first_input_b, inputs_b, *memory, strict=True)
+    axes = zip(loop[:3], loop[3:], *inputs_b, *memory, strict=True)
     rates_b, slopes_b = zip(*(follow(*axis) for axis in axes), strict=True)
     return Turning(Vec3(*rates_b), Vec3(*slopes_b))
 
 
-def _rates(loop: SecondOrderRates, memory: Turning, rates_b: Vec3, context: StepContext) -> Vec3:
-    return _turned(loop, memory, rates_b, context).rates_b
+def _rates(loop: SecondOrderRates, memory: Turning, rates_b: Vec3, context: RatesContext) -> Vec3:
+    inputs_b = context.first_input_b, rates_b
+    return _turned(loop, memory, inputs_b, context.dt, context.motion).rates_b
 
 
 def remember(loop: SecondOrderRates, memory: Turning, context: StepContext) -> Turning:
     """Return the memory after a step."""
-    return Turning(context.rates_b, _turned(loop, memory, context.input_b, context).slopes_b)
+    turned = _turned(loop, memory, context.rate_inputs_b, context.dt, context.motion)
+    return Turning(context.rates_b, turned.slopes_b)
 
 
 def observe(

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import CommandContext, Effect, Range
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action
 
@@ -15,8 +15,10 @@ class ThrustLagAsymmetry(NamedTuple):
     ratio: Scalar = 1.0
 
 
-def _lag(asymmetry: ThrustLagAsymmetry, memory: None, tau: Action, context: StepContext) -> Action:
-    is_falling = context.acting.thrust < context.drone.applied.thrust
+def _lag(
+    asymmetry: ThrustLagAsymmetry, memory: None, tau: Action, context: CommandContext
+) -> Action:
+    is_falling = context.command.thrust < context.drone.applied.thrust
     return tau._replace(thrust=jnp.where(is_falling, asymmetry.ratio * tau.thrust, tau.thrust))
 
 

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
+from flytrack_env.effects.base import Effect, ForceContext, Range
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -13,7 +13,7 @@ class ThrustTilt(NamedTuple):
     towards_y: Scalar = 0.0
 
 
-def _force(tilt: ThrustTilt, memory: None, force_b: Vec3, context: StepContext) -> Vec3:
+def _force(tilt: ThrustTilt, memory: None, force_b: Vec3, context: ForceContext) -> Vec3:
     thrust = context.thrust_acc
     return Vec3(force_b.x + tilt.towards_x * thrust, force_b.y + tilt.towards_y * thrust, force_b.z)
 

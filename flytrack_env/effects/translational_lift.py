@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, Search, StepContext
+from flytrack_env.effects.base import Effect, ForceContext, Range, Search
 from flytrack_env.quaternion import Scalar
 
 # m/s, airspeed at which half of the gain is there: about the velocity that a racing quadcopter's
@@ -17,9 +17,9 @@ class TranslationalLift(NamedTuple):
 
 
 def _thrust(
-    lift: TranslationalLift, memory: None, thrust_n: Scalar, context: StepContext
+    lift: TranslationalLift, memory: None, thrust_n: Scalar, context: ForceContext
 ) -> Scalar:
-    airspeed_b = context.airspeed_b()
+    airspeed_b = context.airspeed_b
     squared = airspeed_b.x * airspeed_b.x + airspeed_b.y * airspeed_b.y
     return thrust_n * (1.0 + lift.gain * (squared / (squared + HALF_SPEED * HALF_SPEED)))
 

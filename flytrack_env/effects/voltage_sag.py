@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, Search, StepContext
+from flytrack_env.effects.base import BatteryContext, Effect, Range, Search
 from flytrack_env.quaternion import Scalar
 
 
@@ -22,9 +22,9 @@ def load_of(thrust_action: Scalar) -> Scalar:
     return stick * stick
 
 
-def _battery(sag: VoltageSag, memory: None, battery_v: Scalar, context: StepContext) -> Scalar:
+def _battery(sag: VoltageSag, memory: None, battery_v: Scalar, context: BatteryContext) -> Scalar:
     # The state has the voltage under load: only what the load changed in the step counts.
-    change = load_of(context.applied.thrust) - load_of(context.drone.applied.thrust)
+    change = load_of(context.applied.thrust) - load_of(context.first.thrust)
     return battery_v - sag.at_full_v * change
 
 

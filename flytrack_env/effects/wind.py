@@ -6,8 +6,9 @@ parameters are apart because their units are.
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, Search, StepContext
+from flytrack_env.effects.base import Effect, ForceContext, Range, Search
 from flytrack_env.quaternion import Scalar, Vec3
+from flytrack_env.state import Drone
 
 
 class Wind(NamedTuple):
@@ -21,11 +22,11 @@ class Wind(NamedTuple):
     a_z: Scalar = 0.0
 
 
-def _air(wind: Wind, memory: None, air_w: Vec3, context: StepContext) -> Vec3:
+def _air(wind: Wind, memory: None, air_w: Vec3, drone: Drone) -> Vec3:
     return air_w + Vec3(wind.v_x, wind.v_y, wind.v_z)
 
 
-def _force(wind: Wind, memory: None, force_b: Vec3, context: StepContext) -> Vec3:
+def _force(wind: Wind, memory: None, force_b: Vec3, context: ForceContext) -> Vec3:
     push_w = Vec3(wind.a_x, wind.a_y, wind.a_z)
     return force_b + Vec3(*(axis.dot(push_w) for axis in context.body_axes_w))
 

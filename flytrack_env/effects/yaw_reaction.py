@@ -2,8 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, StepContext
-from flytrack_env.motion import Motion
+from flytrack_env.effects.base import Effect, Range, RatesContext
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -13,12 +12,8 @@ class YawReaction(NamedTuple):
     angle: Scalar = 0.0
 
 
-def _rates(reaction: YawReaction, memory: None, rates_b: Vec3, context: StepContext) -> Vec3:
-    if context.motion is Motion.CONTINUOUS:
-        change = context.applied_slope.thrust
-    else:
-        change = (context.applied.thrust - context.drone.applied.thrust) / context.dt
-    return rates_b._replace(z=rates_b.z + reaction.angle * change)
+def _rates(reaction: YawReaction, memory: None, rates_b: Vec3, context: RatesContext) -> Vec3:
+    return rates_b._replace(z=rates_b.z + reaction.angle * context.applied_slope.thrust)
 
 
 YAW_REACTION = Effect(

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from flytrack_env.effects import CommandDelay, StepContext, check_parameters, command_delay
+from flytrack_env.effects import CommandDelay, check_parameters, command_delay
 from flytrack_env.episodes import EpisodicEnvironment, without_nan
 from flytrack_env.params import EnvParams
 from flytrack_env.state import Action, Drone
@@ -69,11 +69,9 @@ class ActionDelay(Wrapper):
         """
         delay = self.own_params(params)
         is_nan = jnp.isnan(sum(command))
-        context = StepContext(
-            drone=self.env.drone(state.inner), command=without_nan(command), dt=params.dt
-        )
-        arriving = command_delay.delayed(delay, state.past, context.command, context)
+        command = without_nan(command)
+        arriving = command_delay.delayed(delay, state.past, command, params.dt)
         arriving = Action(*(jnp.where(is_nan, jnp.nan, value) for value in arriving))
         inner, reward, terminated, info = self.env.advance(state.inner, arriving, params)
-        past = command_delay.remember(delay, state.past, context)
+        past = (command, *state.past[:-1])
         return ActionDelayState(inner, past), reward, terminated, info
