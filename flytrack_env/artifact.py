@@ -99,7 +99,8 @@ def _operations(operation: Any) -> Iterator[Any]:
 def check_pure(content: bytes, exported: export.Exported, is_trusted: bool) -> None:
     """Raise ArtifactError if an artifact calls native code other than its own.
 
-    is_trusted: allow native calls, such as those of LAPACK, but no callbacks into Python.
+    Args:
+        is_trusted: allow native calls, such as those of LAPACK, but no callbacks into Python.
     """
     try:
         with make_ir_context():
@@ -163,8 +164,9 @@ def check(
 ) -> None:
     """Raise ArtifactError unless a file's bytes are a plant: see the functions above.
 
-    starts: a start state of every size that an artifact's state may have. is_trusted: see
-    ``check_pure``.
+    Args:
+        starts: a start state of every size that an artifact's state may have.
+        is_trusted: see ``check_pure``.
     """
     exported = deserialize(content)
     size = check_signature(exported, [len(start) for start in starts], num_actions)

@@ -25,9 +25,12 @@ WORD = 32  # bits
 
 
 class Ended(NamedTuple):
-    """A step before auto-reset: whether the episode ended, and observation, row by row, and state.
+    """A step before auto-reset; scalars, or of a batch (num_envs,).
 
-    seed: random word, uint32, of the episode that may begin. Scalars, or of a batch (num_envs,).
+    Attributes:
+        done: whether the episode ended.
+        shown: observation, row by row, and state after the step.
+        seed: random word, uint32, of the episode that may begin.
     """
 
     done: jax.Array

@@ -21,8 +21,9 @@ class BatteryWarning(UserWarning):
 class Battery(NamedTuple):
     """Voltages of a craft's battery; the defaults are the handout's.
 
-    full_v, empty_v: where episodes may start, and where they end, V.
-    fitted_low_v, fitted_high_v: between which the thrust map was measured, V.
+    Attributes:
+        full_v, empty_v: where episodes may start, and where they end, V.
+        fitted_low_v, fitted_high_v: between which the thrust map was measured, V.
     """
 
     full_v: Scalar = BATTERY_FULL_V

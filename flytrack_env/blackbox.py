@@ -119,8 +119,11 @@ class BlackBox(Plant):
     the default device is another, run inside ``with jax.default_device(jax.devices("cpu")[0])``;
     JAX raises a ValueError otherwise.
 
-    path: the artifact's file. state_size: components of the artifact's own state, 21 or 18. dt: s,
-    baked in. battery: the handout's, which is part of the contract of these files.
+    Args:
+        path: the artifact's file.
+        state_size: components of the artifact's own state, 21 or 18.
+        dt: s, baked in.
+        battery: the handout's, which is part of the contract of these files.
     """
 
     dt = DT
@@ -190,11 +193,13 @@ def load(
 
     The module's docstring says what a file may hold, and what the risks are.
 
-    max_rate: deg/s, body rates at full stick, used with 18-component artifacts only. limits: of the
-    trial. None: no trial, and native calls are allowed; only for files from people whose programs
-    you would run.
+    Args:
+        max_rate: deg/s, body rates at full stick, used with 18-component artifacts only.
+        limits: of the trial; with None there is no trial, and native calls are allowed: only for
+            files from people whose programs you would run.
 
-    Raises: BlackBoxError: missing, unreadable, too large, damaged, for another platform, of another
+    Raises:
+        BlackBoxError: missing, unreadable, too large, damaged, for another platform, of another
             signature, not pure, not finite after one step from the start state, or it crashed or
             exceeded ``limits``.
     """

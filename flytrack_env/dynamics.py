@@ -35,12 +35,19 @@ HELD_S = 1e6  # s, long enough for lags and limits of the rates to settle, to fl
 class ModelParameters(NamedTuple):
     """Parameters of the minimal model; the first five fields alone construct it.
 
-    tau: (4,) s, time constants of the first-order lag of roll, pitch, yaw, thrust. thrust_coeffs:
-    (6,) N, of 1, u, u^2, u^3, V, u V. max_rate: (3,) deg/s, body rate at full stick. m: kg. g:
-    m/s^2. battery_drain_v_per_min: V/min. effects: parameters of the effects that the model has, in
-    the order of ``flytrack_env.effects.EFFECTS``. motion: how it moves within a step, static.
-    battery: between which voltages it is flown. Without effects, with the default motion and
-    battery, the model is the handout's.
+    Without effects, with the default motion and battery, the model is the handout's.
+
+    Attributes:
+        tau: (4,) s, time constants of the first-order lag of roll, pitch, yaw, thrust.
+        thrust_coeffs: (6,) N, of 1, u, u^2, u^3, V, u V.
+        max_rate: (3,) deg/s, body rate at full stick.
+        m: mass, kg.
+        g: gravity, m/s^2.
+        battery_drain_v_per_min: voltage that the battery loses, V/min.
+        effects: parameters of the effects that the model has, in the order of
+            ``flytrack_env.effects.EFFECTS``.
+        motion: how it is integrated over a step, static.
+        battery: between which voltages it is flown.
     """
 
     tau: jax.Array | np.ndarray
@@ -147,7 +154,9 @@ def _rates(
 ) -> tuple[Vec3, ...]:
     """Return the body rates of an applied action before each effect, and after all of them.
 
-    drone: at the beginning of the step. first_rates: the result there, where this is later.
+    Args:
+        drone: at the beginning of the step.
+        first_rates: the result there, where this is later.
     """
     rates_b = body_rates(applied, params.max_rate)
     if not effects.acts(params.effects, "rates"):
@@ -205,7 +214,10 @@ def advance(
 ) -> tuple[Drone, tuple[Any, ...]]:
     """Return the drone ``dt`` seconds later under a held command, and the memories of its effects.
 
-    Commands are not clipped here. memories: as from ``effects.start_memories``.
+    Commands are not clipped here.
+
+    Args:
+        memories: as from ``effects.start_memories``.
     """
     return move(drone, memories, command, dt, params)[:2]
 
@@ -222,8 +234,10 @@ def move(
 class _Response(NamedTuple):
     """How the actuators respond in a span of a step.
 
-    applied: the action at its end, with the memories of effects that replace the lag. acting: the
-    command that acts. tau: its lag, s.
+    Attributes:
+        applied: the action at its end, with the memories of effects that replace the lag.
+        acting: the command that acts.
+        tau: its lag, s.
     """
 
     applied: Action
@@ -320,7 +334,8 @@ def _move_at_once(
 class _Instant(NamedTuple):
     """A moment within a continuous step, by what follows from the commands alone.
 
-    rates: body rates before each effect, and after all of them.
+    Attributes:
+        rates: body rates before each effect, and after all of them.
     """
 
     applied: Action
@@ -439,8 +454,10 @@ def observe_rates(
     """Return a drone with measured body rates, rad/s, and the memories of its effects.
 
     A rate loop with a memory takes up how far they are from the model's; where there is none, the
-    applied action does, to first order in what effects make of it. dt: since the last measurement,
-    s.
+    applied action does, to first order in what effects make of it.
+
+    Args:
+        dt: since the last measurement, s.
     """
     memories, rest_b = effects.observe(params.effects, memories, rates_b - drone.rates_b, dt)
     full_stick = body_rates(Action(1.0, 1.0, 1.0, 0.0), params.max_rate)
@@ -462,7 +479,9 @@ class Reading(NamedTuple):
 def read_gyro(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: ModelParameters) -> Vec3:
     """Return the body rates that the gyro of a drone reads, rad/s.
 
-    memories: of the effects, up to this drone. dt: s, the step between readings.
+    Args:
+        memories: of the effects, up to this drone.
+        dt: s, the step between readings.
     """
     return effects.fold("gyro", params.effects, memories, drone.rates_b, dt)
 
@@ -470,7 +489,9 @@ def read_gyro(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: Model
 def sensed(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: ModelParameters) -> Drone:
     """Return the drone as its sensors report it: gyro and pose; the rest is true.
 
-    memories: of the effects, up to this drone. dt: s, the step between readings.
+    Args:
+        memories: of the effects, up to this drone.
+        dt: s, the step between readings.
     """
     pose = effects.Pose(drone.pos_w, drone.vel_w, drone.quat)
     pose = effects.fold("pose", params.effects, memories, pose, dt)
@@ -493,8 +514,9 @@ def read_sensors(moved: Moved, params: ModelParameters) -> Reading:
 def step(x: jax.Array, u: jax.Array, dt: Scalar, params: ModelParameters) -> jax.Array:
     """Return the handout's next state: (21,), (4,), s -> (21,); differentiable in everything.
 
-    Raises: ValueError: if ``x`` or ``u`` has another shape, or the model has an effect with a
-            memory, which the vector has no place for; ``flytrack_env.plants.Simulator`` flies that.
+    Raises:
+        ValueError: if ``x`` or ``u`` has another shape, or the model has an effect with a memory,
+            which the vector has no place for; ``flytrack_env.plants.Simulator`` flies that.
     """
     drone = unpack(x)
     memories = effects.start_memories(params.effects, drone)

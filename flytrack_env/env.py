@@ -40,15 +40,16 @@ class FlyTrack(EpisodicEnvironment):
     Args:
         track: name of a shipped track, the path of a track file, or a ``Track``.
         model: parameters of the simulated drone, or the path of a model file; nominal if None.
-        plant: what moves the drone; the simulator if None. Black boxes: ``flytrack_env.blackbox``.
+        plant: what moves the drone; the simulator if None. ``flytrack_env.blackbox`` has others.
         missed_gate: "terminate" the episode when a gate's plane is crossed outside its frame, or
             "fly_on" with the same gate still to be flown.
         reward: weights of reward terms by name, for those that are not to have the default weight.
 
-    Raises: TrackError, ModelFileError: a track or model that cannot be read. ValueError: another
-        value of ``missed_gate``; an unknown reward term, or a weight that is no number; a battery
-        beyond all voltages that the model was fitted at. TypeError: a plant that is not a
-        ``flytrack_env.plants.Plant``.
+    Raises:
+        TrackError, ModelFileError: a track or model that cannot be read.
+        ValueError: another value of ``missed_gate``; an unknown reward term, or a weight that is no
+            number; a battery beyond all voltages that the model was fitted at.
+        TypeError: a plant that is not a ``flytrack_env.plants.Plant``.
     """
 
     def __init__(

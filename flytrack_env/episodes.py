@@ -39,7 +39,8 @@ def observation_box(table: tuple[Entry, ...]) -> spaces.Box:
 def clip_action(action: jax.Array, dtype: Any = None) -> Action:
     """Return the command of an action (4,), clipped to [-1, 1]; infinite values clip, NaN stays.
 
-    dtype: of the command; the action's own if None.
+    Args:
+        dtype: of the command; the action's own if None.
     """
     command = unpack_action(jnp.asarray(action, dtype))
     # The fence: a batch of actions is strided, and what reads strided memory is not vectorised.
@@ -60,8 +61,11 @@ def _keep_types(changed: Any, state: Any) -> Any:
 class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ignore[type-var]
     """An environment for gymnax, made of hooks for one drone; a state is any pytree.
 
-    track: the course. plant: what moves the drone. missed_gate: "terminate" or "fly_on". env_id: as
-    registered.
+    Attributes:
+        track: the course.
+        plant: what moves the drone.
+        missed_gate: "terminate" or "fly_on".
+        env_id: as registered.
     """
 
     _supports_transition_gradients = True
@@ -101,7 +105,8 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> Any:
         """Return the state of an episode that begins with a given drone and gate to fly first.
 
-        seed: uint32 word that decides whatever else an episode draws (noise, a model).
+        Args:
+            seed: uint32 word that decides whatever else an episode draws (noise, a model).
         """
         raise NotImplementedError
 
@@ -110,8 +115,11 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     ) -> tuple[Any, jax.Array, jax.Array, dict[str, Any]]:
         """Return next state, reward, whether the episode terminates, and info; no auto-reset.
 
-        reward, terminated: scalars. command: within [-1, 1]; one that is not a number ends the
-        episode and may not get into the state.
+        Reward and terminated are scalars.
+
+        Args:
+            command: within [-1, 1]; one that is not a number ends the episode and may not get into
+                the state.
         """
         raise NotImplementedError
 
@@ -173,8 +181,12 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     ) -> tuple[jax.Array, Any, jax.Array, jax.Array, dict[str, Any]]:
         """Return observation, state, reward, terminated and info of one step, without auto-reset.
 
-        action: (4,). The observation is (size,), of the type of the state, as the reward is; reward
-        and terminated are scalars. key is unused.
+        The observation is (size,), of the type of the state, as the reward is; reward and
+        terminated are scalars.
+
+        Args:
+            key: unused.
+            action: (4,).
         """
         del key
         rows, next_state, reward, flags, info = one_kernel(self._transition)(
@@ -187,9 +199,10 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     ) -> tuple[jax.Array, Any]:
         """Return observation, (size,) float32, and state of an episode that begins.
 
-        Raises: TypeError: a key that is none, or more than one. ValueError: parameters of another
-                environment's wrappers; or that no episode can be flown with, where their values are
-                known (not while they are traced).
+        Raises:
+            TypeError: a key that is none, or more than one.
+            ValueError: parameters of another environment's wrappers; or that no episode can be
+                flown with, where their values are known (not while they are traced).
         """
         check_key(key)
         if params is None:
@@ -272,15 +285,18 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         params: EnvParams,
         has_ended: jax.Array | None = None,
     ) -> Step:
-        """``step`` for a whole batch with one key, faster than ``vmap(step)``.
+        """Step a whole batch with one key, faster than ``vmap(step)``.
 
-        states: leaves (num_envs,). actions: (num_envs, 4). params: the same for all. Same results
-        as ``vmap(step)`` up to the random draws: starts are sampled only in steps where an episode
-        ended.
+        The results are those of ``vmap(step)`` up to the random draws: starts are sampled only in
+        steps where an episode ended.
 
-        has_ended: None, or (num_envs,) bool to reset one step late: an environment whose episode
-        ended in the step before is reset instead of stepped, with a reward of 0, both flags False
-        and a meaningless info.
+        Args:
+            states: leaves (num_envs,).
+            actions: (num_envs, 4).
+            params: the same for all.
+            has_ended: None, or (num_envs,) bool to reset one step late: an environment whose
+                episode ended in the step before is reset instead of stepped, with a reward of 0,
+                both flags False and a meaningless info.
         """
         seeds = seeds_of(seed_of(key), jnp.arange(actions.shape[0]))
         step = jax.vmap(self._fly, in_axes=(0, 0, 0, None, 0))

@@ -27,7 +27,9 @@ def check_gymnax(found: str) -> None:
 def check_installed(extra: str, who: str, *modules: str) -> None:
     """Raise ImportError unless all these modules are installed; import none of them.
 
-    extra: of FlyTrack, which brings them. who: needs them, in the plural, for the message.
+    Args:
+        extra: of FlyTrack, which brings them.
+        who: needs them, in the plural, for the message.
 
     Raises:
         ImportError: a module is not installed; the message names its package and the extra.

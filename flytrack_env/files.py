@@ -26,7 +26,8 @@ def user_cache_folder() -> Path:
 def open_file(path: Path, most_bytes: int) -> BinaryIO:
     """Return a file opened for reading.
 
-    Raises: OSError: not a regular file (a pipe may never begin, a device never end), larger than
+    Raises:
+        OSError: not a regular file (a pipe may never begin, a device never end), larger than
             ``most_bytes``, or an error of the operating system.
     """
     try:
@@ -49,8 +50,9 @@ def read_at_most(path: Path, most_bytes: int) -> bytes:
 def write_atomically(path: str | Path, content: bytes) -> None:
     """Write a file under a temporary name beside it and rename it; makes missing folders.
 
-    Raises: OSError: the path is a folder or a device, or an error of the operating system; nothing
-        is left then.
+    Raises:
+        OSError: the path is a folder or a device, or an error of the operating system; nothing is
+            left then.
     """
     path = Path(os.path.realpath(path))  # a link stays one
     if path.exists() and not path.is_file():
@@ -95,8 +97,9 @@ def locked_folder(folder: Path) -> Iterator[None]:
     process. Where there is none (Windows, some network file systems), a warning says so. A process
     that holds the folder already goes on: a command holds what its training writes into.
 
-    Raises: OSError: another process holds the folder; it names the folder, the process and its
-            command. Or the folder would lie in a file.
+    Raises:
+        OSError: another process holds the folder; it names the folder, the process and its command.
+            Or the folder would lie in a file.
     """
     folder = Path(os.path.realpath(folder))
     try:

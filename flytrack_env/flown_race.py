@@ -29,10 +29,13 @@ PADDED_TO = 1024  # steps: flights of about the same length share one compiled p
 class Pass(NamedTuple):
     """One gate passed, or a lap completed by it.
 
-    row: of the first state behind the gate; the number of states if that is after the last. time_s:
-    of the crossing, interpolated, s since the first state. gate: index in flying order. pos_w:
-    where, (3,), world, m. lap: that it completed, counted from 1, 0 if none. lap_time_s: of that
-    lap, 0.0 if none.
+    Attributes:
+        row: of the first state behind the gate; the number of states if that is after the last.
+        time_s: of the crossing, interpolated, s since the first state.
+        gate: index in flying order.
+        pos_w: where, (3,), world, m.
+        lap: that it completed, counted from 1, 0 if none.
+        lap_time_s: of that lap, 0.0 if none.
     """
 
     row: int
@@ -46,10 +49,15 @@ class Pass(NamedTuple):
 class FlownRace(NamedTuple):
     """The race at each state of a flight, leaves (T,), and its events.
 
-    gate: index of the gate to fly next. gate_distance_m: to its centre. laps: completed.
-    lap_start_s: time of the crossing that began the lap. lap_time_s: of the last complete lap, 0 if
-    none. is_frame, is_miss: whether the step from this state on touches the frame of the gate or
-    misses it; for the last state only where that step is extrapolated. passes: in order.
+    Attributes:
+        gate: index of the gate to fly next.
+        gate_distance_m: to its centre.
+        laps: completed.
+        lap_start_s: time of the crossing that began the lap.
+        lap_time_s: of the last complete lap, 0 if none.
+        is_frame, is_miss: whether the step from this state on touches the frame of the gate or
+            misses it; for the last state only where that step is extrapolated.
+        passes: in order.
     """
 
     gate: np.ndarray
@@ -70,10 +78,12 @@ def follow_race(
 ) -> FlownRace:
     """Return the race of a 100 Hz flight through these positions, by ``advance_race``'s rules.
 
-    positions: (T, 3), world, m, finite. first_gate: index of the gate to fly first; if None, gate 0
-    for a flight that begins near the track's start or passes no gate, else the one that it passes
-    first. last_vel_w: (3,), m/s, of the last state: a rollout ends before its last step, often just
-    before a gate, and that step is extrapolated at this velocity, if it is finite.
+    Args:
+        positions: (T, 3), world, m, finite.
+        first_gate: index of the gate to fly first; if None, gate 0 for a flight that begins near
+            the track's start or passes no gate, else the one that it passes first.
+        last_vel_w: (3,), m/s, of the last state: a rollout ends before its last step, often just
+            before a gate, and that step is extrapolated at this velocity, if it is finite.
 
     Raises:
         ValueError: a track without gates.
@@ -116,7 +126,11 @@ def _first_gate(positions: np.ndarray, track: Track) -> int:
 def gates_passed(positions: np.ndarray, track: Track) -> np.ndarray:
     """Return which gates each step passes in the direction of flight, whatever their order.
 
-    positions: (T, 3), world, m. Returned: (T - 1, num_gates) bool.
+    Args:
+        positions: (T, 3), world, m.
+
+    Returns:
+        (T - 1, num_gates) bool.
     """
     is_pass = _passed(_padded(np.asarray(positions, np.float32)), build_course(track))
     return np.asarray(is_pass)[: len(positions) - 1]
@@ -133,8 +147,11 @@ def why_ended(states: np.ndarray, track: Track, race: FlownRace) -> str:
 
     A rollout's last row is the state before its last step, which is extrapolated at the last
     velocity. A rollout does not state its battery: one that begins within the handout's voltages is
-    taken to have the handout's, and when any other is empty is not known. states: (T, 21). race: as
-    ``follow_race`` returns it for them with ``last_vel_w``.
+    taken to have the handout's, and when any other is empty is not known.
+
+    Args:
+        states: (T, 21).
+        race: as ``follow_race`` returns it for them with ``last_vel_w``.
     """
     start_v, handout = float(states[0, BATTERY]), Battery()
     is_handout = handout.empty_v <= start_v <= handout.full_v * (1.0 + ROUNDING)

@@ -208,7 +208,8 @@ def _bind(
 ) -> Tree:
     """Return the results of a function of leaves, computed by a kernel if it is made of ``SIMPLE``.
 
-    element: what the function is the batch of, if it is one.
+    Args:
+        element: what the function is the batch of, if it is one.
     """
     # As on one device: loops do not keep the types that shard_map checks.
     avals = [jax.typeof(leaf) for leaf in leaves]
@@ -249,7 +250,10 @@ def _divided(kernel: ClosedJaxpr, used: Sequence[int], element: _Element) -> Clo
     """Return a kernel of a batch as an operation that XLA divides among devices along the batch.
 
     Left to itself it divides what is within the kernel, and its compiler of such a call has no
-    collectives. used: indices of the batch's arguments that the kernel has.
+    collectives.
+
+    Args:
+        used: indices of the batch's arguments that the kernel has.
     """
     dims = [element.dims[i] for i in used]
     own = element._replace(

@@ -135,8 +135,9 @@ def load_model(path: str | Path) -> ModelParameters:
     and ``battery``, an object with the fields of ``Battery``, without which the handout's is
     assumed and a warning given.
 
-    Raises: ModelFileError: missing file, not JSON, a newer version, a field missing, unknown or out
-        of range.
+    Raises:
+        ModelFileError: missing file, not JSON, a newer version, a field missing, unknown or out of
+            range.
     """
     data = _read_json(Path(path))
     model = model_from_json(data, path)
@@ -154,7 +155,9 @@ def model_from_json(
 ) -> ModelParameters:
     """Return the parameters in the JSON values of a model file, or of ``model_as_json``.
 
-    path: where they come from, for messages. dtype: of the arrays.
+    Args:
+        path: where they come from, for messages.
+        dtype: of the arrays.
 
     Raises:
         ModelFileError: a newer version, a field missing, unknown or out of range.

@@ -20,7 +20,11 @@ from flytrack_env.tracks import GateFrame
 class Entry(NamedTuple):
     """Rows of the observation that belong together: value = quantity / scale, within +-limit.
 
-    key: for code. name: for people. size: number of rows. frame, unit: of the quantity.
+    Attributes:
+        key: for code.
+        name: for people.
+        size: number of rows.
+        frame, unit: of the quantity.
     """
 
     key: str

@@ -54,10 +54,16 @@ UNIT_TOLERANCE = 1e-5  # of a norm
 class EnvParams:
     """Everything that may be fitted, randomised or tuned: a pytree without static fields.
 
-    model: the simulated drone. course: the track as arrays. reset: how episodes start. reward:
-    weights. dt: s. drone_radius: m. max_steps_in_episode: the time limit, steps. wrappers: the
-    parameters of each wrapper around the environment, by its name; documented by the wrapper's
-    class.
+    Attributes:
+        model: the simulated drone.
+        course: the track as arrays.
+        reset: how episodes start.
+        reward: weights.
+        dt: s.
+        drone_radius: m.
+        max_steps_in_episode: the time limit, steps.
+        wrappers: the parameters of each wrapper around the environment, by its name; documented by
+            the wrapper's class.
     """
 
     model: ModelParameters
@@ -79,7 +85,10 @@ class EnvParams:
         """Raise ValueError, naming the field, for values that no episode can be flown with.
 
         For concrete values, as nothing can be refused under ``jit``. Any may be batched, as for
-        ``vmap``. delay_steps: that the plant remembers (``flytrack_env.plants``).
+        ``vmap``.
+
+        Args:
+            delay_steps: that the plant remembers (``flytrack_env.plants``).
         """
         for name, bounds in RANGES.items():
             value = attrgetter(name)(self)

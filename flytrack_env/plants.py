@@ -18,10 +18,11 @@ from flytrack_env.state import Action, Drone
 class Plant(ABC):
     """Pure functions for one drone; all of them work under ``jit``, ``vmap`` and ``scan``.
 
-    dt: the only time step that the plant can take, s; None if it takes any. A plant with a ``dt``
-    has its parameters baked in and ignores ``model`` as well. delay_steps: how many commands delays
-    of the model's effects remember. battery: of a plant that has its own; None if it is the
-    model's.
+    Attributes:
+        dt: the only time step that the plant can take, s; None if it takes any. A plant with a
+            ``dt`` has its parameters baked in and ignores ``model`` as well.
+        delay_steps: how many commands delays of the model's effects remember.
+        battery: of a plant that has its own; None if it is the model's.
     """
 
     dt: float | None = None

@@ -13,11 +13,14 @@ from flytrack_env.tracks import Course, GateFrame, cross_gate
 class Race(NamedTuple):
     """Where the drone stands in the race, scalars.
 
-    gate_index: the gate to fly next, in [0, num_gates). gate, next_gate: its flight frame and that
-    of the gate after it, kept because looking them up is the most expensive part of a step.
-    gates_passed: in this episode. laps: completed, a lap being num_gates gates from wherever the
-    episode began. lap_start_s: time of the crossing that began the lap. lap_time_s: the last
-    complete lap, 0 if none.
+    Attributes:
+        gate_index: the gate to fly next, in [0, num_gates).
+        gate, next_gate: its flight frame and that of the gate after it, kept because looking them
+            up is the most expensive part of a step.
+        gates_passed: in this episode.
+        laps: completed, a lap being num_gates gates from wherever the episode began.
+        lap_start_s: time of the crossing that began the lap.
+        lap_time_s: the last complete lap, 0 if none.
     """
 
     gate_index: jax.Array
@@ -32,7 +35,8 @@ class Race(NamedTuple):
 class RaceEvents(NamedTuple):
     """What happened in one step: gates passed (0 to 2), lap completed, frame touched, gate missed.
 
-    offset: of the worst pass from its gate's centre, over the free half opening.
+    Attributes:
+        offset: of the worst pass from its gate's centre, over the free half opening.
     """
 
     num_passed: jax.Array

@@ -88,11 +88,15 @@ def make_race(
 ) -> MultiDroneRace:
     """Return the race of an id: ``FlyTrackDuel-v0``, or ``FlyTrackRace-v0`` of 2 to 8 drones.
 
-    over, ghosts: as in ``flytrack_env.multi_drone.MultiDroneRace``. env_id, overrides: as in
-    ``make``, for the environment that each drone flies.
+    Args:
+        over: as in ``flytrack_env.multi_drone.MultiDroneRace``.
+        ghosts: the same.
+        env_id: of the environment that each drone flies.
+        overrides: further arguments of ``make`` for it.
 
-    Raises: ValueError: unknown id, or a number of drones that it does not have. TypeError: unknown
-        argument.
+    Raises:
+        ValueError: unknown id, or a number of drones that it does not have.
+        TypeError: unknown argument.
     """
     if race_id not in RACES:
         raise ValueError(f"race_id: found {race_id!r}, expected one of {', '.join(RACES)}")
@@ -109,10 +113,13 @@ def make_versus(
 ) -> Versus:
     """Return gymnax's view of a race for one learner, drone 0.
 
-    opponents: of the others; by default time-optimal ghosts, each ``GHOST_DELAY_S`` after the one
-    before. arguments: of ``make_race``.
+    Args:
+        opponents: of the others; by default time-optimal ghosts, each ``GHOST_DELAY_S`` after the
+            one before.
+        arguments: of ``make_race``.
 
-    Raises: ValueError: as ``make_race`` and ``Versus``, and without opponents on a track without a
+    Raises:
+        ValueError: as ``make_race`` and ``Versus``, and without opponents on a track without a
             time-optimal lap.
     """
     race = make_race(race_id, num_drones, "first", **arguments)

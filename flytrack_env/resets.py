@@ -20,14 +20,18 @@ LAST_SEGMENT_FRACTION = 0.8
 class ResetParams(NamedTuple):
     """Distribution of starts; every draw is uniform.
 
-    course_fraction: share of the starts that lie along the course; the others are at the start
-    pose. start_*: half ranges around the start pose, m, degrees; the height is only raised, by 0 to
-    start_height_noise. course_offset: half range of the offset from the curve between two gates,
-    per axis, m. course_speed: speed from 0 to this along that curve, m/s, with a sideways part of
-    20 %. course_yaw_deg: half range of the yaw about the direction of that curve. course_tilt_deg:
-    tilt from 0 to this towards any side. course_stick: half range of the applied rate actions;
-    applied thrust from course_thrust_low to course_thrust_high. *_charge_low: battery from this to
-    full, from 0 (empty) to 1 (full) in voltage.
+    Attributes:
+        course_fraction: share of the starts that lie along the course; the others are at the start
+            pose.
+        start_*: half ranges around the start pose, m, degrees; the height is only raised, by 0 to
+            start_height_noise.
+        course_offset: half range of the offset from the curve between two gates, per axis, m.
+        course_speed: speed from 0 to this along that curve, m/s, with a sideways part of 20 %.
+        course_yaw_deg: half range of the yaw about the direction of that curve.
+        course_tilt_deg: tilt from 0 to this towards any side.
+        course_stick: half range of the applied rate actions; applied thrust from course_thrust_low
+            to course_thrust_high.
+        *_charge_low: battery from this to full, from 0 (empty) to 1 (full) in voltage.
     """
 
     course_fraction: Scalar = 0.8

@@ -14,9 +14,11 @@ from flytrack_env.state import Drone
 class Transition(NamedTuple):
     """What the reward terms may look at; before, after: the drone before and after the step.
 
-    gate_centre_w: centre of the gate that was flown to when the step began, m. num_passed: gates
-    passed in this step. offset: how far off-centre, 0 at the centre, 1 at the edge of the free
-    opening. is_terminated: whether the episode terminates (not: is truncated).
+    Attributes:
+        gate_centre_w: centre of the gate that was flown to when the step began, m.
+        num_passed: gates passed in this step.
+        offset: how far off-centre, 0 at the centre, 1 at the edge of the free opening.
+        is_terminated: whether the episode terminates (not: is truncated).
     """
 
     before: Drone

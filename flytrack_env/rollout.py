@@ -34,10 +34,14 @@ class RolloutError(ValueError):
 def save_rollout(path: str | Path, states: ArrayLike, actions: ArrayLike) -> None:
     """Write one flight as float32 rows, under a temporary name that is renamed when complete.
 
-    states: (T, 21), actions: (T, 4); row t is the state and the action commanded in it.
+    Args:
+        states: (T, 21).
+        actions: (T, 4); row t is the action commanded in state t.
 
-    Raises: RolloutError: wrong shapes, no steps or more than MOST_STEPS, or a number that is not
-        finite. OSError: the file cannot be written.
+    Raises:
+        RolloutError: wrong shapes, no steps or more than MOST_STEPS, or a number that is not
+            finite.
+        OSError: the file cannot be written.
     """
     path = Path(path)
     states, actions = np.asarray(states), np.asarray(actions)
@@ -58,13 +62,15 @@ def save_rollout(path: str | Path, states: ArrayLike, actions: ArrayLike) -> Non
 def load_rollout(path: str | Path, allow_pickle: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Return the states (T, 21) and the actions (T, 4) of a rollout file, float32.
 
-    The applied roll, pitch and yaw are NaN if the file lacks them (rows of 22). allow_pickle: also
-    read files of pickled objects, which runs whatever code they hold; only for files from people
-    you trust.
+    The applied roll, pitch and yaw are NaN if the file lacks them (rows of 22).
 
-    Raises: RolloutError: missing file, not an ``.npy``, pickled objects unless allowed, another
-            shape, no steps or more than MOST_STEPS, a file cut short, or a number that is not
-            finite.
+    Args:
+        allow_pickle: also read files of pickled objects, which runs whatever code they hold; only
+            for files from people you trust.
+
+    Raises:
+        RolloutError: missing file, not an ``.npy``, pickled objects unless allowed, another shape,
+            no steps or more than MOST_STEPS, a file cut short, or a number that is not finite.
     """
     path = Path(path)
     try:
@@ -88,7 +94,10 @@ def load_named_rollouts(
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return rollouts by file name without suffix, after the folder's name if file names repeat.
 
-    Each is states (T, 21) and actions (T, 4). allow_pickle: see ``load_rollout``.
+    Each is states (T, 21) and actions (T, 4).
+
+    Args:
+        allow_pickle: see ``load_rollout``.
 
     Raises:
         RolloutError: a file that is no rollout, or two files with the same folder and file name.

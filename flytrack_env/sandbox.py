@@ -25,8 +25,10 @@ MEMORY_STATUS = Path("/proc/self/status")
 class ResourceLimits(NamedTuple):
     """What a call may use.
 
-    cpu_s: whole seconds of processor time. memory_bytes: beyond what the process has once it has
-    imported the function. wall_s: s on the clock, imports included.
+    Attributes:
+        cpu_s: whole seconds of processor time.
+        memory_bytes: beyond what the process has once it has imported the function.
+        wall_s: s on the clock, imports included.
     """
 
     cpu_s: int = 4
@@ -37,7 +39,8 @@ class ResourceLimits(NamedTuple):
 class SandboxError(Exception):
     """A call that did not return.
 
-    kind: name of the exception if the function raised one.
+    Args:
+        kind: name of the exception if the function raised one.
     """
 
     def __init__(self, text: str, kind: str = ""):
@@ -55,8 +58,11 @@ def run(
 ) -> bytes:
     """Return ``function(argument, content)`` of a file that does not import this package.
 
-    argument: JSON values. environment: added to that of this process. The function can write no
-    files; what it prints is discarded.
+    The function can write no files; what it prints is discarded.
+
+    Args:
+        argument: JSON values.
+        environment: added to that of this process.
 
     Raises:
         SandboxError: the function raised, exceeded a limit, or crashed; the message says which.

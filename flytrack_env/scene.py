@@ -60,8 +60,9 @@ CAMERA_PITCH_DEG = 40.0  # upwards
 class Gates(NamedTuple):
     """The gates of a course in flying order, world frame, m.
 
-    centres, forward: (n, 3); forward is the direction of flight. outer, inner: (n, 4, 3), the
-    corners of frame and opening, in order around the square.
+    Attributes:
+        centres, forward: (n, 3); forward is the direction of flight.
+        outer, inner: (n, 4, 3), the corners of frame and opening, in order around the square.
     """
 
     centres: np.ndarray
@@ -90,7 +91,11 @@ def squares(
 ) -> np.ndarray:
     """Return the corners of squares, (n, 4, 3).
 
-    centres: (n, 3), m. first, second: (n, 3), unit vectors along the edges. half_edge: (n,), m.
+    Args:
+        centres: (n, 3), m.
+        first: (n, 3), unit vectors along one edge.
+        second: the same along the other edge.
+        half_edge: (n,), m.
     """
     half = half_edge[:, None]
     return np.stack([centres + half * (a * first + b * second) for a, b in SQUARE], axis=1)

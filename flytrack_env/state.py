@@ -47,8 +47,13 @@ class Action(NamedTuple):
 class Drone(NamedTuple):
     """State of one drone, a scalar per leaf.
 
-    pos_w, vel_w, acc_w: world, m, m/s, m/s^2; the acceleration is the mean over the step that led
-    here. quat: body to world. rates_b: body, rad/s. applied: the lagged action. battery_v: V.
+    Attributes:
+        pos_w, vel_w, acc_w: world, m, m/s, m/s^2; the acceleration is the mean over the step that
+            led here.
+        quat: body to world.
+        rates_b: body, rad/s.
+        applied: the lagged action.
+        battery_v: V.
     """
 
     pos_w: Vec3

@@ -13,9 +13,12 @@ from flytrack_env.tracks import Course
 class Causes(NamedTuple):
     """Causes of termination, each a bool; several can hold at once.
 
-    crash: the drone touched a gate's frame, or was given an action that is not a number. ground:
-    below the floor of the bounds. out_of_bounds: beyond any other side. missed_gate: crossed the
-    gate's plane outside its frame. battery_empty: below the battery's empty voltage.
+    Attributes:
+        crash: the drone touched a gate's frame, or was given an action that is not a number.
+        ground: below the floor of the bounds.
+        out_of_bounds: beyond any other side.
+        missed_gate: crossed the gate's plane outside its frame.
+        battery_empty: below the battery's empty voltage.
     """
 
     crash: jax.Array
@@ -34,7 +37,9 @@ def find_causes(
 ) -> Causes:
     """Return the causes of termination after a step.
 
-    is_crash, is_missed: from the gate's crossing, bool scalars.
+    Args:
+        is_crash: from the gate's crossing, bool scalar.
+        is_missed: the same.
     """
     pos_w, low, high = drone.pos_w, course.bounds_low, course.bounds_high
     is_below = jnp.asarray(pos_w.z < low.z)

@@ -35,10 +35,13 @@ def convert(
 
     1 is no bool, and "1" is no number. Whole floats count as integers, so that 2e7 is one.
 
-    Args: where: file or object that the values are from, for messages; empty where the caller names
-        it. values: dictionaries, lists, text and numbers. kind: struct, dataclass or other type;
-        ``Annotated[..., msgspec.Meta(...)]`` sets limits. error: what is raised for a value that
-        does not fit. field: where in the file the values are, for messages.
+    Args:
+        where: file or object that the values are from, for messages; empty where the caller names
+            it.
+        values: dictionaries, lists, text and numbers.
+        kind: struct, dataclass or other type; ``Annotated[..., msgspec.Meta(...)]`` sets limits.
+        error: what is raised for a value that does not fit.
+        field: where in the file the values are, for messages.
     """
     try:
         return msgspec.convert(_with_integers(values), kind)
@@ -95,7 +98,8 @@ def _describe(problem: str, value: Any, kind: Any, field: str) -> str:
 def join_text(field: str, text: str) -> str:
     """Put a table's name before a message on it.
 
-    text: ``field: found ...`` of one of its fields, or ``expected ...`` of the table itself.
+    Args:
+        text: ``field: found ...`` of one of its fields, or ``expected ...`` of the table itself.
     """
     if not field:
         return text

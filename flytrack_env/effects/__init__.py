@@ -113,8 +113,11 @@ def effect_of(parameters: Any) -> Effect:
 def check_parameters(parameters: Any, dt: Any, delay_steps: int = USUAL_STEPS) -> None:
     """Raise ValueError for concrete values beyond what the effect can do.
 
-    The message names effect and parameter. dt: step of time, s. delay_steps: how many steps are
-    remembered, as in ``start_memories``.
+    The message names effect and parameter.
+
+    Args:
+        dt: step of time, s.
+        delay_steps: how many steps are remembered, as in ``start_memories``.
     """
     effect = effect_of(parameters)
     for name, bounds in effect.ranges.items():
@@ -157,7 +160,8 @@ def start_memories(
 ) -> tuple[Any, ...]:
     """Return what the effects of a model remember when an episode begins; None for most.
 
-    delay_steps: of delays; every step of an episode carries them, so that fewer are faster.
+    Args:
+        delay_steps: of delays; every step of an episode carries them, so that fewer are faster.
     """
 
     def start(parameters: Any) -> Any:
@@ -214,8 +218,10 @@ def fold_rates(
 ) -> tuple[Any, ...]:
     """Return the value of the stage rates before each effect, and last, after all of them.
 
-    The first is ``context.first_input_b``. first_rates: the same at the beginning of the step;
-    empty where that is now.
+    The first is ``context.first_input_b``.
+
+    Args:
+        first_rates: the same at the beginning of the step; empty where that is now.
     """
     rates = [context.first_input_b]
     for index, (parameters, memory) in enumerate(zip(effects, memories, strict=True)):
@@ -234,7 +240,9 @@ def remember(
 ) -> tuple[Any, ...]:
     """Return what the effects of a model remember after a step.
 
-    first_rates, rates: as from ``fold_rates``, at the beginning and at the end of the step.
+    Args:
+        first_rates: as from ``fold_rates``, at the beginning of the step.
+        rates: the same at its end.
     """
     later = []
     for parameters, memory, *inputs_b in zip(effects, memories, first_rates, rates, strict=False):
@@ -251,7 +259,9 @@ def observe(
 ) -> tuple[tuple[Any, ...], Any]:
     """Update memories by measured body rates; return them and what they do not explain.
 
-    offset_b: measured rates minus the model's. dt: since the last measurement, s.
+    Args:
+        offset_b: measured rates minus the model's.
+        dt: since the last measurement, s.
     """
     found = []
     for parameters, memory in zip(reversed(effects), reversed(memories), strict=True):

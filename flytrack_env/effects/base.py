@@ -225,11 +225,13 @@ def shifted(offsets: Any, memory: None, vector: Vec3, context: Any) -> Vec3:
 class Memory:
     """What an effect remembers from step to step.
 
-    Attributes: start: (parameters, drone) -> memory at the beginning of an episode. An effect with
-            ``max_steps`` also takes the number of steps to remember. remember: (parameters, memory,
-            context) -> memory after a step. observe: (parameters, memory, offset_b, dt) -> memory
-            corrected by measured body rates, and the part of the offset that it does not explain.
-            offset_b: measured minus modelled rates, rad/s. dt: time since the last measurement, s.
+    Attributes:
+        start: (parameters, drone) -> memory at the beginning of an episode. An effect with
+            ``max_steps`` also takes the number of steps to remember.
+        remember: (parameters, memory, context) -> memory after a step.
+        observe: (parameters, memory, offset_b, dt) -> memory corrected by measured body rates, and
+            the part of the offset that it does not explain; offset_b is measured minus modelled
+            rates, rad/s, and dt the time since the last measurement, s.
     """
 
     start: Callable[..., Any]

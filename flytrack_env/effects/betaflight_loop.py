@@ -42,13 +42,19 @@ NONE_HZ = 1e5  # a filter that does nothing in a millisecond
 class BetaflightLoop(NamedTuple):
     """The craft, and its settings as the firmware's command line has them.
 
-    Without arms there is no loop. roll_arm, pitch_arm, yaw_arm: angular acceleration for a newton
-    of one motor, 1/(kg m). yaw_spin: change of the yaw rate when one motor starts, rad/s. motor_s:
-    lag of the motors. precession: (I_z - I_y) / I_x. rear_right, front_right, rear_left,
-    front_left: thrust of a motor as a share of what it should be. center_x, center_y: where the
-    centre of mass is ahead and left of the motors' middle, as a share of the motors' own distance
-    from it. gyro_late_s: lag of the gyro beyond that of its filters' settings. sticks_hz,
-    throttle_hz: cutoffs of the receiver's smoothing. A cutoff of 0 is no filter.
+    Without arms there is no loop.
+
+    Attributes:
+        roll_arm, pitch_arm, yaw_arm: angular acceleration for a newton of one motor, 1/(kg m).
+        yaw_spin: change of the yaw rate when one motor starts, rad/s.
+        motor_s: lag of the motors.
+        precession: (I_z - I_y) / I_x.
+        rear_right, front_right, rear_left, front_left: thrust of a motor as a share of what it
+            should be.
+        center_x, center_y: where the centre of mass is ahead and left of the motors' middle, as a
+            share of the motors' own distance from it.
+        gyro_late_s: lag of the gyro beyond that of its filters' settings.
+        sticks_hz, throttle_hz: cutoffs of the receiver's smoothing; 0 is no filter.
     """
 
     roll_arm: Scalar = 0.0
@@ -121,8 +127,12 @@ class BetaflightLoop(NamedTuple):
 class Frames(NamedTuple):
     """The receiver's last frame, and the feedforward's memory of earlier frames; (3,) each.
 
-    setpoint, hold: deg/s, the latter follows slowly. speed: smoothed, deg/s^2; speed_change: of it,
-    in a frame. moved: by how much the stick did, us. was_still: 1 if it did not.
+    Attributes:
+        setpoint, hold: deg/s, the latter follows slowly.
+        speed: smoothed, deg/s^2.
+        speed_change: of it, in a frame.
+        moved: by how much the stick did, us.
+        was_still: 1 if it did not.
     """
 
     stick: Array
@@ -185,8 +195,11 @@ class Turn(NamedTuple):
 class Given(NamedTuple):
     """What the substeps under one frame share.
 
-    setpoint, feedforward: of the frame, (3,) each. throttle: 0 to 1. thrust_coeffs, battery_v: of
-    the thrust map. dt: of a substep, s.
+    Attributes:
+        setpoint, feedforward: of the frame, (3,) each.
+        throttle: 0 to 1.
+        thrust_coeffs, battery_v: of the thrust map.
+        dt: of a substep, s.
     """
 
     loop: BetaflightLoop
@@ -235,7 +248,8 @@ def _lowpass(
 ) -> tuple[Scalar, ...]:
     """Return the stages of a low pass after a held target, exactly.
 
-    cutoff_hz: of all stages together.
+    Args:
+        cutoff_hz: of all stages together.
     """
     correction = 1.0 / (2.0 ** (1.0 / len(stages)) - 1.0) ** 0.5
     cutoff_hz = jnp.where(cutoff_hz > 0.0, cutoff_hz * correction, NONE_HZ)
@@ -257,7 +271,9 @@ def _received(
 ) -> Frames:
     """Return the frames after a new one.
 
-    full: rates at full stick, (3,) deg/s. dt: since the last frame, s.
+    Args:
+        full: rates at full stick, (3,) deg/s.
+        dt: since the last frame, s.
     """
     setpoint, reach = stick * full, jnp.abs(full)
     change = setpoint - frames.setpoint

@@ -40,7 +40,8 @@ PastCommands = tuple[Action, ...]  # those before the present one, the latest fi
 def start(delay: CommandDelay, drone: Drone, num_steps: int = USUAL_STEPS) -> PastCommands:
     """Return the memory of a new episode, as if the applied action had always been commanded.
 
-    num_steps: how many commands it holds; longer delays are cut.
+    Args:
+        num_steps: how many commands it holds; longer delays are cut.
     """
     return (drone.applied,) * num_steps
 
@@ -62,10 +63,12 @@ def late(
 ) -> Scalar:
     """Return the mean over a step of a value that is ``delay_s`` late and was held over each step.
 
-    values: the present one, the one a step of ``dt`` s before, ... A delay of n + f steps is 1 - f
-    parts of the value n steps before and f parts of the one before that; longer delays than values
-    are cut. Differentiable, at 0 from above. span: shares of the step that the mean is over, if not
-    all of it.
+    A delay of n + f steps is 1 - f parts of the value n steps before and f parts of the one before
+    that; longer delays than values are cut. Differentiable, at 0 from above.
+
+    Args:
+        values: the present one, the one a step of ``dt`` s before, ...
+        span: shares of the step that the mean is over, if not all of it.
     """
     steps = delay_s / dt
     mean = values[0]

@@ -31,7 +31,8 @@ XYZ = 3
 class Moment(NamedTuple):
     """The inputs of a law: scalars or arrays of one shape; units, frames as in ``ForceContext``.
 
-    time_s: since the start of the flight.
+    Attributes:
+        time_s: since the start of the flight.
     """
 
     pos_w: Vec3
@@ -149,9 +150,14 @@ def _place(moment: Moment, x: float, y: float, z: float, radius: float) -> Scala
 class Shape(NamedTuple):
     """A shape of a factor: a function of a quantity.
 
-    numbers: names of its numbers. words: of its formula. quantities: that can have the shape. at:
-    the function. positive: numbers that must be above 0. of_moment: it takes the moment in place of
-    the quantity's value, since its quantity is a direction or a place.
+    Attributes:
+        numbers: names of its numbers.
+        words: of its formula.
+        quantities: that can have the shape.
+        at: the function.
+        positive: numbers that must be above 0.
+        of_moment: it takes the moment in place of the quantity's value, since its quantity is a
+            direction or a place.
     """
 
     numbers: tuple[str, ...]
@@ -235,9 +241,11 @@ class Factor:
 class Term:
     """A vector times factors.
 
-    acts: "force", m/s^2 of specific force, or "rate", rad/s of body rates. frame: of the vector:
-    body, world or air: only the first component is used, along the velocity through the air.
-    coefficients, standard_errors: three each.
+    Attributes:
+        acts: "force", m/s^2 of specific force, or "rate", rad/s of body rates.
+        frame: of the vector: body, world or air: only the first component is used, along the
+            velocity through the air.
+        coefficients, standard_errors: three each.
     """
 
     acts: str
@@ -270,7 +278,8 @@ class Term:
     def at(self, moment: Moment, spread: Scalar) -> Vec3:
         """Return its vector, body frame.
 
-        spread: by how many standard errors each coefficient is larger.
+        Args:
+            spread: by how many standard errors each coefficient is larger.
         """
         signal, total = self.signal(moment), Vec3(0.0, 0.0, 0.0)
         for place, one in enumerate(self.basis(moment)):
@@ -325,7 +334,8 @@ class Law:
 def law_from_json(values: Any) -> Law:
     """Return the law in JSON values of ``Law.as_json``.
 
-    Raises: ValueError: what is not in the grammar, numbers that are not finite, a pole within the
+    Raises:
+        ValueError: what is not in the grammar, numbers that are not finite, a pole within the
             envelope; the message begins with the field.
     """
     kind = Annotated[tuple[_TermFields, ...], Meta(min_length=1, max_length=MOST_TERMS)]

@@ -27,9 +27,10 @@ class ImuLatency(NamedTuple):
 class PastReadings(NamedTuple):
     """True body rates, rad/s, and specific forces, m/s^2, body frame; the present ones first.
 
-    rate_bends_b, force_bends_b: how far those in the middle of a continuous step are from the mean
-    of its ends, of the same steps; the last one is not used. is_fresh: no step was made yet, and no
-    force is known.
+    Attributes:
+        rate_bends_b, force_bends_b: how far those in the middle of a continuous step are from the
+            mean of its ends, of the same steps; the last one is not used.
+        is_fresh: no step was made yet, and no force is known.
     """
 
     rates_b: tuple[Vec3, ...]
@@ -58,7 +59,8 @@ def _late(
 ) -> Vec3:
     """Return the reading of the delayed time: on the parabola of its step, a line in a simulator.
 
-    past: the readings with the present ones first, as they were without later effects.
+    Args:
+        past: the readings with the present ones first, as they were without later effects.
     """
     by_axis = zip(*(present, *past[1:]), strict=True)
     line = Vec3(*(late(values, latency.latency_s, dt) for values in by_axis))

@@ -13,8 +13,12 @@ from flytrack_env.state import Drone
 class LearnedLaw(NamedTuple):
     """A law, and how it acts.
 
-    scale: share of it that acts, 1 as learnt. spread: by how many standard errors its coefficients
-    are larger. law: static. Draw ``spread`` from -1 to 1, say, to fly what the log cannot tell.
+    Draw ``spread`` from -1 to 1, say, to fly what the log cannot tell.
+
+    Attributes:
+        scale: share of it that acts, 1 as learnt.
+        spread: by how many standard errors its coefficients are larger.
+        law: static.
     """
 
     scale: Scalar = 0.0

@@ -11,7 +11,8 @@ from flytrack_env.quaternion import Scalar, Vec3
 class QuadraticDrag(NamedTuple):
     """Deceleration per airspeed squared along body x, y, z, 1/m.
 
-    shared: how far the axes share the speed, 1.
+    Attributes:
+        shared: how far the axes share the speed, 1.
     """
 
     k_x: Scalar = 0.0

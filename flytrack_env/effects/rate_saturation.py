@@ -15,7 +15,8 @@ AXES = ("roll", "pitch", "yaw")
 class RateSaturation(NamedTuple):
     """Share of each full stick, at its end, that turns no faster, 1.
 
-    softness: how gradually, 0 (a corner) to 1.
+    Attributes:
+        softness: how gradually, 0 (a corner) to 1.
     """
 
     roll: Scalar = 0.0

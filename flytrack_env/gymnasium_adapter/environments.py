@@ -71,7 +71,8 @@ class _Adapter:
     ) -> np.ndarray:
         """Begin episodes by the options of a reset; return their observations, (num_envs, size).
 
-        draw_words: called for the words of their keys once the options are known to be good.
+        Args:
+            draw_words: called for the words of their keys once the options are known to be good.
         """
         options, simulation = check_names(options), self._simulation
         if TRACK in options:
@@ -131,12 +132,17 @@ class _Adapter:
 class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
     """One environment of an id, stepped as one compiled function.
 
-    env_id: of ``flytrack_env.registration.ENVIRONMENTS``. render_mode: None, "rgb_array" or
-    "human". params: replace the default parameters. overrides: further arguments of
-    ``flytrack_env.make``: track, model, plant, missed_gate, reward.
+    Args:
+        env_id: of ``flytrack_env.registration.ENVIRONMENTS``.
+        render_mode: None, "rgb_array" or "human".
+        params: replace the default parameters.
+        overrides: further arguments of ``flytrack_env.make``: track, model, plant, missed_gate,
+            reward.
 
-    Raises: ValueError, TypeError: what ``flytrack_env.make`` and ``check_params`` refuse, or a
-        render mode. ImportError: a render mode whose package is not installed.
+    Raises:
+        ValueError, TypeError: what ``flytrack_env.make`` and ``check_params`` refuse, or a render
+            mode.
+        ImportError: a render mode whose package is not installed.
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 100}  # noqa: RUF012  # as Gymnasium declares it
@@ -158,8 +164,10 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Return observation and an empty info of an episode that begins.
 
-        options: position (world, m), quaternion (w, x, y, z, body to world) or yaw_deg, velocity
-        (world, m/s), battery_v, gate_index (to fly first), track; see docs/gymnasium.md.
+        Args:
+            options: position (world, m), quaternion (w, x, y, z, body to world) or yaw_deg,
+                velocity (world, m/s), battery_v, gate_index (to fly first), track; see
+                docs/gymnasium.md.
 
         Raises:
             ValueError: an unknown option, or a value that no episode can start with.
@@ -176,7 +184,8 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Return observation, reward, terminated, truncated and info, of Python's own types.
 
-        action: (4,), see docs/environment.md. There is no auto-reset.
+        Args:
+            action: (4,), see docs/environment.md. There is no auto-reset.
 
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
@@ -222,10 +231,11 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
     """Environments of one id side by side, each reset by itself after its episode ended.
 
     What ``gymnasium.vector.SyncVectorEnv`` returns in the same autoreset mode, in the same types:
-    new, writable arrays in every step.
+    new, writable arrays in every step. Other arguments and errors are those of ``FlyTrackEnv``.
 
-    render_mode: None or "rgb_array". autoreset_mode: ``AutoresetMode.NEXT_STEP`` or ``SAME_STEP``,
-    or its value. Other arguments and errors are those of ``FlyTrackEnv``.
+    Args:
+        render_mode: None or "rgb_array".
+        autoreset_mode: ``AutoresetMode.NEXT_STEP`` or ``SAME_STEP``, or its value.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  # as Gymnasium declares it
@@ -268,12 +278,15 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Return observations and an empty info of episodes that begin, in all environments.
 
-        seed: of the first environment, the others counting up; or one per environment. An
-        environment's start is that of a single environment with its seed. options: as for the
-        single environment, the same for all.
+        An environment's start is that of a single environment with its seed.
 
-        Raises: ValueError: an unknown option, a value that no episode can start with, or another
-                number of seeds.
+        Args:
+            seed: of the first environment, the others counting up; or one per environment.
+            options: as for the single environment, the same for all.
+
+        Raises:
+            ValueError: an unknown option, a value that no episode can start with, or another number
+                of seeds.
         """
         observations = self._begin(options, lambda: self._seed(seed))
         self._words, self._count = draw_key(self.np_random), 0
@@ -304,11 +317,13 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Return observations, rewards, terminations, truncations and infos of a step.
 
-        actions: (num_envs, 4). With ``NEXT_STEP``, where an episode ended in the step before, the
-        action is ignored, and the observation is the first one of the next episode, with a reward
-        of 0, no flag and no info. With ``SAME_STEP``, where an episode ends, the observation is the
-        first one of the next episode, and infos has ``final_obs`` and ``final_info`` with their
-        masks.
+        With ``NEXT_STEP``, where an episode ended in the step before, the action is ignored, and
+        the observation is the first one of the next episode, with a reward of 0, no flag and no
+        info. With ``SAME_STEP``, where an episode ends, the observation is the first one of the
+        next episode, and infos has ``final_obs`` and ``final_info`` with their masks.
+
+        Args:
+            actions: (num_envs, 4).
 
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.

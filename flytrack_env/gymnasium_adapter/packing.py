@@ -22,7 +22,8 @@ HOST_DTYPES = {"f": np.float64, "i": np.int64, "u": np.int64, "b": np.bool_}
 class Layout(NamedTuple):
     """Structure of a pytree, dtypes of its matrices, and the place of each leaf.
 
-    places: a leaf's shape, matrix, first row, and the row after its last.
+    Attributes:
+        places: a leaf's shape, matrix, first row, and the row after its last.
     """
 
     structure: Any

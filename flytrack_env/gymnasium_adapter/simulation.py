@@ -48,8 +48,9 @@ def begin(
 ) -> tuple[Packed, jax.Array, jax.Array]:
     """Return states, observations and scenes of episodes that begin.
 
-    words: of their keys, (num_envs, KEY_WORDS). start: as of ``options.read_start``, the same for
-    all.
+    Args:
+        words: of their keys, (num_envs, KEY_WORDS).
+        start: as of ``options.read_start``, the same for all.
     """
     own = _params_of(params)
 
@@ -100,9 +101,13 @@ def step_batch(
     """Step a batch with auto-reset.
 
     Return states, observations, final observations, scenes, and what ``_group`` makes of the rest.
-    words: of one key for all; count: makes it this step's own. has_ended: None to reset in this
-    step, or (num_envs,) bool for those that ended in the step before. Scenes, after the auto-reset,
-    are None unless they are needed.
+    Scenes, after the auto-reset, are None unless they are needed.
+
+    Args:
+        words: of one key for all.
+        count: of steps, with which the key is this step's own.
+        has_ended: None to reset in this step, or (num_envs,) bool for those that ended in the step
+            before.
     """
     key = jax.random.fold_in(_make_key(words), count)
     found = env.step_batch(key, states.unpack(), actions, _params_of(params), has_ended)
@@ -125,8 +130,11 @@ def _group(
 
     Reward, flags, the infos of an episode that goes on, the final infos of one that ended, and the
     masks of the latter. A mask says where the value of its name, less the underscore, is given;
-    elsewhere it is 0. has_ended: None; or whether this is the reset after an end, which has no
-    infos, and then nothing is final.
+    elsewhere it is 0.
+
+    Args:
+        has_ended: None; or whether this is the reset after an end, which has no infos, and then
+            nothing is final.
     """
 
     def masked(mask: jax.Array) -> dict[str, jax.Array]:
@@ -151,10 +159,15 @@ _COMPILED: dict[Any, EpisodicEnvironment] = {}
 class Simulation:
     """An environment of an id with its parameters. Never changes; copies share what is compiled.
 
-    env_id, overrides: what ``flytrack_env.make`` takes. params: replace the defaults if not None.
+    Args:
+        env_id: of ``flytrack_env.make``.
+        overrides: its other arguments.
+        params: replace the defaults if not None.
 
-    Raises: ValueError: what ``flytrack_env.make`` and ``check_params`` refuse, and leaves of
-        another shape. TypeError: params of another type.
+    Raises:
+        ValueError: what ``flytrack_env.make`` and ``check_params`` refuse, and leaves of another
+            shape.
+        TypeError: params of another type.
     """
 
     def __init__(self, env_id: str, params: EnvParams | None, overrides: dict[str, Any]):

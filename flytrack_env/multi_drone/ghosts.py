@@ -34,7 +34,10 @@ class Ghost(NamedTuple):
 def time_optimal_ghost(track: Track, delay_s: float = 0.0) -> Ghost:
     """Return the ghost of a track's time-optimal laps with the nominal drone.
 
-    The first lap is from standstill. delay_s: for which it waits at the start pose.
+    The first lap is from standstill.
+
+    Args:
+        delay_s: for which it waits at the start pose.
 
     Raises:
         ReferenceFileError: a track without shipped references.

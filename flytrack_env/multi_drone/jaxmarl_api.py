@@ -21,7 +21,10 @@ class JaxMarlRace(MultiAgentEnv):
     """A race as a ``jaxmarl.environments.MultiAgentEnv``; agents are "drone_0" and so on.
 
     Auto-reset is JaxMARL's own: once the race is over, ``dones["__all__"]``. An agent that is out
-    stays done, with a reward of 0. params: the race's default ones if None.
+    stays done, with a reward of 0.
+
+    Args:
+        params: the race's default ones if None.
     """
 
     def __init__(self, race: MultiDroneRace, params: RaceParams | None = None) -> None:

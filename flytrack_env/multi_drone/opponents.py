@@ -30,8 +30,10 @@ OPPONENT = (
 class Standing(NamedTuple):
     """What others see of a drone, scalars.
 
-    pos_w, vel_w: world, m, m/s. progress: gates passed, and the share of the way to the next one.
-    is_out: whether it is out of the race.
+    Attributes:
+        pos_w, vel_w: world, m, m/s.
+        progress: gates passed, and the share of the way to the next one.
+        is_out: whether it is out of the race.
     """
 
     pos_w: Vec3
@@ -123,7 +125,9 @@ def gap_of(own: Standing, others: Sequence[Standing]) -> jax.Array:
 def progress_of(gates_passed: Scalar, pos_w: Vec3, centre_w: Vec3, leg_m: Scalar) -> jax.Array:
     """Return the gates passed plus the share of the way to the next gate, float32.
 
-    centre_w: of the next gate. leg_m: its distance from the gate before.
+    Args:
+        centre_w: of the next gate.
+        leg_m: its distance from the gate before.
     """
     distance_m = jnp.asarray(compute_once((centre_w - pos_w).norm()))
     return jnp.asarray(gates_passed, distance_m.dtype) + 1.0 - distance_m / leg_m

@@ -21,8 +21,10 @@ SEEDS = 2**31
 class ParallelRace(ParallelEnv[str, np.ndarray, np.ndarray]):
     """A race as a ``pettingzoo.ParallelEnv``.
 
-    Agents are "drone_0" and so on, and leave once they are out. params: the race's default ones if
-    None.
+    Agents are "drone_0" and so on, and leave once they are out.
+
+    Args:
+        params: the race's default ones if None.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "FlyTrackRace-v0", "render_modes": []}
@@ -59,8 +61,9 @@ class ParallelRace(ParallelEnv[str, np.ndarray, np.ndarray]):
         Return observations, rewards, terminations, truncations and infos of the agents that were
         racing.
 
-        Raises: ValueError: actions of other agents than those that race, or of another shape.
-                RuntimeError: no race was begun.
+        Raises:
+            ValueError: actions of other agents than those that race, or of another shape.
+            RuntimeError: no race was begun.
         """
         if self._states is None:
             raise RuntimeError("step: found no race, expected reset() before it")

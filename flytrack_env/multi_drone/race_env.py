@@ -48,8 +48,12 @@ PLACE_BITS = MOST_DRONES - 1  # of a random word: which drone of the race it is
 class EntrantState(NamedTuple):
     """One drone of a race.
 
-    inner: the state of its environment. leg_m: distance of its gate from the gate before. progress,
-    is_out: as in ``Standing``. gap: as ``gap_of``. step: since the race began.
+    Attributes:
+        inner: the state of its environment.
+        leg_m: distance of its gate from the gate before.
+        progress, is_out: as in ``Standing``.
+        gap: as ``gap_of``.
+        step: since the race began.
     """
 
     inner: Any
@@ -80,11 +84,14 @@ class MultiDroneRace:
     more, and gets a reward of 0. Observations are those of ``env``, and of the nearest opponents
     (``flytrack_env.multi_drone.opponents``).
 
-    Args: env: the environment of one drone, wrapped or not. num_drones: 1 to 8. One drone flies
-            exactly as in ``env``. over: when the race is over, and reset, before the time limit:
-            once "all" drones are out, or "first", once drone 0 is. ghosts: by their place, from 1,
-            drones that fly a given line (``flytrack_env.multi_drone.ghosts``). With any, races
-            begin at the start pose, and the others on a grid that leaves the line free.
+    Args:
+        env: the environment of one drone, wrapped or not.
+        num_drones: 1 to 8. One drone flies exactly as in ``env``.
+        over: when the race is over, and reset, before the time limit: once "all" drones are out, or
+            "first", once drone 0 is.
+        ghosts: by their place, from 1, drones that fly a given line
+            (``flytrack_env.multi_drone.ghosts``). With any, races begin at the start pose, and the
+            others on a grid that leaves the line free.
 
     Raises:
         ValueError: another number of drones, value of ``over`` or place of a ghost.
@@ -160,8 +167,9 @@ class MultiDroneRace:
     ) -> tuple[jax.Array, EntrantState]:
         """Return observations, (num_drones, size) float32, and state of a race on the start grid.
 
-        Raises: TypeError: a key that is none. ValueError: parameters that no race can be flown
-                with, where their values are known.
+        Raises:
+            TypeError: a key that is none.
+            ValueError: parameters that no race can be flown with, where their values are known.
         """
         check_key(key)
         params = self.default_params if params is None else params
@@ -181,7 +189,10 @@ class MultiDroneRace:
     ) -> tuple[jax.Array, EntrantState]:
         """Return observations and state of a race that begins with given drones and gates.
 
-        Leaves (num_drones,). seed: uint32 word that decides whatever else the episode draws.
+        Leaves (num_drones,).
+
+        Args:
+            seed: uint32 word that decides whatever else the episode draws.
 
         Raises:
             ValueError: drones that start inside each other, where positions are known.
@@ -213,12 +224,14 @@ class MultiDroneRace:
     ) -> Step:
         """Step the race with auto-reset.
 
-        Return observations, states, rewards, terminated, truncated and info.
+        Args:
+            actions: (num_drones, 4).
 
-        actions: (num_drones, 4). Everything returned has num_drones in front. terminated: whether a
-        drone is out. truncated: whether the race is over for one that is not. info: that of ``env``
-        while a drone flies, ``collision``, ``rank``, ``gap_gates``, ``race_over`` and
-        ``final_observation``.
+        Returns:
+            Observations, states, rewards, whether each drone is out, whether the race is over for
+            one that is not, and info: that of ``env`` while a drone flies, ``collision``,
+            ``rank``, ``gap_gates``, ``race_over`` and ``final_observation``. Everything has
+            num_drones in front.
         """
         return self._advance_flat(seed_of(key)[None], states, actions, params, resets=True)
 
@@ -239,7 +252,9 @@ class MultiDroneRace:
     ) -> Step:
         """``step`` for a batch of races with one key, faster than ``vmap(step)``.
 
-        states: leaves (num_races, num_drones). actions: (num_races, num_drones, 4).
+        Args:
+            states: leaves (num_races, num_drones).
+            actions: (num_races, num_drones, 4).
         """
         shape = actions.shape[:-1]
         seeds = seeds_of(seed_of(key), jnp.arange(shape[0]))

@@ -15,10 +15,13 @@ BOTH_OUT, RAMMER_OUT = 0, 1
 class RaceRules(NamedTuple):
     """How drones start and collide; all of it may be batched, as parameters may.
 
-    collision_radius: of the sphere around each drone, m. blame: 0, both drones of a collision are
-    out; 1, the one that ran into the other is (``flytrack_env.multi_drone.collisions``).
-    column_spacing, row_spacing: of the start grid, m. first_slot: slot on the grid of drone 0, the
-    others following; -1: drawn. lead: reward for each gate gained on the best opponent.
+    Attributes:
+        collision_radius: of the sphere around each drone, m.
+        blame: 0, both drones of a collision are out; 1, the one that ran into the other is
+            (``flytrack_env.multi_drone.collisions``).
+        column_spacing, row_spacing: of the start grid, m.
+        first_slot: slot on the grid of drone 0, the others following; -1: drawn.
+        lead: reward for each gate gained on the best opponent.
     """
 
     collision_radius: Scalar = 0.15

@@ -16,9 +16,11 @@ from flytrack_env.multi_drone.rules import RaceParams
 class Opponent(NamedTuple):
     """A policy that does not learn.
 
-    act: (params, observations (..., observation_size)) -> actions (..., 4). observation_size: that
-    of the race, or that of its environment for one drone, for a policy that does not see others.
-    params: a pytree.
+    Attributes:
+        act: (params, observations (..., observation_size)) -> actions (..., 4).
+        observation_size: that of the race, or that of its environment for one drone, for a policy
+            that does not see others.
+        params: a pytree.
     """
 
     act: Callable[[Any, jax.Array], jax.Array]
@@ -58,8 +60,9 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
         race: with ``over="first"``.
         opponents: the policy of each other drone, in their order.
 
-    Raises: ValueError: another number of opponents, one that observes something of another size, or
-            a race that goes on without drone 0.
+    Raises:
+        ValueError: another number of opponents, one that observes something of another size, or a
+            race that goes on without drone 0.
     """
 
     def __init__(self, race: MultiDroneRace, opponents: Sequence[Opponent]) -> None:
@@ -132,7 +135,8 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
     ) -> Step:
         """Step a batch of races with one key, faster than ``vmap(step)``.
 
-        actions: (num_races, 4).
+        Args:
+            actions: (num_races, 4).
         """
         actions = self._all_actions(states.observations, actions, params)
         return self._of_learner(self.race.step_batch(key, states.entrants, actions, params.race))

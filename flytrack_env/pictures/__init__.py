@@ -73,7 +73,8 @@ def write_pictures(flights: Sequence[Flight], folder: str | Path) -> list[Path]:
 def write_animation(flight: Flight, reference: Reference, folder: str | Path) -> Path:
     """Write ``NAME.gif``, the fastest flying lap beside the time-optimal one; return its path.
 
-    reference: a time-optimal flying lap of the same track.
+    Args:
+        reference: a time-optimal flying lap of the same track.
 
     Raises:
         ImportError, OSError: Pillow is not installed, or the file cannot be written.

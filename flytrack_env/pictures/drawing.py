@@ -76,7 +76,10 @@ def draw_path(
 ) -> LineCollection:
     """Draw a path whose segments have the colours of their values; return it, for a colour bar.
 
-    points: (n, 2). values: (n - 1,), of the segments. top: of the colour scale, which begins at 0.
+    Args:
+        points: (n, 2).
+        values: (n - 1,), of the segments.
+        top: of the colour scale, which begins at 0.
     """
     lines = LineCollection(
         list(np.stack([points[:-1], points[1:]], axis=1)),

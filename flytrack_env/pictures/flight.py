@@ -21,9 +21,14 @@ SHOWN_LAPS = 6
 class Meeting(NamedTuple):
     """The drone in the plane of the gate to fly next.
 
-    outcome: PASSED, TOUCHED or MISSED. gate: index in flying order. time_s: since the first state.
-    distance_m: flown until then. pos_w: where, (3,), world, m. right_m, up_m: off the gate's
-    centre, as the drone comes to it. speed_m_s: before it.
+    Attributes:
+        outcome: PASSED, TOUCHED or MISSED.
+        gate: index in flying order.
+        time_s: since the first state.
+        distance_m: flown until then.
+        pos_w: where, (3,), world, m.
+        right_m, up_m: off the gate's centre, as the drone comes to it.
+        speed_m_s: before it.
     """
 
     outcome: str
@@ -39,9 +44,14 @@ class Meeting(NamedTuple):
 class Flight(NamedTuple):
     """One recorded flight at 100 Hz.
 
-    name: of its pictures. states: (T, 21), whose applied roll, pitch and yaw may be NaN. commands:
-    (T, 4). race: gates and laps, followed through the positions. distances_m: flown until each
-    state, (T,). meetings: in order. ended: why the flight ended.
+    Attributes:
+        name: of its pictures.
+        states: (T, 21), whose applied roll, pitch and yaw may be NaN.
+        commands: (T, 4).
+        race: gates and laps, followed through the positions.
+        distances_m: flown until each state, (T,).
+        meetings: in order.
+        ended: why the flight ended.
     """
 
     name: str

@@ -60,13 +60,18 @@ class ReferenceFileError(ValueError):
 class Reference:
     """A time-optimal flight, sampled at the simulator's step.
 
-    track, model_name: names. track_sha256: digest of the track. kind: "flying", a lap from the last
-    gate's plane to itself, periodic except for the battery; or "standing", from rest at the start
-    pose through every gate once. model: that it is optimal for. dt_s: s. time_s: to the last gate's
-    plane, s; for "flying" the lap time. states: (N + 1, 21) and commands: (N, 4), float64, laid out
-    as in ``flytrack_env.state``; each command is held over its step, and the last gate is passed in
-    the last step. gate_times_s: (num_gates,), s from the first state. found: how it was found, JSON
-    values (solver, status, seconds, versions, command).
+    Attributes:
+        track, model_name: names.
+        track_sha256: digest of the track.
+        kind: "flying", a lap from the last gate's plane to itself, periodic except for the battery;
+            or "standing", from rest at the start pose through every gate once.
+        model: that it is optimal for.
+        dt_s: s.
+        time_s: to the last gate's plane, s; for "flying" the lap time.
+        states: (N + 1, 21), float64, laid out as in ``flytrack_env.state``.
+        commands: (N, 4), each held over its step; the last gate is passed in the last step.
+        gate_times_s: (num_gates,), s from the first state.
+        found: how it was found, JSON values (solver, status, seconds, versions, command).
     """
 
     track: str
@@ -192,8 +197,9 @@ def _check_notes(notes: dict[str, Any]) -> None:
 def load_reference(path: str | Path) -> Reference:
     """Return the reference in a file.
 
-    Raises: ReferenceFileError: missing or damaged file, pickled objects, another version, arrays
-            that are no flight, commands beyond [-1, 1], notes of wrong types, or a model of another
+    Raises:
+        ReferenceFileError: missing or damaged file, pickled objects, another version, arrays that
+            are no flight, commands beyond [-1, 1], notes of wrong types, or a model of another
             digest.
     """
     path = Path(path)

@@ -35,7 +35,9 @@ NUM_COLOURS = 128
 class Lap(NamedTuple):
     """A lap to show.
 
-    states: (T, 21), at 100 Hz from the start of the lap on. time_s: the lap time, s.
+    Attributes:
+        states: (T, 21), at 100 Hz from the start of the lap on.
+        time_s: the lap time, s.
     """
 
     label: str

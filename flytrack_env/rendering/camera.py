@@ -16,8 +16,11 @@ def unit(vector: np.ndarray, fallback: np.ndarray) -> np.ndarray:
 class Camera:
     """A camera that stays upright.
 
-    eye_w, forward_w: (3,), world, m; forward of length 1. centre_px: (2,), pixels. focal_px:
-    pixels.
+    Args:
+        eye_w: (3,), world, m.
+        forward_w: (3,), unit vector, world.
+        centre_px: (2,), pixels.
+        focal_px: pixels.
     """
 
     def __init__(

@@ -27,7 +27,8 @@ def scene_row(drone: Drone, race: Race) -> jax.Array:
 class FlightLog:
     """The rows of one episode from its start on; row k is the state k steps after it.
 
-    step_s: length of a step, s.
+    Args:
+        step_s: length of a step, s.
     """
 
     def __init__(self, step_s: float):

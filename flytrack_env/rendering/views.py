@@ -59,7 +59,11 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 class TopView:
     """Draws the course from above, the trail, and the drone as an arrow.
 
-    Trails are kept between pictures. width, height: pixels of its part of the canvas.
+    Trails are kept between pictures.
+
+    Args:
+        width: of its part of the canvas, pixels.
+        height: the same.
     """
 
     def __init__(
@@ -163,7 +167,10 @@ class TopView:
 class ChaseView:
     """Draws the flight from behind the drone, in perspective: gates, ground, trail and drone.
 
-    left: pixels of the canvas that belong to another view. width, height: of this one.
+    Args:
+        left: pixels of the canvas that belong to another view.
+        width: of this one.
+        height: the same.
     """
 
     def __init__(self, course: Course, gates: Gates, left: int, width: int, height: int):
@@ -260,7 +267,8 @@ def draw_gate(
 ) -> None:
     """Draw a gate's frame as a solid ring.
 
-    corners_c: (8, 3), outer four and inner four, camera's frame.
+    Args:
+        corners_c: (8, 3), outer four and inner four, camera's frame.
     """
     for a in range(4):
         b = (a + 1) % 4
@@ -290,7 +298,8 @@ def draw_drone(
 ) -> None:
     """Draw arms, rotors and body of a drone, the far rotors first.
 
-    colours: of body, front rotors and rear rotors.
+    Args:
+        colours: of body, front rotors and rear rotors.
     """
     axes_w = enlargement * rotations(quaternion).T
     motors_w = pos_w + scene.MOTORS_B @ axes_w
@@ -333,9 +342,11 @@ class Renderer:
     ) -> np.ndarray:
         """Return a picture of the log's last row and the way there, (540, 960, 3), uint8.
 
-        ghost: state (21,) of a second drone to show. follows_nose: whether the camera looks where
-        the drone's nose points, as a pilot needs it, and not to the next gate. notes: lines of text
-        on the chase view.
+        Args:
+            ghost: state (21,) of a second drone to show.
+            follows_nose: whether the camera looks where the drone's nose points, as a pilot needs
+                it, and not to the next gate.
+            notes: lines of text on the chase view.
 
         Raises:
             ValueError: an empty log.

@@ -20,7 +20,9 @@ INVISIBLE = "offscreen"  # what SDL takes by itself where there is no display
 class Window:
     """Shows pictures through pygame; without a display it is invisible, and a warning is logged.
 
-    step_s: time between two steps, s. must_be_seen: refuse to be invisible.
+    Args:
+        step_s: time between two steps, s.
+        must_be_seen: refuse to be invisible.
 
     Raises:
         ImportError: pygame is not installed.
@@ -53,8 +55,9 @@ class Window:
     def show(self, draw: Callable[[], np.ndarray], is_first: bool) -> None:
         """Wait until the next step is due, and draw and show a picture if one is due.
 
-        draw: returns a picture (height, width, 3), uint8. is_first: whether an episode begins,
-        whose first picture is always shown, at once.
+        Args:
+            draw: returns a picture (height, width, 3), uint8.
+            is_first: whether an episode begins, whose first picture is always shown, at once.
         """
         now_s = time.monotonic()
         self.step_due_s += self.step_s

@@ -22,10 +22,12 @@ LENGTH_SAMPLES = 1000
 class GateFrame(NamedTuple):
     """Flight frame of one gate.
 
-    centre: m. forward, up: its axes x and z in the world. half_opening, half_frame: half edges of
-    the inner and the outer square, m.
-
     The leaves are scalars, or arrays of shape (num_gates,) for the gates of a course.
+
+    Attributes:
+        centre: m.
+        forward, up: its axes x and z in the world.
+        half_opening, half_frame: half edges of the inner and the outer square, m.
     """
 
     centre: Vec3
@@ -46,8 +48,11 @@ class GateFrame(NamedTuple):
 class Course(NamedTuple):
     """What the environment needs of a track; a pytree of arrays, so that courses can be batched.
 
-    gates: leaves (num_gates,), in flying order. start_pos_w: m. start_quat: body to world.
-    bounds_low, bounds_high: m.
+    Attributes:
+        gates: leaves (num_gates,), in flying order.
+        start_pos_w: m.
+        start_quat: body to world.
+        bounds_low, bounds_high: m.
     """
 
     gates: GateFrame
@@ -86,10 +91,12 @@ class Course(NamedTuple):
 class Crossing(NamedTuple):
     """How a straight segment meets a gate's plane in the direction of flight.
 
-    is_pass, is_frame, is_miss: through the opening, on the frame, outside it; at most one is true.
-    fraction: where on the segment, in [0, 1]; 1 where the plane is not crossed.
-    offset: distance of the crossing from the centre over the free half opening, along the worse
-    of the gate's two axes: 0 at the centre, 1 at the edge.
+    Attributes:
+        is_pass, is_frame, is_miss: through the opening, on the frame, outside it; at most one is
+            true.
+        fraction: where on the segment, in [0, 1]; 1 where the plane is not crossed.
+        offset: distance of the crossing from the centre over the free half opening, along the worse
+            of the gate's two axes: 0 at the centre, 1 at the edge.
     """
 
     is_pass: jax.Array

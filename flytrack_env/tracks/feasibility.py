@@ -21,15 +21,18 @@ ROUNDING_M = 1e-4  # of float32 positions some hundred metres from the origin
 class Limits(NamedTuple):
     """What a course must keep; lengths in m.
 
-    min_spacing, max_spacing: distance between the centres of consecutive gates. Nearer than that
-    there is no room to turn; observations clip at 90 m. max_turn_deg: angle between a gate's
-    direction of flight and the straight way from the gate before it or to the gate behind it. At 90
-    deg the drone turns on the spot. clearance: between the way and frames, floor, walls and
-    ceiling, and between frames. The default is what starts in flight lie off the way (0.5 m,
-    ``ResetParams.course_offset``) and a drone's radius. min_start_distance, max_start_turn_deg: as
-    above, from the start to the first gate. start_clearance: between the start and the walls;
-    starts are drawn 0.3 m around it. min_opening: inner edge of a gate. drone_radius: of the drone
-    that must not touch frames.
+    Attributes:
+        min_spacing, max_spacing: distance between the centres of consecutive gates. Nearer than
+            that there is no room to turn; observations clip at 90 m.
+        max_turn_deg: angle between a gate's direction of flight and the straight way from the gate
+            before it or to the gate behind it. At 90 deg the drone turns on the spot.
+        clearance: between the way and frames, floor, walls and ceiling, and between frames. The
+            default is what starts in flight lie off the way (0.5 m, ``ResetParams.course_offset``)
+            and a drone's radius.
+        min_start_distance, max_start_turn_deg: as above, from the start to the first gate.
+        start_clearance: between the start and the walls; starts are drawn 0.3 m around it.
+        min_opening: inner edge of a gate.
+        drone_radius: of the drone that must not touch frames.
     """
 
     min_spacing: float = 5.0
@@ -46,7 +49,9 @@ class Limits(NamedTuple):
 class Problem(NamedTuple):
     """One demand that a course does not meet.
 
-    demand: one of ``DEMANDS``. text: which gates, what was found, what was expected.
+    Attributes:
+        demand: one of ``DEMANDS``.
+        text: which gates, what was found, what was expected.
     """
 
     demand: str
@@ -56,8 +61,11 @@ class Problem(NamedTuple):
 class Geometry(NamedTuple):
     """A track as float64 arrays, world, m.
 
-    centres: (N, 3). axes: (N, 3, 3), forward, left and up of each gate's flight frame as rows.
-    half_frames: (N,). way: (N, SAMPLES_PER_WAY, 3), from each gate to the gate behind it.
+    Attributes:
+        centres: (N, 3).
+        axes: (N, 3, 3), forward, left and up of each gate's flight frame as rows.
+        half_frames: (N,).
+        way: (N, SAMPLES_PER_WAY, 3), from each gate to the gate behind it.
     """
 
     track: Track
@@ -126,7 +134,8 @@ class Geometry(NamedTuple):
     def excesses(self, points: np.ndarray, margin: np.ndarray | float) -> dict[str, float]:
         """Return by side how far points (M, 3) lie beyond the bounds less a margin, m, if they do.
 
-        margin: one for all axes, or (3,).
+        Args:
+            margin: one for all axes, or (3,).
         """
         below = np.array(self.track.bounds_low) + margin - points.min(axis=0)
         above = points.max(axis=0) - np.array(self.track.bounds_high) + margin

@@ -42,8 +42,9 @@ def random_track(
         heights: lowest and highest centre of a gate, m.
         limits: what the course must keep, the spacing of the gates among it; ``Limits()`` if None.
 
-    Raises: TrackError: arguments out of range, or no feasible course after many attempts; the
-            message says which demand failed most often.
+    Raises:
+        TrackError: arguments out of range, or no feasible course after many attempts; the message
+            says which demand failed most often.
     """
     _check_arguments(num_gates, size, heights)
     limits = Limits() if limits is None else limits

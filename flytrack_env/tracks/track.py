@@ -34,8 +34,11 @@ class TrackError(ValueError):
 class Gate:
     """One square gate; position in m, quaternion (w, x, y, z) gate to world, edges in m.
 
-    id: a number for people, any below 2^53 but another gate's. direction: +1 if flown towards the
-    gate's local +y, -1 if towards -y. opening: inner edge. frame: outer edge.
+    Attributes:
+        id: a number for people, any below 2^53 but another gate's.
+        direction: +1 if flown towards the gate's local +y, -1 if towards -y.
+        opening: inner edge.
+        frame: outer edge.
     """
 
     id: int
@@ -50,9 +53,12 @@ class Gate:
 class Track:
     """A course: gates in flying order (laps repeat), start pose and bounds; SI units, world frame.
 
-    name: as in its file. start_position: m. start_quaternion: (w, x, y, z), body to world.
-    bounds_low, bounds_high: corners of the box that must not be left, m; the ground is the lower
-    one's z.
+    Attributes:
+        name: as in its file.
+        start_position: m.
+        start_quaternion: (w, x, y, z), body to world.
+        bounds_low, bounds_high: corners of the box that must not be left, m; the ground is the
+            lower one's z.
     """
 
     name: str
@@ -96,9 +102,10 @@ def load_track(name_or_path: str | Path) -> Track:
 def save_track(path: str | Path, track: Track) -> None:
     """Write a track as a ``.toml`` file from which ``load_track`` returns an equal track.
 
-    Raises: TrackError: a path without ``.toml``, or a track that would not come back as it is:
-        values that no track file may have, quaternions that are not units. OSError: the file cannot
-        be written.
+    Raises:
+        TrackError: a path without ``.toml``, or a track that would not come back as it is: values
+            that no track file may have, quaternions that are not units.
+        OSError: the file cannot be written.
     """
     path = Path(path)
     if path.suffix != ".toml":

@@ -112,7 +112,10 @@ class Writer:
     """Writes the entities of one flight.
 
     The first flight has ``world/drone`` and so on, as in the handout; others
-    ``world/flights/NAME/drone``. colours: by the names of flights and models.
+    ``world/flights/NAME/drone``.
+
+    Args:
+        colours: by the names of flights and models.
     """
 
     def __init__(self, trajectory: Trajectory, is_first: bool, colours: dict[str, Colour]):
@@ -131,7 +134,9 @@ class Writer:
     ) -> None:
         """Write all of the flight.
 
-        label: before the name of each line. events: pairs of row and text.
+        Args:
+            label: before the name of each line.
+            events: pairs of row and text.
         """
         self.recording = recording
         self._log_drone()

@@ -47,10 +47,13 @@ def visualize_state_action_sequence(
 ) -> None:
     """Write a flight as a Rerun recording, on the timelines ``step`` and ``sim_time`` (100 Hz).
 
-    sequence: pairs of state (21,) and action (4,), one per step. Outside the pose, a number that is
-    not finite is a gap in its plot. gates: (N, >=8) with id, x, y, z, qw, qx, qy, qz (to world),
-    drawn in the handout's size, 2.7 m outside and 1.5 m inside, and each taken to be flown in the
-    direction in which the flight first passes it.
+    Outside the pose, a number that is not finite is a gap in its plot.
+
+    Args:
+        sequence: pairs of state (21,) and action (4,), one per step.
+        gates: (N, >=8) with id, x, y, z, qw, qx, qy, qz (to world), drawn in the handout's size,
+            2.7 m outside and 1.5 m inside, and each taken to be flown in the direction in which the
+            flight first passes it.
 
     Raises:
         ValueError: no steps, wrong shapes, a pose that is not finite, a quaternion whose norm is
@@ -74,9 +77,12 @@ def write_recording(
 ) -> None:
     """Write flights on one time line as a Rerun recording.
 
-    The file has a temporary name until it is complete. flights: at least one, of different names;
-    the first has the entities of the handout, others their own below ``flights/NAME``. track: None
-    shows no gates.
+    The file has a temporary name until it is complete.
+
+    Args:
+        flights: at least one, of different names; the first has the entities of the handout, others
+            their own below ``flights/NAME``.
+        track: None shows no gates.
 
     Raises:
         ValueError: no flights, two of one name, a flight that cannot be shown (as for
@@ -178,8 +184,10 @@ def make_blueprint(
 ) -> rrb.Blueprint:
     """Return the layout of a recording.
 
-    paths: of the lines that its plots have, below that of the plots. gates_w: centres
-    (num_gates, 3), world, m. num_colours: rows of the key.
+    Args:
+        paths: of the lines that its plots have, below that of the plots.
+        gates_w: centres (num_gates, 3), world, m.
+        num_colours: rows of the key.
     """
     has_line = {
         title: any(

@@ -20,10 +20,15 @@ LARGEST_M = 1e30  # Rerun stores float32, where larger numbers are infinite
 class Trajectory:
     """A flight to record; outside the pose, a number that is not finite is a gap in its plot.
 
-    name: of its plots and paths. states: (T, 21). actions: (T, 4), commanded. time_s: (T,), s,
-    growing; None: a step of 0.01 s from 0 on. ended: why the flight ended; None: derived from its
-    last state. restarts: (T,) bool, rows at which the path begins anew; None: none. residuals_w: by
-    the name of a model, (T, 3), the specific force that it does not explain, world frame, m/s^2.
+    Attributes:
+        name: of its plots and paths.
+        states: (T, 21).
+        actions: (T, 4), commanded.
+        time_s: (T,), s, growing; None: a step of 0.01 s from 0 on.
+        ended: why the flight ended; None: derived from its last state.
+        restarts: (T,) bool, rows at which the path begins anew; None: none.
+        residuals_w: by the name of a model, (T, 3), the specific force that it does not explain,
+            world frame, m/s^2.
     """
 
     name: str
@@ -103,8 +108,11 @@ def track_of_gates(gates: np.ndarray, positions: np.ndarray) -> Track:
 
     Gates have the handout's size, and are flown as the flight first passes them.
 
-    gates: (N, >=8) with id, x, y, z, qw, qx, qy, qz (to world). positions: (T, 3), of the flight. A
-    gate that it does not pass is flown towards its local +y.
+    A gate that the flight does not pass is flown towards its local +y.
+
+    Args:
+        gates: (N, >=8) with id, x, y, z, qw, qx, qy, qz (to world).
+        positions: (T, 3), of the flight.
 
     Raises:
         ValueError: another shape, or a pose that is not finite or no rotation.

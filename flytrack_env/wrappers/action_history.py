@@ -24,8 +24,9 @@ class ActionHistoryState(NamedTuple):
 class ActionHistory(Wrapper):
     """Append the last ``length`` actions to the observation, the latest first.
 
-    kind: "commanded" (clipped, as the policy gave them) or "applied" (lagged). When an episode
-    begins, all of them are the applied action that the drone begins with.
+    Args:
+        kind: "commanded" (clipped, as the policy gave them) or "applied" (lagged). When an episode
+            begins, all of them are the applied action that the drone begins with.
 
     Raises:
         ValueError: a length below 1, another kind.

@@ -25,9 +25,11 @@ class WrapperError(ValueError):
 class Wrapper(EpisodicEnvironment):
     """Delegates every hook; a wrapper overrides those that it changes.
 
-    Its state is a NamedTuple whose field ``inner`` holds the wrapped environment's state. key: its
-    name, and that of its parameters in ``EnvParams.wrappers``; no two wrappers of an environment
-    share one.
+    Its state is a NamedTuple whose field ``inner`` holds the wrapped environment's state.
+
+    Attributes:
+        key: its name, and that of its parameters in ``EnvParams.wrappers``; no two wrappers of an
+            environment share one.
 
     Raises:
         WrapperError: anything but FlyTrack or a wrapper of ours, the same wrapper twice, or one

@@ -31,12 +31,16 @@ LEFT_ALONE: Any = None  # in the place of a parameter's bound: not drawn
 class RandomizationParams(NamedTuple):
     """Ranges of uniform draws, once per episode.
 
-    mass_factor_*: of the model's mass; forces per mass (drag, a wind's push) stay, so that it acts
-    like 1 / thrust_scale. lag_factor_*: of each of its four time constants. low, high: parameters
-    of effects (``flytrack_env.effects``), the same effects in both; None leaves a parameter alone.
-    effect_factor_*: of what the model itself has of these effects. An effect that was identified is
-    known: its departure from neutral is scaled, instead of drawn from low to high; but what was
-    learnt, of which ``spread`` is drawn, in standard errors.
+    An effect that was identified is known: its departure from neutral is scaled, instead of drawn
+    from low to high; but what was learnt, of which ``spread`` is drawn, in standard errors.
+
+    Attributes:
+        mass_factor_low, mass_factor_high: of the model's mass; forces per mass (drag, a wind's
+            push) stay, so that it acts like 1 / thrust_scale.
+        lag_factor_low, lag_factor_high: of each of its four time constants.
+        low, high: parameters of effects (``flytrack_env.effects``), the same effects in both; None
+            leaves a parameter alone.
+        effect_factor_low, effect_factor_high: of what the model itself has of these effects.
     """
 
     mass_factor_low: Scalar = 0.8

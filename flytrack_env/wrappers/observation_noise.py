@@ -19,9 +19,12 @@ from flytrack_env.wrappers.base import Wrapper
 class NoiseParams(NamedTuple):
     """Standard deviations of white noise on the drone that the policy sees, per component.
 
-    position_m, velocity_m_per_s: world. attitude_deg: a turn about each body axis. rates_rad_per_s:
-    body. The defaults are those of a good motion capture or visual-inertial estimate and a filtered
-    gyro.
+    The defaults are those of a good motion capture or visual-inertial estimate and a filtered gyro.
+
+    Attributes:
+        position_m, velocity_m_per_s: world.
+        attitude_deg: a turn about each body axis.
+        rates_rad_per_s: body.
     """
 
     position_m: Scalar = 0.02
