@@ -26,7 +26,7 @@ from flytrack_env.files import write_atomically
 from flytrack_env.plants import Plant
 from flytrack_env.quaternion import Vec3
 from flytrack_env.references import Reference
-from flytrack_env.resets import STILL_THRUST
+from flytrack_env.resets import IDLE_THRUST
 from flytrack_env.state import pack, unpack, unpack_action
 from flytrack_env.tracks import cross_gate
 
@@ -49,7 +49,7 @@ def start_state(track: Track, battery_v: float) -> np.ndarray:
     """Return the state at rest at the start pose, rotors still, (21,)."""
     state = np.zeros(layout.STATE_SIZE)
     state[layout.POSITION], state[layout.QUATERNION] = track.start_position, track.start_quaternion
-    state[layout.APPLIED_ACTION][-1], state[layout.BATTERY] = STILL_THRUST, battery_v
+    state[layout.APPLIED_ACTION][-1], state[layout.BATTERY] = IDLE_THRUST, battery_v
     return state
 
 

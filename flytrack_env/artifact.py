@@ -22,8 +22,8 @@ HARMLESS_CALLS = (
     "annotate_device_placement",
 )
 # characters quoted from a file, or from an error message that it may have written
-LONGEST_TEXT = 500
-MOST_NAMED = 5
+MAX_TEXT_LENGTH = 500
+MAX_NAMED = 5
 # The compiler recurses into nested loops and calls, and overflows its stack at some depth. A file
 # is tried inside this many loops, so that one that only just compiles is refused rather than crash
 # a larger program.
@@ -38,7 +38,7 @@ class ArtifactError(ValueError):
 
 
 def _printable(text: str) -> str:
-    text = " ".join(text.split())[:LONGEST_TEXT]
+    text = " ".join(text.split())[:MAX_TEXT_LENGTH]
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
@@ -116,7 +116,7 @@ def check_pure(content: bytes, exported: export.Exported, is_trusted: bool) -> N
         name for name in targets if "callback" in name or not (is_trusted or name in HARMLESS_CALLS)
     ]
     if refused:
-        listed = _printable(", ".join(refused[:MOST_NAMED]))
+        listed = _printable(", ".join(refused[:MAX_NAMED]))
         raise ArtifactError(
             f"found a call of {listed}, expected a pure function that calls nothing"
         )

@@ -19,9 +19,9 @@ Shown = tuple[list[jax.Array], Any]  # observation, row by row, and state
 Begin = Callable[[jax.Array, Any], Shown]
 
 # Starts per round. Random actions end 1 episode in 70 per step, so that one round is the rule.
-ONE_IN = 32
-SPARE = 8
-WORD = 32  # bits
+ENVS_PER_START = 32
+SPARE_STARTS = 8
+WORD_BITS = 32  # bits
 
 
 class Ended(NamedTuple):
@@ -95,7 +95,7 @@ def _starts(begin: Begin, seeds: jax.Array, params: Any, shown: Shown) -> Shown:
 def _reset_in_rounds(begin: Begin, steps: Ended, params: Any) -> Shown:
     """Return the same, with no more starts sampled at once than a step is likely to need."""
     num_envs = len(steps.done)
-    count = min(num_envs, num_envs // ONE_IN + SPARE)
+    count = min(num_envs, num_envs // ENVS_PER_START + SPARE_STARTS)
     # One after the other is cheapest within one kernel, and slow where each operation is a kernel.
     search, take, put = (
         (_scan, _take_each, _put_each) if has_kernels() else (_search, _take, _scatter)
@@ -132,8 +132,8 @@ def _scatter(olds: Any, news: Any, places: jax.Array) -> Any:
 def _scan(ended: jax.Array, count: int) -> jax.Array:
     """Do the same as ``_search``, bit by bit of words."""
     size = ended.shape[0]
-    bits = jnp.pad(ended, (0, -size % WORD)).reshape(-1, WORD).astype(jnp.uint32)
-    words, half = bits << jnp.arange(WORD, dtype=jnp.uint32), WORD // 2
+    bits = jnp.pad(ended, (0, -size % WORD_BITS)).reshape(-1, WORD_BITS).astype(jnp.uint32)
+    words, half = bits << jnp.arange(WORD_BITS, dtype=jnp.uint32), WORD_BITS // 2
     while half:  # a reduction would be no simple operation
         words, half = compute_once(words[:, :half] | words[:, half:]), half // 2
     words = words[:, 0]
@@ -144,7 +144,7 @@ def _scan(ended: jax.Array, count: int) -> jax.Array:
         is_one, lowest = word != 0, word & (~word + 1)
         bit = jax.lax.population_count(lowest - 1).astype(jnp.int32)
         # Without a bit, what is written is written over.
-        place = jnp.where(is_one, index * WORD + bit, size)
+        place = jnp.where(is_one, index * WORD_BITS + bit, size)
         places = jax.lax.dynamic_update_index_in_dim(places, place, found, 0)
         word = jnp.where(is_one, word ^ lowest, _at(words, jnp.minimum(index + 1, last)))
         return jnp.where(is_one, index, index + 1), word, found + is_one.astype(jnp.int32), places

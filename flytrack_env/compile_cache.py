@@ -11,7 +11,7 @@ import jax
 from flytrack_env.files import user_cache_folder
 
 SWITCH = "FLYTRACK_COMPILE_CACHE"  # environment variable: 0 keeps nothing
-LARGEST_BYTES = 2**30  # every change of a program leaves its predecessor behind
+MAX_BYTES = 2**30  # every change of a program leaves its predecessor behind
 FOLDER, LEAST_S = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
 
 
@@ -28,7 +28,7 @@ def keep_compiled_programs() -> None:
     try:
         folder = user_cache_folder() / "compiled" / _processor()
         folder.mkdir(parents=True, exist_ok=True)
-        if sum(path.stat().st_size for path in folder.glob("*")) > LARGEST_BYTES:
+        if sum(path.stat().st_size for path in folder.glob("*")) > MAX_BYTES:
             shutil.rmtree(folder, ignore_errors=True)
     except (OSError, RuntimeError):  # no home, or a file that another process removes
         return

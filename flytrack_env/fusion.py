@@ -157,7 +157,7 @@ SIMPLE = frozenset(
     while xor flytrack_one_kernel
     """.split()  # noqa: SIM905, a table
 )
-MOST_FENCED = 64  # elements
+MAX_FENCED = 64  # elements
 SWITCH = "FLYTRACK_ONE_KERNEL"  # environment variable: 0 compiles without
 ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 
@@ -341,7 +341,7 @@ def _lower_kernel(ctx, *args, jaxpr, divided):  # type: ignore[no-untyped-def]
     # XLA's compiler of such a call aborts on an argument that nothing reads, and simplifies reads
     # away that JAX sees; it does on some constants, too. So one more result reads something of each
     # argument, and what is small, as parameters are, is fenced.
-    small = [i for i, aval in enumerate(ctx.avals_in) if 0 < aval.size <= MOST_FENCED]
+    small = [i for i, aval in enumerate(ctx.avals_in) if 0 < aval.size <= MAX_FENCED]
     given = dict(enumerate(args))
     if small:
         avals = [ctx.avals_in[i] for i in small]

@@ -4,14 +4,18 @@ import difflib
 import reprlib
 from collections.abc import Iterable, Sequence
 
-LONGEST_NAME = 60  # characters
-LONGEST_TEXT = 300
+MAX_NAME_LENGTH = 60  # characters
+MAX_TEXT_LENGTH = 300
 
 
 def quote_name(name: object) -> str:
     """Return a name: as it is, or shortened and quoted."""
     text = str(name)
-    return text if text.isprintable() and len(text) <= LONGEST_NAME else ascii(text[:LONGEST_NAME])
+    return (
+        text
+        if text.isprintable() and len(text) <= MAX_NAME_LENGTH
+        else ascii(text[:MAX_NAME_LENGTH])
+    )
 
 
 def quote_value(value: object) -> str:
@@ -24,7 +28,7 @@ def quote_value(value: object) -> str:
 
 def error_text(error: BaseException) -> str:
     """Return an exception's message on one line, shortened; it may quote the file's content."""
-    text = " ".join(str(error).split())[:LONGEST_TEXT]
+    text = " ".join(str(error).split())[:MAX_TEXT_LENGTH]
     return text if text.isprintable() else ascii(text)[1:-1]
 
 

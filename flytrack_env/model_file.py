@@ -26,7 +26,7 @@ UNITS = {
     "g": "m/s^2",
     "battery_drain_v_per_min": "V/min",
 }
-LARGEST_BYTES = 4 * 2**20
+MAX_BYTES = 4 * 2**20
 BATTERY = "battery"
 BESIDE = ("effects", "motion", BATTERY)  # parameters, or among them
 
@@ -45,9 +45,9 @@ def _object(where: str, value: Any) -> dict[str, Any]:
     return value
 
 
-LARGEST = float(np.finfo(np.float32).max)
-Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
-Above0 = Annotated[float, Meta(gt=1e-45, le=LARGEST)]  # what is smaller is 0 in float32
+MAX_FLOAT32 = float(np.finfo(np.float32).max)
+Number = Annotated[float, Meta(ge=-MAX_FLOAT32, le=MAX_FLOAT32)]
+Above0 = Annotated[float, Meta(gt=1e-45, le=MAX_FLOAT32)]  # what is smaller is 0 in float32
 
 
 class _BatteryFields(Fields):
@@ -114,7 +114,7 @@ def _read_effect(source: str, name: str, values: dict[str, Any]) -> Any:
 def _read_json(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file."""
     try:
-        data = json.loads(read_at_most(path, LARGEST_BYTES))
+        data = json.loads(read_at_most(path, MAX_BYTES))
     except OSError as error:
         raise ModelFileError(f"{path}: cannot be read: {error_text(error)}") from error
     except (

@@ -10,12 +10,12 @@ import jax
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import ROUNDING, USUAL_STEPS, Range, check_parameters
+from flytrack_env.effects import DEFAULT_DELAY_STEPS, ROUNDING, Range, check_parameters
 from flytrack_env.quaternion import Scalar
 from flytrack_env.resets import ResetParams
 from flytrack_env.rewards import RewardWeights
 from flytrack_env.tracks import Course
-from flytrack_env.tracks.track import LARGEST
+from flytrack_env.tracks.track import MAX_COORDINATE_M
 
 # Within these, numbers stay finite, attitudes unit quaternions and observations in their space;
 # wider than anything that flies. Effects and wrappers have ranges of their own.
@@ -30,12 +30,12 @@ RANGES: Mapping[str, Range] = {
     "model.g": Range(0.0, 1e3, "m/s^2"),
     "model.battery_drain_v_per_min": Range(-1e3, 1e3, "V/min"),
     "reset.course_fraction": Range(0.0, 1.0, "1"),
-    "reset.start_position_noise": Range(0.0, LARGEST, "m"),
-    "reset.start_height_noise": Range(0.0, LARGEST, "m"),
+    "reset.start_position_noise": Range(0.0, MAX_COORDINATE_M, "m"),
+    "reset.start_height_noise": Range(0.0, MAX_COORDINATE_M, "m"),
     "reset.start_yaw_noise_deg": Range(0.0, 180.0, "deg"),
     "reset.start_tilt_noise_deg": Range(0.0, 180.0, "deg"),
     "reset.start_charge_low": Range(0.0, 1.0, "1"),
-    "reset.course_offset": Range(0.0, LARGEST, "m"),
+    "reset.course_offset": Range(0.0, MAX_COORDINATE_M, "m"),
     "reset.course_speed": Range(0.0, 1e3, "m/s"),
     "reset.course_yaw_deg": Range(0.0, 180.0, "deg"),
     "reset.course_tilt_deg": Range(0.0, 180.0, "deg"),
@@ -45,7 +45,7 @@ RANGES: Mapping[str, Range] = {
     "reset.course_charge_low": Range(0.0, 1.0, "1"),
     **{f"reward.{name}": Range(-1e6, 1e6, "1") for name in RewardWeights._fields},
 }
-LEAST_GATES = 2
+MIN_GATES = 2
 DT_S = 0.01  # step of an environment
 UNIT_TOLERANCE = 1e-5  # of a norm
 
@@ -81,7 +81,7 @@ class EnvParams:
             """Return the parameters with some fields changed."""
             ...
 
-    def check(self, delay_steps: int = USUAL_STEPS) -> None:
+    def check(self, delay_steps: int = DEFAULT_DELAY_STEPS) -> None:
         """Raise ValueError, naming the field, for values that no episode can be flown with.
 
         For concrete values, as nothing can be refused under ``jit``. Any may be batched, as for
@@ -113,12 +113,14 @@ class EnvParams:
 def _check_course(course: Course) -> None:
     """Raise ValueError for invalid numbers, or one gate alone, whose passes would count twice."""
     num_gates = np.shape(course.gates.half_opening)[-1]
-    if num_gates < LEAST_GATES:
-        raise ValueError(f"course.gates: found {num_gates}, expected at least {LEAST_GATES}")
+    if num_gates < MIN_GATES:
+        raise ValueError(f"course.gates: found {num_gates}, expected at least {MIN_GATES}")
     for path, leaf in jax.tree_util.tree_leaves_with_path(course):
-        if not np.all(np.abs(leaf) <= LARGEST):
+        if not np.all(np.abs(leaf) <= MAX_COORDINATE_M):
             name = f"course{jax.tree_util.keystr(path)}"
-            raise ValueError(f"{name}: found {leaf}, expected finite numbers within +-{LARGEST:g}")
+            raise ValueError(
+                f"{name}: found {leaf}, expected finite numbers within +-{MAX_COORDINATE_M:g}"
+            )
     units = {
         "start_quat": course.start_quat,
         "gates.forward": course.gates.forward,

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from flytrack_env.battery import Battery
 from flytrack_env.dynamics import ModelParameters, advance, sensed
-from flytrack_env.effects import USUAL_STEPS, start_memories
+from flytrack_env.effects import DEFAULT_DELAY_STEPS, start_memories
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action, Drone
 
@@ -27,7 +27,7 @@ class Plant(ABC):
 
     dt: float | None = None
     battery: Battery | None = None
-    delay_steps: int = USUAL_STEPS
+    delay_steps: int = DEFAULT_DELAY_STEPS
 
     @abstractmethod
     def reset(self, drone: Drone, model: ModelParameters) -> Any:
@@ -62,7 +62,7 @@ class SimulatorState(NamedTuple):
 class Simulator(Plant):
     """The differentiable model: ``flytrack_env.dynamics`` with the model's effects."""
 
-    def __init__(self, delay_steps: int = USUAL_STEPS):
+    def __init__(self, delay_steps: int = DEFAULT_DELAY_STEPS):
         self.delay_steps = delay_steps
 
     def reset(self, drone: Drone, model: ModelParameters) -> SimulatorState:

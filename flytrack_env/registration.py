@@ -13,7 +13,7 @@ from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.messages import check_keywords
 from flytrack_env.multi_drone import MultiDroneRace, Opponent, Versus, idle
 from flytrack_env.multi_drone.ghosts import Ghost, time_optimal_ghost
-from flytrack_env.multi_drone.rules import MOST_DRONES
+from flytrack_env.multi_drone.rules import MAX_DRONES
 from flytrack_env.wrappers import ActionHistory, DomainRandomization, ObservationNoise
 
 
@@ -74,7 +74,7 @@ def make(env_id: str, **overrides: Any) -> EpisodicEnvironment:
 
 RACES = {
     "FlyTrackDuel-v0": range(2, 3),
-    "FlyTrackRace-v0": range(2, MOST_DRONES + 1),
+    "FlyTrackRace-v0": range(2, MAX_DRONES + 1),
 }  # numbers of drones
 
 

@@ -51,9 +51,9 @@ class ResetParams(NamedTuple):
 
 
 SIDEWAYS_FRACTION = 0.2
-VERTICAL_BELOW = 1e-3
-SHORTEST_TANGENT = 1e-3
-STILL_THRUST = -1.0
+MIN_HORIZONTAL = 1e-3
+MIN_TANGENT = 1e-3
+IDLE_THRUST = -1.0
 
 
 def sample_start(
@@ -78,8 +78,8 @@ def sample_start(
         draws.uniform("yaw_stick", -stick, stick),
         draws.uniform(
             "thrust",
-            choose(params.course_thrust_low, STILL_THRUST),
-            choose(params.course_thrust_high, STILL_THRUST),
+            choose(params.course_thrust_low, IDLE_THRUST),
+            choose(params.course_thrust_high, IDLE_THRUST),
         ),
     )
     lowest_v = model.battery.voltage(choose(params.course_charge_low, params.start_charge_low))
@@ -116,13 +116,13 @@ def _point_on_course(draws: Draws, gate_index: jax.Array, course: Course) -> tup
     s = draws.uniform("along", 0.0, LAST_SEGMENT_FRACTION)
     point, tangent = hermite_curve(before.centre, leave, gate.centre, meet, s)
     point, tangent = compute_once((point, tangent))
-    return point, compute_once(tangent.scale(1.0 / jnp.maximum(tangent.norm(), SHORTEST_TANGENT)))
+    return point, compute_once(tangent.scale(1.0 / jnp.maximum(tangent.norm(), MIN_TANGENT)))
 
 
 def _facing(direction: Vec3) -> Quaternion:
     """Return the level attitude that faces along a direction, the world's x if it is vertical."""
     horizontal = Vec3(direction.x, direction.y, 0.0).norm()
-    is_vertical = horizontal < VERTICAL_BELOW
+    is_vertical = horizontal < MIN_HORIZONTAL
     cosine = jnp.where(is_vertical, 1.0, direction.x / jnp.where(is_vertical, 1.0, horizontal))
     # Half-angle formulas; rounding can put the cosine just beyond 1.
     w = jnp.sqrt(jnp.maximum(0.5 * (1.0 + cosine), 0.0))

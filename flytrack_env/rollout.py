@@ -21,10 +21,10 @@ from flytrack_env.state import ACTION_SIZE, APPLIED_ACTION, STATE_SIZE
 ROW_SIZE = STATE_SIZE + ACTION_SIZE
 SHORT_ROW_SIZE = ROW_SIZE - 3
 EXPECTED = f"a plain numeric array of shape (T, {ROW_SIZE}) or (T, {SHORT_ROW_SIZE}) with T >= 1"
-MOST_STEPS = 2**21  # close to six hours at 100 Hz
-LARGEST_ITEM_BYTES = 8
-LARGEST_HEADER_BYTES = 2**16
-LARGEST_BYTES = LARGEST_HEADER_BYTES + MOST_STEPS * ROW_SIZE * LARGEST_ITEM_BYTES
+MAX_STEPS = 2**21  # close to six hours at 100 Hz
+MAX_ITEM_BYTES = 8
+MAX_HEADER_BYTES = 2**16
+MAX_BYTES = MAX_HEADER_BYTES + MAX_STEPS * ROW_SIZE * MAX_ITEM_BYTES
 
 
 class RolloutError(ValueError):
@@ -39,15 +39,15 @@ def save_rollout(path: str | Path, states: ArrayLike, actions: ArrayLike) -> Non
         actions: (T, 4); row t is the action commanded in state t.
 
     Raises:
-        RolloutError: wrong shapes, no steps or more than MOST_STEPS, or a number that is not
+        RolloutError: wrong shapes, no steps or more than MAX_STEPS, or a number that is not
             finite.
         OSError: the file cannot be written.
     """
     path = Path(path)
     states, actions = np.asarray(states), np.asarray(actions)
     steps = len(states) if states.ndim else 0
-    if steps > MOST_STEPS:
-        raise RolloutError(f"{path}: found {steps} steps, expected at most {MOST_STEPS}")
+    if steps > MAX_STEPS:
+        raise RolloutError(f"{path}: found {steps} steps, expected at most {MAX_STEPS}")
     for name, array, size in (("states", states, STATE_SIZE), ("actions", actions, ACTION_SIZE)):
         if array.shape != (steps, size) or steps == 0 or array.dtype.kind not in "fiu":
             found = f"{array.dtype} of shape {array.shape}"
@@ -70,11 +70,11 @@ def load_rollout(path: str | Path, allow_pickle: bool = False) -> tuple[np.ndarr
 
     Raises:
         RolloutError: missing file, not an ``.npy``, pickled objects unless allowed, another shape,
-            no steps or more than MOST_STEPS, a file cut short, or a number that is not finite.
+            no steps or more than MAX_STEPS, a file cut short, or a number that is not finite.
     """
     path = Path(path)
     try:
-        with open_file(path, LARGEST_BYTES) as file:
+        with open_file(path, MAX_BYTES) as file:
             is_pickled = _check_header(path, file, allow_pickle)
             file.seek(0)
             rows = np.load(file, allow_pickle=is_pickled)
@@ -129,13 +129,13 @@ def _check_header(path: Path, file: BinaryIO, allow_pickle: bool) -> bool:
             f"{path}: found pickled objects, expected {EXPECTED}; pickles run the code they hold, "
             "and are read only if allowed"
         )
-    if dtype.kind not in "fiu" or dtype.itemsize > LARGEST_ITEM_BYTES:
+    if dtype.kind not in "fiu" or dtype.itemsize > MAX_ITEM_BYTES:
         raise RolloutError(f"{path}: found an array of {quote_name(dtype)}, expected {EXPECTED}")
     if len(shape) != 2 or shape[1] not in (ROW_SIZE, SHORT_ROW_SIZE) or shape[0] < 1:
         raise RolloutError(f"{path}: found shape {quote_value(shape)}, expected {EXPECTED}")
-    if shape[0] > MOST_STEPS:
+    if shape[0] > MAX_STEPS:
         raise RolloutError(
-            f"{path}: found {quote_value(shape[0])} steps, expected at most {MOST_STEPS}"
+            f"{path}: found {quote_value(shape[0])} steps, expected at most {MAX_STEPS}"
         )
     return False
 

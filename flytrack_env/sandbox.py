@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 # characters of an exception's message, which a foreign file may have written
-LONGEST_MESSAGE = 1000
+MAX_MESSAGE_LENGTH = 1000
 RETURNED, RAISED = b"R", b"E"  # first byte of the output
 MEMORY_STATUS = Path("/proc/self/status")
 
@@ -136,7 +136,8 @@ def main() -> None:
             output.write(RETURNED + getattr(module, call["function"])(call["argument"], content))
         except BaseException as error:  # reported to the caller, whatever it is
             output.write(
-                RAISED + json.dumps([type(error).__name__, str(error)[:LONGEST_MESSAGE]]).encode()
+                RAISED
+                + json.dumps([type(error).__name__, str(error)[:MAX_MESSAGE_LENGTH]]).encode()
             )
 
 

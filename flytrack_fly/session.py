@@ -12,7 +12,7 @@ from flytrack_env.multi_drone import Path, RaceRules, is_put_out, place_on_grid
 from flytrack_env.quaternion import Vec3
 from flytrack_env.rendering import FlightLog, scene_row
 from flytrack_env.rendering.flight_log import GATE_INDEX, LAP_START, LAP_TIME, LAPS
-from flytrack_env.rollout import MOST_STEPS
+from flytrack_env.rollout import MAX_STEPS
 from flytrack_env.state import BATTERY, POSITION, STATE_SIZE
 from flytrack_env.terminations import Causes
 from flytrack_env.thrust import hover_action
@@ -77,7 +77,7 @@ class Session:
         self.ghost, self.is_race = ghost, is_race
         self.gate_ids = [gate.id for gate in track.gates]
         self.env = make("FlyTrack-v0", track=track, model=model, missed_gate="fly_on")
-        self.params = still_start(self.env.default_params, MOST_STEPS)  # the battery ends a flight
+        self.params = still_start(self.env.default_params, MAX_STEPS)  # the battery ends a flight
         self.step_s = float(self.params.dt)
         self._start = self.env.reset(jax.random.key(0), self.params)[1]
         if is_race:

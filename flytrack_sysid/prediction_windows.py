@@ -13,7 +13,7 @@ import numpy as np
 from jax.scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters, advance, body_rates, observe_rates, read_gyro
-from flytrack_env.effects import MOST_STEPS, ImuLatency, at_row, start_memories
+from flytrack_env.effects import MAX_DELAY_STEPS, ImuLatency, at_row, start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_sysid.log import FlightLog, usual_step
@@ -164,7 +164,7 @@ def _fly(model: ModelParameters, record: Record, gyro_b: jax.Array, windows: Win
     first = jax.tree.map(lambda leaf: leaf[0], record)
     applied = Action(*first.applied)
     start = measured_drone(first, applied, body_rates(applied, model.max_rate))
-    memories = start_memories(model.effects, start, MOST_STEPS)
+    memories = start_memories(model.effects, start, MAX_DELAY_STEPS)
     _, flown = jax.lax.scan(one, (start, memories), (record, windows.is_free, read_b))
     pos, vel, quat, gyro = jax.tree.map(lambda leaf: leaf[windows.ends - 1], flown)
     row, gyro_b = jax.tree.map(lambda leaf: leaf[windows.ends], (record, gyro_b))

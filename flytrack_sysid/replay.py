@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters, Moved, body_rates, move
-from flytrack_env.effects import MOST_STEPS, at_row, start_memories
+from flytrack_env.effects import MAX_DELAY_STEPS, at_row, start_memories
 from flytrack_env.fusion import one_kernel
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
@@ -71,7 +71,7 @@ class ReplayState(NamedTuple):
 def start_replay(model: ModelParameters, row: Record) -> ReplayState:
     """Return a state to begin with at a row at which a flight begins."""
     drone = measured_drone(row, Action(*row.applied), Vec3(*jnp.zeros_like(row.vel_w)))
-    memories = start_memories(model.effects, drone, MOST_STEPS)
+    memories = start_memories(model.effects, drone, MAX_DELAY_STEPS)
     return ReplayState(drone.applied, drone.rates_b, memories)
 
 
@@ -112,7 +112,7 @@ def replay(
         # batch.
         begun = before._replace(applied=Action(*row.applied))
         memories = where_true(
-            row.begins, start_memories(model.effects, begun, MOST_STEPS), state.memories
+            row.begins, start_memories(model.effects, begun, MAX_DELAY_STEPS), state.memories
         )
         memories = at_row(memories, row.time_s)
         moved = move(before, memories, Action(*row.command), row.step_s, model)

@@ -22,7 +22,12 @@ from flytrack_env.effects.base import (
 )
 from flytrack_env.effects.betaflight_loop import BETAFLIGHT_LOOP, BetaflightLoop
 from flytrack_env.effects.betaflight_rates import BETAFLIGHT_RATES, BetaflightRates
-from flytrack_env.effects.command_delay import COMMAND_DELAY, MOST_STEPS, USUAL_STEPS, CommandDelay
+from flytrack_env.effects.command_delay import (
+    COMMAND_DELAY,
+    DEFAULT_DELAY_STEPS,
+    MAX_DELAY_STEPS,
+    CommandDelay,
+)
 from flytrack_env.effects.grammar import Flight
 from flytrack_env.effects.ground_effect import GROUND_EFFECT, GroundEffect
 from flytrack_env.effects.gyro_bias import GYRO_BIAS, GyroBias
@@ -110,7 +115,7 @@ def effect_of(parameters: Any) -> Effect:
     return effect
 
 
-def check_parameters(parameters: Any, dt: Any, delay_steps: int = USUAL_STEPS) -> None:
+def check_parameters(parameters: Any, dt: Any, delay_steps: int = DEFAULT_DELAY_STEPS) -> None:
     """Raise ValueError for concrete values beyond what the effect can do.
 
     The message names effect and parameter.
@@ -152,11 +157,11 @@ def delay_steps_of(effects: tuple[Any, ...], dt: float) -> int:
     """
     longest_s = max((float(np.max(lasting_s(parameters))) for parameters in effects), default=0.0)
     needed = np.ceil((DRAWN_LONGER * longest_s + DRAWN_LATER_S) / dt * (1.0 - ROUNDING))
-    return int(np.clip(needed, USUAL_STEPS, MOST_STEPS))
+    return int(np.clip(needed, DEFAULT_DELAY_STEPS, MAX_DELAY_STEPS))
 
 
 def start_memories(
-    effects: tuple[Any, ...], drone: Drone, delay_steps: int = USUAL_STEPS
+    effects: tuple[Any, ...], drone: Drone, delay_steps: int = DEFAULT_DELAY_STEPS
 ) -> tuple[Any, ...]:
     """Return what the effects of a model remember when an episode begins; None for most.
 
@@ -274,11 +279,11 @@ def observe(
 
 __all__ = [
     "BY_NAME",
+    "DEFAULT_DELAY_STEPS",
     "EFFECTS",
     "LEARNED_LAW",
-    "MOST_STEPS",
+    "MAX_DELAY_STEPS",
     "STAGES",
-    "USUAL_STEPS",
     "AccelerometerBias",
     "AccelerometerScale",
     "ActualRates",

@@ -35,7 +35,7 @@ BOOST_SCALE, BOOST_HZ = 0.1, 15.0  # throttle_boost_cutoff
 STICK_US, JITTER = 500.0, 7.0  # feedforward_jitter_factor
 FF_RATE_LIMIT, NEAR_FULL = 90.0, 0.9  # feedforward_max_rate_limit
 YAW_HOLD, YAW_HOLD_S = 15.0, 0.1
-STILL = 1e-5  # of a stick, between two frames
+MIN_STICK_CHANGE = 1e-5  # of a stick, between two frames
 NONE_HZ = 1e5  # a filter that does nothing in a millisecond
 
 
@@ -277,7 +277,7 @@ def _received(
     """
     setpoint, reach = stick * full, jnp.abs(full)
     change = setpoint - frames.setpoint
-    is_still = jnp.abs(stick - frames.stick) < STILL
+    is_still = jnp.abs(stick - frames.stick) < MIN_STICK_CHANGE
     is_inside = jnp.abs(setpoint) < NEAR_FULL * reach
     was_still = frames.was_still > 0.5
     # A frame that repeats the last one is taken for a lost one, unless the one before did, too.

@@ -16,8 +16,8 @@ from flytrack_env.effects.base import (
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action, Drone
 
-USUAL_STEPS, MOST_STEPS = 4, 12  # commands remembered, by default and at most
-LONGEST_S, LONGEST_STEPS = (
+DEFAULT_DELAY_STEPS, MAX_DELAY_STEPS = 4, 12  # commands remembered, by default and at most
+MAX_DELAY_S, STEPS_PER_DELAY = (
     0.06,
     6,
 )  # of each parameter: all of them fit into the longest memory together
@@ -37,7 +37,7 @@ class CommandDelay(NamedTuple):
 PastCommands = tuple[Action, ...]  # those before the present one, the latest first
 
 
-def start(delay: CommandDelay, drone: Drone, num_steps: int = USUAL_STEPS) -> PastCommands:
+def start(delay: CommandDelay, drone: Drone, num_steps: int = DEFAULT_DELAY_STEPS) -> PastCommands:
     """Return the memory of a new episode, as if the applied action had always been commanded.
 
     Args:
@@ -109,9 +109,9 @@ COMMAND_DELAY = Effect(
     name="command_delay",
     parameters=CommandDelay,
     ranges={
-        "delay_s": Range(0.0, LONGEST_S, "s"),
-        "yaw_extra_s": Range(-LONGEST_S, LONGEST_S, "s"),
-        "thrust_extra_s": Range(-LONGEST_S, LONGEST_S, "s"),
+        "delay_s": Range(0.0, MAX_DELAY_S, "s"),
+        "yaw_extra_s": Range(-MAX_DELAY_S, MAX_DELAY_S, "s"),
+        "thrust_extra_s": Range(-MAX_DELAY_S, MAX_DELAY_S, "s"),
     },
     notable=dict.fromkeys(CommandDelay._fields, 0.005),
     equation=r"u_i(t) \leftarrow \frac{1}{\Delta t} "
@@ -119,7 +119,7 @@ COMMAND_DELAY = Effect(
     r"\quad \text{delay}_i = \max(0, \text{delay} + \text{extra}_i)",
     source="assumption: constant within a flight; the link comes first, then what the flight "
     "controller makes of the sticks",
-    max_steps=dict.fromkeys(CommandDelay._fields, LONGEST_STEPS),
+    max_steps=dict.fromkeys(CommandDelay._fields, STEPS_PER_DELAY),
     hooks={"command": _command},
     memory=Memory(start=start, remember=_remember),
     search=Search(

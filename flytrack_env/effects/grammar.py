@@ -22,9 +22,9 @@ from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Action
 from flytrack_env.validation import Fields, choose, convert
 
-TINY_SPEED = 0.3  # m/s: slower flight has no direction
-MOST_TERMS, MOST_FACTORS = 6, 2
-LARGEST = 1e6  # of any number in a law
+MIN_SPEED = 0.3  # m/s: slower flight has no direction
+MAX_TERMS, MAX_FACTORS = 6, 2
+MAX_NUMBER = 1e6  # of any number in a law
 XYZ = 3
 
 
@@ -266,7 +266,7 @@ class Term:
             return unit
         if self.frame == "world":
             return tuple(Vec3(*(axis.dot(one) for axis in moment.body_axes_w)) for one in unit)
-        speed = jnp.maximum(moment.airspeed_b.norm(), TINY_SPEED)
+        speed = jnp.maximum(moment.airspeed_b.norm(), MIN_SPEED)
         return (moment.airspeed_b.scale(1.0 / speed),)
 
     def signal(self, moment: Moment) -> Scalar:
@@ -338,13 +338,13 @@ def law_from_json(values: Any) -> Law:
         ValueError: what is not in the grammar, numbers that are not finite, a pole within the
             envelope; the message begins with the field.
     """
-    kind = Annotated[tuple[_TermFields, ...], Meta(min_length=1, max_length=MOST_TERMS)]
+    kind = Annotated[tuple[_TermFields, ...], Meta(min_length=1, max_length=MAX_TERMS)]
     terms = convert("", values, kind, field="law")
     return Law(tuple(_term(f"law[{index}]", term) for index, term in enumerate(terms)))
 
 
-Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
-StandardError = Annotated[float, Meta(ge=0.0, le=LARGEST)]
+Number = Annotated[float, Meta(ge=-MAX_NUMBER, le=MAX_NUMBER)]
+StandardError = Annotated[float, Meta(ge=0.0, le=MAX_NUMBER)]
 
 
 class _TermFields(Fields):
@@ -352,7 +352,7 @@ class _TermFields(Fields):
     frame: Literal["body", "world", "air"]
     coefficients: tuple[Number, Number, Number]
     standard_errors: tuple[StandardError, StandardError, StandardError]
-    factors: Annotated[tuple[dict[str, Any], ...], Meta(min_length=1, max_length=MOST_FACTORS)]
+    factors: Annotated[tuple[dict[str, Any], ...], Meta(min_length=1, max_length=MAX_FACTORS)]
 
     def __post_init__(self) -> None:
         if self.frame == "air" and any(self.coefficients[1:]):
@@ -371,7 +371,7 @@ def _term(where: str, term: _TermFields) -> Term:
 def _factor(where: str, value: dict[str, Any]) -> Factor:
     name = choose(f"{where}.shape", value.get("shape"), SHAPES)
     shape = SHAPES[name]
-    positive = Annotated[float, Meta(gt=0.0, le=LARGEST)]
+    positive = Annotated[float, Meta(gt=0.0, le=MAX_NUMBER)]
     numbers = [
         (number, positive if number in shape.positive else Number) for number in shape.numbers
     ]

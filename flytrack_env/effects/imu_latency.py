@@ -13,7 +13,7 @@ from flytrack_env.effects.base import (
     Search,
     StepContext,
 )
-from flytrack_env.effects.command_delay import USUAL_STEPS, late
+from flytrack_env.effects.command_delay import DEFAULT_DELAY_STEPS, late
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Drone
 
@@ -43,7 +43,7 @@ class PastReadings(NamedTuple):
 def start(latency: ImuLatency, drone: Drone, num_steps: int) -> PastReadings:
     """Return the memory of a new episode: rates that have always been held, and no forces."""
     still = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
-    size = min(num_steps, USUAL_STEPS) + 1
+    size = min(num_steps, DEFAULT_DELAY_STEPS) + 1
     none = (still,) * size
     return PastReadings(
         (drone.rates_b,) * size, none, none, none, jnp.ones_like(drone.battery_v, bool)
@@ -118,7 +118,7 @@ IMU_LATENCY = Effect(
     r"\boldsymbol{\omega}(t - \text{latency}), \quad "
     r"\mathbf{f}_\text{measured}(t) = \mathbf{f}(t - \text{latency})",
     source="assumption: the same for both sensors; what imu_offset adds is not late",
-    max_steps={"latency_s": USUAL_STEPS},
+    max_steps={"latency_s": DEFAULT_DELAY_STEPS},
     hooks={"gyro": _gyro, "accelerometer": _accelerometer},
     memory=Memory(start=start, remember=remember),
     search=Search(probes={"latency_s": (0.005, 0.01, 0.02, 0.03)}),

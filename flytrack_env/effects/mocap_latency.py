@@ -5,11 +5,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from flytrack_env.effects.base import Effect, Memory, Pose, Range, Search, StepContext
-from flytrack_env.effects.command_delay import MOST_STEPS, late
+from flytrack_env.effects.command_delay import MAX_DELAY_STEPS, late
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import Drone
 
-LONGEST_S = 0.12
+MAX_LATENCY_S = 0.12
 
 
 class MocapLatency(NamedTuple):
@@ -59,12 +59,12 @@ def remember(latency: MocapLatency, past: PastPoses, context: StepContext) -> Pa
 MOCAP_LATENCY = Effect(
     name="mocap_latency",
     parameters=MocapLatency,
-    ranges={"latency_s": Range(0.0, LONGEST_S, "s")},
+    ranges={"latency_s": Range(0.0, MAX_LATENCY_S, "s")},
     notable={"latency_s": 0.002},
     equation=r"(\mathbf{p}, \mathbf{v}, \mathbf{q})_\text{measured}(t) = "
     r"(\mathbf{p}, \mathbf{v}, \mathbf{q})(t - \text{latency})",
     source="assumption: the same for all three, linear between steps",
-    max_steps={"latency_s": MOST_STEPS},
+    max_steps={"latency_s": MAX_DELAY_STEPS},
     hooks={"pose": _pose},
     memory=Memory(start=start, remember=remember),
     search=Search(needs=("q", "w"), probes={"latency_s": (0.005, 0.01, 0.02, 0.03)}),

@@ -10,8 +10,8 @@ from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Drone
 
 AXES = ("roll", "pitch", "yaw")
-SHORTEST_S = 1e-5  # a lag below this is none: nothing at 100 Hz shows it
-SHORTEST_STEP_S = 1e-12  # at the beginning of a step nothing has changed yet
+MIN_LAG_S = 1e-5  # a lag below this is none: nothing at 100 Hz shows it
+MIN_STEP_S = 1e-12  # at the beginning of a step nothing has changed yet
 OBSERVED_SLOPE = 0.6  # of what a step's offset says of the slope; the gyro's noise is in it
 CRITICAL = 1e-6  # of the squared damping about 1: the series is exact to rounding
 
@@ -51,7 +51,7 @@ def start(loop: SecondOrderRates, drone: Drone) -> Turning:
 
 def _response(lag_s: Scalar, damping: Scalar, dt: Scalar) -> _Response:
     """Return the exponential of [[0, 1], [-wn^2, -2 zeta wn]] dt."""
-    is_lag = lag_s > SHORTEST_S
+    is_lag = lag_s > MIN_LAG_S
     frequency = 2.0 * damping / jnp.where(is_lag, lag_s, 1.0)
     decay = damping * frequency
     spread = frequency * frequency * (damping * damping - 1.0)
@@ -80,7 +80,7 @@ def _input(lag_s: Scalar, before: Scalar, now: Scalar, dt: Scalar, motion: Motio
     """
     if motion is not Motion.CONTINUOUS:
         return _Input(now, now, 0.0)
-    slope = (now - before) / jnp.maximum(dt, SHORTEST_STEP_S)
+    slope = (now - before) / jnp.maximum(dt, MIN_STEP_S)
     return _Input(before - lag_s * slope, now - lag_s * slope, slope)
 
 
@@ -97,7 +97,7 @@ def _turned(
         lag_s: Scalar, damping: Scalar, first: Scalar, new: Scalar, old: Scalar, slope: Scalar
     ) -> tuple[Scalar, Scalar]:
         left, given = _response(lag_s, damping, dt), _input(lag_s, first, new, dt, motion)
-        offset, change, is_lag = old - given.first, slope - given.slope, lag_s > SHORTEST_S
+        offset, change, is_lag = old - given.first, slope - given.slope, lag_s > MIN_LAG_S
         after = given.last + left.offset * offset + left.offset_of_slope * change
         slope_after = given.slope + left.slope_of_offset * offset + left.slope * change
         # Without a lag, nothing may change.
@@ -128,7 +128,7 @@ def observe(
     of the offset.
     """
     own = [
-        jnp.where(lag_s > SHORTEST_S, offset, 0.0)
+        jnp.where(lag_s > MIN_LAG_S, offset, 0.0)
         for lag_s, offset in zip(loop, offset_b, strict=False)
     ]
     held_b = Vec3(*own)

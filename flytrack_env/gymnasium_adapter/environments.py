@@ -22,7 +22,7 @@ RENDER_MODES, VECTOR_RENDER_MODES = ("human", "rgb_array"), ("rgb_array",)
 AUTORESET_MODES = AutoresetMode.NEXT_STEP.value, AutoresetMode.SAME_STEP.value
 SEED_WORDS = 4
 NONE_BEGAN = np.zeros(1, bool)
-MOST_STEPS = 2**32  # that a uint32 can count
+MAX_COUNT = 2**32  # that a uint32 can count
 
 
 class _Adapter:
@@ -341,7 +341,7 @@ class FlyTrackVectorEnv(_Adapter, gymnasium.vector.VectorEnv[np.ndarray, np.ndar
             has_ended,
             self._renderer is not None,
         )
-        self._count = (self._count + 1) % MOST_STEPS
+        self._count = (self._count + 1) % MAX_COUNT
         rewards, terminated, truncated, infos, final_info, final_masks = grouped.to_host()
         done = terminated | truncated
         self._log(scenes, done if has_ended is None else has_ended)

@@ -17,9 +17,9 @@ TRACK, BATTERY_V = "track", "battery_v"
 POSE_NAMES = ("position", "quaternion", "yaw_deg", "velocity", "gate_index")
 NAMES = (*POSE_NAMES, BATTERY_V, TRACK)
 UNIT_NORM_TOLERANCE = 1e-3
-LARGEST_SPEED = RANGES["reset.course_speed"].high
-LARGEST = float(np.finfo(np.float32).max)
-STILL_ROTORS = (0.0, 0.0, 0.0, -1.0)
+MAX_SPEED = RANGES["reset.course_speed"].high
+MAX_FLOAT32 = float(np.finfo(np.float32).max)
+IDLE_ROTORS = (0.0, 0.0, 0.0, -1.0)
 
 
 def check_names(options: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -64,7 +64,7 @@ def read_start(options: Mapping[str, Any], course: Course, battery: Battery) -> 
         drone[layout.POSITION] = _position(options, course)
         drone[layout.QUATERNION] = _quaternion(options, course)
         drone[layout.VELOCITY] = _velocity(options)
-        drone[layout.APPLIED_ACTION] = STILL_ROTORS
+        drone[layout.APPLIED_ACTION] = IDLE_ROTORS
         drone[layout.BATTERY] = battery.full_v
         start |= {"drone": drone, "gate_index": np.int32(_gate_index(options, course.num_gates))}
     return start
@@ -95,8 +95,8 @@ def _quaternion(options: Mapping[str, Any], course: Course) -> Any:
 
 def _velocity(options: Mapping[str, Any]) -> Any:
     velocity = _numbers(options, "velocity", 3) if "velocity" in options else np.zeros(3)
-    if not (abs(velocity) <= LARGEST_SPEED).all():
-        raise _error("velocity", options, f"at most {LARGEST_SPEED:g} m/s along every axis")
+    if not (abs(velocity) <= MAX_SPEED).all():
+        raise _error("velocity", options, f"at most {MAX_SPEED:g} m/s along every axis")
     return velocity
 
 
@@ -116,7 +116,11 @@ def _numbers(options: Mapping[str, Any], name: str, size: int) -> np.ndarray:
     except ValueError as error:  # ragged lists
         raise _error(name, options, expected) from error
     is_right_shape = values.shape == ((size,) if size else ())
-    if not is_right_shape or values.dtype.kind not in "fiu" or not (abs(values) < LARGEST).all():
+    if (
+        not is_right_shape
+        or values.dtype.kind not in "fiu"
+        or not (abs(values) < MAX_FLOAT32).all()
+    ):
         raise _error(name, options, expected)
     return values.astype(float)
 

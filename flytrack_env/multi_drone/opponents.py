@@ -11,7 +11,7 @@ from flytrack_env.observations import Entry
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.tracks import GateFrame
 
-MOST_SEEN = 3
+MAX_OBSERVED = 3
 OPPONENT = (
     Entry(
         "opponent_position",
@@ -44,7 +44,7 @@ class Standing(NamedTuple):
 
 def opponent_table(num_drones: int) -> tuple[Entry, ...]:
     """Return the observation's rows on opponents: the three nearest, or all if there are fewer."""
-    return OPPONENT * min(num_drones - 1, MOST_SEEN)
+    return OPPONENT * min(num_drones - 1, MAX_OBSERVED)
 
 
 def observe_opponents(
@@ -90,14 +90,14 @@ def _nearest(own: Standing, others: Sequence[Standing]) -> list[Standing]:
         return jnp.where(other.is_out, jnp.inf, apart.dot(apart))
 
     row = compute_once([(distance(other), other) for other in others])
-    for place in range(min(len(row) - 1, MOST_SEEN)):
+    for place in range(min(len(row) - 1, MAX_OBSERVED)):
         for i in reversed(range(place, len(row) - 1)):
             pair = (first, one), (second, other) = row[i], row[i + 1]
             is_wrong = (second < first) | ((second == first) & (other.progress > one.progress))
             row[i] = jax.tree.map(lambda a, b, swap=is_wrong: jnp.where(swap, b, a), *pair)
             row[i + 1] = jax.tree.map(lambda a, b, swap=is_wrong: jnp.where(swap, a, b), *pair)
         row = compute_once(row)
-    return [other for _, other in row[:MOST_SEEN]]
+    return [other for _, other in row[:MAX_OBSERVED]]
 
 
 def rank_of(own: Standing, others: Sequence[Standing]) -> jax.Array:

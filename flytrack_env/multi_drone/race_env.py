@@ -28,7 +28,7 @@ from flytrack_env.multi_drone.opponents import (
     rank_of,
 )
 from flytrack_env.multi_drone.rules import (
-    MOST_DRONES,
+    MAX_DRONES,
     RaceParams,
     RaceRules,
     check_apart,
@@ -42,7 +42,7 @@ from flytrack_env.randomness import Draws, check_key, seed_of, seeds_of
 from flytrack_env.state import Action, Drone
 
 CLEAR_OF_GHOSTS_M = 2.0
-PLACE_BITS = MOST_DRONES - 1  # of a random word: which drone of the race it is
+PLACE_BITS = MAX_DRONES - 1  # of a random word: which drone of the race it is
 
 
 class EntrantState(NamedTuple):

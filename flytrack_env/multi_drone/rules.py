@@ -7,7 +7,7 @@ import numpy as np
 from flytrack_env.params import EnvParams
 from flytrack_env.quaternion import Scalar
 
-MOST_DRONES = 8
+MAX_DRONES = 8
 DRAWN_SLOT = -1
 BOTH_OUT, RAMMER_OUT = 0, 1
 
@@ -41,8 +41,8 @@ class RaceParams(NamedTuple):
 
 def check_num_drones(num_drones: int) -> None:
     """Raise ValueError unless so many drones can race."""
-    if not isinstance(num_drones, int) or not 1 <= num_drones <= MOST_DRONES:
-        raise ValueError(f"num_drones: found {num_drones!r}, expected 1 to {MOST_DRONES}")
+    if not isinstance(num_drones, int) or not 1 <= num_drones <= MAX_DRONES:
+        raise ValueError(f"num_drones: found {num_drones!r}, expected 1 to {MAX_DRONES}")
 
 
 def check_rules(rules: RaceRules, num_drones: int) -> None:

@@ -14,7 +14,7 @@ from flytrack_env.tracks import Track, build_course
 DPI = 100
 LETTER_IN = 0.068  # width of a letter of a small text
 LABEL_SHARE, ARROW_SHARE = 0.026, 0.055  # of the larger extent
-SHORTEST_ARROW = 0.3  # of a unit vector: a direction seen more head-on than that has no arrow
+MIN_ARROW = 0.3  # of a unit vector: a direction seen more head-on than that has no arrow
 HEADROOM = 1.2  # of a colour scale, whose last colours are too pale for a line
 
 
@@ -57,7 +57,7 @@ def draw_gates(axes: Axes, track: Track, view: list[int]) -> None:
         for corners, colour in ((outer, PAPER_FRAME), (inner, PAPER_OPENING)):
             closed = np.concatenate([corners, corners[:1]])[:, view]
             axes.plot(*closed.T, color=colour, linewidth=2.2, solid_capstyle="butt", zorder=3)
-        if np.linalg.norm(forward[view]) > SHORTEST_ARROW:
+        if np.linalg.norm(forward[view]) > MIN_ARROW:
             tip = centre[view] + ARROW_SHARE * extent(track).max() * forward[view]
             axes.annotate("", xy=tip, xytext=tuple(centre[view]), arrowprops=arrow, zorder=4)
 

@@ -44,9 +44,9 @@ KINDS = ("flying", "standing")
 FILE_VERSION = 1
 TEXTS = ("track", "track_sha256", "kind", "model_name", "model_sha256")
 COPIED = ("track", "track_sha256", "kind", "model_name", "dt_s", "time_s", "found")
-LARGEST_BYTES = 16 * 2**20  # in the file, and unpacked: hours of flight
-LONGEST_S = 3600.0  # of a lap, or of one step
-BEYOND = 1e-6  # of a command beyond full stick: the solver's tolerance
+MAX_BYTES = 16 * 2**20  # in the file, and unpacked: hours of flight
+MAX_TIME_S = 3600.0  # of a lap, or of one step
+COMMAND_TOLERANCE = 1e-6  # of a command beyond full stick: the solver's tolerance
 
 
 class ReferenceFileError(ValueError):
@@ -173,7 +173,7 @@ def _check_arrays(data: dict[str, np.ndarray]) -> None:
             f"gate_times_s: found {quote_value(data['gate_times_s'])}, expected growing times, s"
         )
     most = np.abs(data["commands"]).max()
-    if most > 1.0 + BEYOND:
+    if most > 1.0 + COMMAND_TOLERANCE:
         raise ValueError(f"commands: found {most:.7g}, expected within [-1, 1]")
 
 
@@ -186,7 +186,7 @@ def _check_notes(notes: dict[str, Any]) -> None:
                 f"{name}: found {quote_value(notes[name])}, expected a {expected.__name__}"
             )
     for name in ("dt_s", "time_s"):
-        if not 0.0 < notes[name] < LONGEST_S:
+        if not 0.0 < notes[name] < MAX_TIME_S:
             raise ValueError(f"{name}: found {notes[name]}, expected seconds above 0")
     for name, known in (("version", (FILE_VERSION,)), ("kind", KINDS)):
         if notes[name] not in known:
@@ -204,7 +204,7 @@ def load_reference(path: str | Path) -> Reference:
     """
     path = Path(path)
     try:
-        data = load_npz(path, LARGEST_BYTES)
+        data = load_npz(path, MAX_BYTES)
         notes = json.loads(str(data.pop("notes")))
         _check_notes(notes)
         _check_arrays(data)

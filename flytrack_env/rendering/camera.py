@@ -4,7 +4,7 @@ import numpy as np
 
 from flytrack_env.scene import UP_W
 
-NEAREST_M = 0.15  # what is nearer to the camera is cut away
+NEAR_PLANE_M = 0.15  # what is nearer to the camera is cut away
 
 
 def unit(vector: np.ndarray, fallback: np.ndarray) -> np.ndarray:
@@ -50,9 +50,9 @@ class Camera:
         It is x, y, x, y, ... in pixels; empty if all of it is behind the camera.
         """
         depths = points_c[:, 2].tolist()
-        if max(depths) < NEAREST_M:
+        if max(depths) < NEAR_PLANE_M:
             return []
-        if min(depths) < NEAREST_M:
+        if min(depths) < NEAR_PLANE_M:
             points_c = _cut(points_c)
         return self.pixels(points_c).ravel().tolist()
 
@@ -61,9 +61,9 @@ def _cut(points_c: np.ndarray) -> np.ndarray:
     """Return the part (m, 3) in front of the nearest plane of a polygon (n, 3) that crosses it."""
     kept = []
     for start, end in zip(points_c, np.roll(points_c, -1, axis=0), strict=True):
-        is_seen = start[2] >= NEAREST_M
+        is_seen = start[2] >= NEAR_PLANE_M
         if is_seen:
             kept.append(start)
-        if is_seen != (end[2] >= NEAREST_M):
-            kept.append(start + (NEAREST_M - start[2]) / (end[2] - start[2]) * (end - start))
+        if is_seen != (end[2] >= NEAR_PLANE_M):
+            kept.append(start + (NEAR_PLANE_M - start[2]) / (end[2] - start[2]) * (end - start))
     return np.array(kept)

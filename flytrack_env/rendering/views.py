@@ -26,7 +26,7 @@ COLUMNS = (14, 78, 182, 262, 340, 460)  # left edge of each text above the chase
 MARGIN = 28  # around the bounds
 GRID_M = 5.0
 WIDE_M = 60.0  # a course of more than this, or of more than twice, has a grid that much wider
-SMALLEST_GATE = 26  # gates of a wide course are drawn larger than they are
+MIN_GATE_LENGTH = 26  # gates of a wide course are drawn larger than they are
 LABEL_DISTANCE = 11
 ARROW, DRONE_LENGTH = 18, 20
 # The drone's arrow, nose at +x, in units of its length.
@@ -35,7 +35,7 @@ ARROWHEAD = np.array([(0.6, 0.0), (-0.4, 0.38), (-0.2, 0.0), (-0.4, -0.38)])
 # The view from behind.
 FIELD_OF_VIEW_DEG = 80.0
 BEHIND_M, ABOVE_M = 2.0, 0.65
-LOWEST_M = 0.25  # of the camera above the floor
+MIN_CAMERA_HEIGHT_M = 0.25  # of the camera above the floor
 LOOK_AHEAD_M = 5.0
 # beyond the gate's centre, so that the view does not swing round as a gate is passed
 AIM_BEYOND_M = 3.0
@@ -74,7 +74,9 @@ class TopView:
         self._fit(low[:2], high[:2], width, height)
         self.half_edges_m = 0.5 * np.linalg.norm(gates.outer[:, 1] - gates.outer[:, 0], axis=1)
         self.pixel_m = PIXEL / self.scale
-        self.enlargement = max(1.0, SMALLEST_GATE * self.pixel_m / (2.0 * self.half_edges_m.min()))
+        self.enlargement = max(
+            1.0, MIN_GATE_LENGTH * self.pixel_m / (2.0 * self.half_edges_m.min())
+        )
         self.empty = Image.new("RGB", (width, height), scene.BACKGROUND)
         self._draw_course(low, high, gate_ids)
         # The trail of each flight that was drawn, and how many of its rows are in it.
@@ -208,7 +210,7 @@ class ChaseView:
         direction = unit(direction * np.array([1.0, 1.0, 0.5]), np.array([1.0, 0.0, 0.0]))
         drone_w = recent[-1, POSITION]
         eye_w = drone_w - BEHIND_M * direction + ABOVE_M * UP_W
-        eye_w[2] = max(eye_w[2], self.floor_m + LOWEST_M)
+        eye_w[2] = max(eye_w[2], self.floor_m + MIN_CAMERA_HEIGHT_M)
         forward = unit(drone_w + LOOK_AHEAD_M * direction - eye_w, direction)
         return Camera(eye_w, forward, self.centre_px, self.focal_px)
 

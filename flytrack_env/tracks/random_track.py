@@ -18,7 +18,7 @@ CROSSING_SHARE = 0.5
 MAX_ATTEMPTS = 300
 PLACING_TRIES = 100  # per gate
 GRID_DIGITS = 2  # positions in whole centimetres read well in a file
-LARGEST_SEED = 2**32 - 1
+MAX_SEED = 2**32 - 1
 
 
 def random_track(
@@ -89,8 +89,8 @@ def _check_arguments(
 def _words_of(key: jax.Array | int) -> list[int]:
     """Return the words of a concrete key."""
     if isinstance(key, (int, np.integer)):
-        if not 0 <= key <= LARGEST_SEED:
-            raise TrackError(f"key: found {key}, expected 0 to {LARGEST_SEED}")
+        if not 0 <= key <= MAX_SEED:
+            raise TrackError(f"key: found {key}, expected 0 to {MAX_SEED}")
         key = jax.random.key(np.uint32(key))
     if jax.numpy.issubdtype(key.dtype, jax.dtypes.prng_key):
         key = jax.random.key_data(key)

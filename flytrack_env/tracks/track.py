@@ -22,8 +22,8 @@ TRACK_FOLDER = Path(__file__).parent
 DIRECTIONS = {"+y": 1.0, "-y": -1.0}
 UNIT_NORM_TOLERANCE = 1e-3
 ROUNDING = 1e-12  # of a norm: a quaternion that is this close to a unit was not rounded for a file
-LARGEST_ID = 2**53  # float64 tells whole numbers apart below it
-LARGEST = 1e6  # m: beyond that, float32 positions are coarser than a drone
+MAX_ID = 2**53  # float64 tells whole numbers apart below it
+MAX_COORDINATE_M = 1e6  # m: beyond that, float32 positions are coarser than a drone
 
 
 class TrackError(ValueError):
@@ -174,7 +174,7 @@ def _parse(path: Path, text: str) -> Track:
     )
 
 
-Coordinate = Annotated[float, Meta(gt=-LARGEST, lt=LARGEST)]
+Coordinate = Annotated[float, Meta(gt=-MAX_COORDINATE_M, lt=MAX_COORDINATE_M)]
 Position = tuple[Coordinate, Coordinate, Coordinate]
 
 
@@ -216,9 +216,9 @@ class _Bounds(Fields):
 
 
 class _GateFields(_Pose):
-    id: Annotated[int, Meta(gt=-LARGEST_ID, lt=LARGEST_ID)]
+    id: Annotated[int, Meta(gt=-MAX_ID, lt=MAX_ID)]
     direction: Literal["+y", "-y"]
-    opening: Annotated[float, Meta(gt=0.0, lt=LARGEST)]
+    opening: Annotated[float, Meta(gt=0.0, lt=MAX_COORDINATE_M)]
     frame: Coordinate
 
     def __post_init__(self) -> None:

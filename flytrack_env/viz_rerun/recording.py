@@ -21,7 +21,7 @@ APP_ID = "flytrack_viz"
 # How the viewer opens.
 BEHIND_M = (-2.5, 0.0, 1.2)  # of the drone, in its level frame
 BESIDE, ALONG, ABOVE = 0.5, 0.12, 0.36  # of the middle of paths and gates, in sizes of them
-SMALLEST_M = 4.0  # of what a view of the course shows
+MIN_VIEW_M = 4.0  # of what a view of the course shows
 ANGLES = {f"{angle} angle [deg]": (f"orientation/{angle}",) for angle in ("roll", "pitch", "yaw")}
 FORCE = "force not explained [m/s²]"
 KEY = "key"  # entity of the colours' names
@@ -200,7 +200,7 @@ def make_blueprint(
     body = rrb.TextLogColumns(text_log_columns=[TextLogColumn(TextLogColumnKind.Body)])
     positions = np.concatenate([gates_w, *(writer.trajectory.positions for writer in writers)])
     low, high = positions.min(axis=0), positions.max(axis=0)
-    middle, size = 0.5 * (low + high), max(float(np.linalg.norm(high - low)), SMALLEST_M)
+    middle, size = 0.5 * (low + high), max(float(np.linalg.norm(high - low)), MIN_VIEW_M)
     # From the broad side.
     beside = (
         [BESIDE, ALONG] if np.ptp(positions[:, 1]) > np.ptp(positions[:, 0]) else [ALONG, -BESIDE]

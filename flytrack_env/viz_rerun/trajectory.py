@@ -13,7 +13,7 @@ from flytrack_env.tracks import Gate, Track
 GATE_OUTER_M, GATE_INNER_M = 2.7, 1.5
 GATE_COLUMNS = 8
 UNIT_NORM_TOLERANCE = 1e-3
-LARGEST_M = 1e30  # Rerun stores float32, where larger numbers are infinite
+MAX_FINITE = 1e30  # Rerun stores float32, where larger numbers are infinite
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ def track_of_gates(gates: np.ndarray, positions: np.ndarray) -> Track:
 
 def _normalise_poses(name: str, rows: np.ndarray, position: slice, quaternion: slice) -> None:
     """Refuse rows whose pose is not finite or not a rotation, and renormalise the rest in place."""
-    is_finite = (np.abs(rows[:, position]) < LARGEST_M).all(axis=1)
+    is_finite = (np.abs(rows[:, position]) < MAX_FINITE).all(axis=1)
     is_finite &= np.isfinite(rows[:, quaternion]).all(axis=1)
     if not is_finite.all():
         row = int(np.argmin(is_finite))

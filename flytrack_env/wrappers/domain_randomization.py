@@ -25,7 +25,7 @@ from flytrack_env.state import Action, Drone
 from flytrack_env.wrappers.base import Wrapper, WrapperError
 
 EFFECT_FACTORS = (1e-6, 1e6)
-LEFT_ALONE: Any = None  # in the place of a parameter's bound: not drawn
+NOT_DRAWN: Any = None  # in the place of a parameter's bound: not drawn
 
 
 class RandomizationParams(NamedTuple):
@@ -50,15 +50,15 @@ class RandomizationParams(NamedTuple):
     effect_factor_low: Scalar = 0.8
     effect_factor_high: Scalar = 1.2
     low: tuple[Any, ...] = (
-        CommandDelay(0.0, LEFT_ALONE, LEFT_ALONE),
+        CommandDelay(0.0, NOT_DRAWN, NOT_DRAWN),
         ThrustScale(0.85),
-        Wind(-3.0, -3.0, LEFT_ALONE, a_x=LEFT_ALONE, a_y=LEFT_ALONE, a_z=LEFT_ALONE),
+        Wind(-3.0, -3.0, NOT_DRAWN, a_x=NOT_DRAWN, a_y=NOT_DRAWN, a_z=NOT_DRAWN),
         LinearDrag(0.0, 0.0, 0.0),
     )
     high: tuple[Any, ...] = (
-        CommandDelay(0.02, LEFT_ALONE, LEFT_ALONE),
+        CommandDelay(0.02, NOT_DRAWN, NOT_DRAWN),
         ThrustScale(1.15),
-        Wind(3.0, 3.0, LEFT_ALONE, a_x=LEFT_ALONE, a_y=LEFT_ALONE, a_z=LEFT_ALONE),
+        Wind(3.0, 3.0, NOT_DRAWN, a_x=NOT_DRAWN, a_y=NOT_DRAWN, a_z=NOT_DRAWN),
         LinearDrag(0.5, 0.5, 0.3),
     )
 

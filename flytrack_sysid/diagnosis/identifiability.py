@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import BY_NAME, MOST_STEPS
+from flytrack_env.effects import BY_NAME, MAX_DELAY_STEPS
 from flytrack_env.plants import Simulator
 from flytrack_sysid.collect import states_flown
 from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, make_lanes, voltages_of
@@ -168,7 +168,7 @@ def _flown(
     vector: jax.Array, like: ModelParameters, starts: jax.Array, commands: jax.Array
 ) -> jax.Array:
     """Return the states of flights, (flights, steps, 21), each before its command."""
-    fly = partial(states_flown, Simulator(MOST_STEPS), from_vector(vector, like))
+    fly = partial(states_flown, Simulator(MAX_DELAY_STEPS), from_vector(vector, like))
     return jax.vmap(fly)(starts, commands)[:, :-1]
 
 

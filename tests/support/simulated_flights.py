@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import move, nominal_parameters, read_sensors, sensed
-from flytrack_env.effects import EFFECTS, MOST_STEPS
+from flytrack_env.effects import EFFECTS, MAX_DELAY_STEPS
 from flytrack_env.plants import Simulator, SimulatorState
 from flytrack_env.state import BATTERY, QUATERNION, Action, pack, unpack, unpack_action
 
@@ -15,7 +15,7 @@ NOMINAL = nominal_parameters()
 # Neutral effects change no bit (tests/contract/test_effects.py), so that a test may replace any of
 # them.
 ALL_NEUTRAL = NOMINAL.with_effects(*(effect.parameters() for effect in EFFECTS))
-_SIMULATOR = Simulator(MOST_STEPS)
+_SIMULATOR = Simulator(MAX_DELAY_STEPS)
 
 
 @jax.jit

@@ -68,7 +68,7 @@ def test_a_folder_that_has_grown_too_large_is_begun_afresh(config, monkeypatch):
     config.jax_compilation_cache_dir = None
     compile_cache.keep_compiled_programs()
     assert (folder / "old").exists()
-    monkeypatch.setattr(compile_cache, "LARGEST_BYTES", 4)
+    monkeypatch.setattr(compile_cache, "MAX_BYTES", 4)
     config.jax_compilation_cache_dir = None
     compile_cache.keep_compiled_programs()
     assert config.jax_compilation_cache_dir == str(folder)

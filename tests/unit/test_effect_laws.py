@@ -15,7 +15,7 @@ from benchmarks.hidden.flights import imu_readings
 from flytrack_bench.hidden import HiddenDrone
 from flytrack_env import effects
 from flytrack_env.dynamics import nominal_parameters
-from flytrack_env.effects.command_delay import LONGEST_STEPS, USUAL_STEPS
+from flytrack_env.effects.command_delay import DEFAULT_DELAY_STEPS, STEPS_PER_DELAY
 from flytrack_env.effects.translational_lift import HALF_SPEED
 from flytrack_env.env import FlyTrack
 from flytrack_env.observations import OBSERVATION
@@ -141,7 +141,7 @@ def test_a_hard_saturation_cuts_the_sticks_off(stick):
     assert saturated == pytest.approx(FULL_STICK * np.clip(stick, -0.6, 0.6), rel=1e-5)
 
 
-@pytest.mark.parametrize("steps", [0, 2, LONGEST_STEPS])
+@pytest.mark.parametrize("steps", [0, 2, STEPS_PER_DELAY])
 def test_a_delay_of_whole_steps_shifts_each_channel_by_its_own_and_none_is_early(
     steps,
 ):
@@ -195,10 +195,10 @@ def test_an_arm_in_any_direction_follows_the_rigid_body():
 
 def past(truth, before, steps):
     """Return the rows of so many steps ago; before the flight, there was one that stayed."""
-    known = np.concatenate([np.tile(before, (USUAL_STEPS, 1)), truth])
+    known = np.concatenate([np.tile(before, (DEFAULT_DELAY_STEPS, 1)), truth])
     rows = np.arange(len(known))
     return np.stack(
-        [np.interp(rows[USUAL_STEPS:] - steps, rows, column) for column in known.T], axis=1
+        [np.interp(rows[DEFAULT_DELAY_STEPS:] - steps, rows, column) for column in known.T], axis=1
     )
 
 
