@@ -18,7 +18,8 @@ from flytrack_env.fusion import compute_once, has_kernels, is_in_kernel, one_ker
 Shown = tuple[list[jax.Array], Any]  # observation, row by row, and state
 Begin = Callable[[jax.Array, Any], Shown]
 
-# Starts per round. Random actions end 1 episode in 70 per step, so that one round is the rule.
+# Starts per round: one for so many environments, and some to spare. Random actions end 1 episode in
+# 70 per step, so that one round is the rule.
 ENVS_PER_START = 32
 SPARE_STARTS = 8
 WORD_BITS = 32  # bits
@@ -50,7 +51,7 @@ def reset_if_ended(begin: Begin, step: Ended, params: Any) -> Shown:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def reset_ended(begin: Begin, steps: Ended, params: Any) -> Shown:
-    """Do the same for a batch with the same parameters; leaves (num_envs, ...)."""
+    """Return the same for a batch that shares its parameters; leaves (num_envs, ...)."""
 
     @custom_vmap
     def reset(steps: Ended, params: Any) -> Shown:
@@ -58,15 +59,15 @@ def reset_ended(begin: Begin, steps: Ended, params: Any) -> Shown:
 
     @reset.def_vmap
     def reset_batch(size: int, is_batched: Any, steps: Ended, params: Any) -> Any:
-        axes = jax.tree.map(lambda one: 0 if one else None, is_batched)
+        axes = jax.tree.map(lambda is_mapped: 0 if is_mapped else None, is_batched)
         if any(jax.tree.leaves(is_batched[1])):
-            found = jax.vmap(partial(_reset_all, begin), tuple(axes), axis_size=size)(steps, params)
+            shown = jax.vmap(partial(_reset_all, begin), tuple(axes), axis_size=size)(steps, params)
         else:  # a batch of batches, as one
-            own = jax.vmap(lambda step: step, (axes[0],), axis_size=size)(steps)
-            flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), own)
-            found = reset_ended(begin, flat, params)
-            found = jax.tree.map(lambda leaf: leaf.reshape(size, -1, *leaf.shape[1:]), found)
-        return found, jax.tree.map(lambda _: True, found)
+            batches = jax.vmap(lambda step: step, (axes[0],), axis_size=size)(steps)
+            flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batches)
+            shown = reset_ended(begin, flat, params)
+            shown = jax.tree.map(lambda leaf: leaf.reshape(size, -1, *leaf.shape[1:]), shown)
+        return shown, jax.tree.map(lambda _: True, shown)
 
     return reset(steps, params)
 
@@ -78,7 +79,7 @@ def _reset_ended_jvp(begin, primals, tangents):  # type: ignore[no-untyped-def]
 
 
 def _reset_all(begin: Begin, steps: Ended, params: Any) -> Shown:
-    """Return the same, with a start sampled for every environment."""
+    """Return what ``reset_ended`` does, with a start sampled for every environment."""
 
     def choose(old: jax.Array, start: jax.Array) -> jax.Array:
         return jnp.where(steps.done.reshape(-1, *[1] * (old.ndim - 1)), start, old)
@@ -93,7 +94,7 @@ def _starts(begin: Begin, seeds: jax.Array, params: Any, shown: Shown) -> Shown:
 
 
 def _reset_in_rounds(begin: Begin, steps: Ended, params: Any) -> Shown:
-    """Return the same, with no more starts sampled at once than a step is likely to need."""
+    """Return what ``reset_ended`` does, sampling as many starts at once as a step may need."""
     num_envs = len(steps.done)
     count = min(num_envs, num_envs // ENVS_PER_START + SPARE_STARTS)
     # One after the other is cheapest within one kernel, and slow where each operation is a kernel.
@@ -105,10 +106,10 @@ def _reset_in_rounds(begin: Begin, steps: Ended, params: Any) -> Shown:
         find, take, put = one_kernel(find), one_kernel(take), one_kernel(put)
 
     def reset_some(carry: Any) -> Any:
-        places, pending, shown = carry
-        starts = _starts(begin, take(steps.seed, places), params, shown)
+        indices, pending, shown = carry
+        starts = _starts(begin, take(steps.seed, indices), params, shown)
         news = compute_once((jnp.zeros(count, bool), starts))
-        pending, shown = put((pending, shown), news, places)
+        pending, shown = put((pending, shown), news, indices)
         return find(pending), pending, shown
 
     # A conditional would copy every leaf in each of its branches, which cost more than the reset.
@@ -124,13 +125,13 @@ def _search(ended: jax.Array, count: int) -> jax.Array:
     return jnp.nonzero(ended, size=count, fill_value=ended.shape[0])[0]
 
 
-def _scatter(olds: Any, news: Any, places: jax.Array) -> Any:
-    """Return ``olds`` with the starts in their places; those beyond the end are dropped."""
-    return jax.tree.map(lambda old, new: old.at[places].set(new, mode="drop"), olds, news)
+def _scatter(olds: Any, news: Any, indices: jax.Array) -> Any:
+    """Return ``olds`` with the starts at their indices; those beyond the end are dropped."""
+    return jax.tree.map(lambda old, new: old.at[indices].set(new, mode="drop"), olds, news)
 
 
 def _scan(ended: jax.Array, count: int) -> jax.Array:
-    """Do the same as ``_search``, bit by bit of words."""
+    """Return what ``_search`` does, by scanning 32-bit words for their set bits."""
     size = ended.shape[0]
     bits = jnp.pad(ended, (0, -size % WORD_BITS)).reshape(-1, WORD_BITS).astype(jnp.uint32)
     words, half = bits << jnp.arange(WORD_BITS, dtype=jnp.uint32), WORD_BITS // 2
@@ -140,14 +141,19 @@ def _scan(ended: jax.Array, count: int) -> jax.Array:
     last = words.shape[0] - 1
 
     def next_bit(carry: Any) -> Any:
-        index, word, found, places = carry
+        word_index, word, count_found, indices = carry
         is_one, lowest = word != 0, word & (~word + 1)
         bit = jax.lax.population_count(lowest - 1).astype(jnp.int32)
         # Without a bit, what is written is written over.
-        place = jnp.where(is_one, index * WORD_BITS + bit, size)
-        places = jax.lax.dynamic_update_index_in_dim(places, place, found, 0)
-        word = jnp.where(is_one, word ^ lowest, _at(words, jnp.minimum(index + 1, last)))
-        return jnp.where(is_one, index, index + 1), word, found + is_one.astype(jnp.int32), places
+        index = jnp.where(is_one, word_index * WORD_BITS + bit, size)
+        indices = jax.lax.dynamic_update_index_in_dim(indices, index, count_found, 0)
+        word = jnp.where(is_one, word ^ lowest, _at(words, jnp.minimum(word_index + 1, last)))
+        return (
+            jnp.where(is_one, word_index, word_index + 1),
+            word,
+            count_found + is_one.astype(jnp.int32),
+            indices,
+        )
 
     start = (jnp.int32(0), words[0], jnp.int32(0), jnp.full(count, size, jnp.int32))
     return jax.lax.while_loop(
@@ -159,30 +165,30 @@ def _at(values: jax.Array, index: Any) -> jax.Array:
     return jax.lax.dynamic_index_in_dim(values, index, keepdims=False)
 
 
-def _take_each(values: jax.Array, places: jax.Array) -> jax.Array:
-    """Do the same as ``_take``, one after the other."""
+def _take_each(values: jax.Array, indices: jax.Array) -> jax.Array:
+    """Return what ``_take`` does, in a loop over the indices."""
 
-    def take(number: Any, found: jax.Array) -> jax.Array:
-        value = _at(values, jnp.minimum(_at(places, number), values.shape[0] - 1))
-        return jax.lax.dynamic_update_index_in_dim(found, value, number, 0)
+    def take(number: Any, taken: jax.Array) -> jax.Array:
+        value = _at(values, jnp.minimum(_at(indices, number), values.shape[0] - 1))
+        return jax.lax.dynamic_update_index_in_dim(taken, value, number, 0)
 
-    return jax.lax.fori_loop(0, places.shape[0], take, jnp.zeros(places.shape, values.dtype))
+    return jax.lax.fori_loop(0, indices.shape[0], take, jnp.zeros(indices.shape, values.dtype))
 
 
-def _put_each(olds: Any, news: Any, places: jax.Array) -> Any:
-    """Do the same as ``_scatter``, one after the other; places beyond the end come last."""
-    size, last = len(olds[0]), len(places) - 1
+def _put_each(olds: Any, news: Any, indices: jax.Array) -> Any:
+    """Return what ``_scatter`` does, in a loop; indices beyond the end come last."""
+    size, last = len(olds[0]), len(indices) - 1
 
     def put(carry: Any) -> Any:
         number, olds = carry
-        place = _at(places, number)
+        index = _at(indices, number)
 
         def put_one(old: jax.Array, new: jax.Array) -> jax.Array:
-            return jax.lax.dynamic_update_index_in_dim(old, _at(new, number), place, 0)
+            return jax.lax.dynamic_update_index_in_dim(old, _at(new, number), index, 0)
 
         return number + 1, jax.tree.map(put_one, olds, news)
 
     def is_left(carry: Any) -> jax.Array:
-        return (carry[0] <= last) & (_at(places, jnp.minimum(carry[0], last)) < size)
+        return (carry[0] <= last) & (_at(indices, jnp.minimum(carry[0], last)) < size)
 
     return jax.lax.while_loop(is_left, put, (jnp.int32(0), olds))[1]

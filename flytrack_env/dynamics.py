@@ -75,7 +75,10 @@ class ModelParameters(NamedTuple):
             KeyError: no effect of that name.
         """
         neutral = effects.BY_NAME[name].parameters()
-        return next((found for found in self.effects if type(found) is type(neutral)), neutral)
+        return next(
+            (parameters for parameters in self.effects if type(parameters) is type(neutral)),
+            neutral,
+        )
 
 
 def nominal_parameters() -> ModelParameters:
@@ -193,8 +196,8 @@ def _forces(
     acc_w = axes[2].scale(thrust_acc) - Vec3(0.0, 0.0, params.g)
     if not effects.acts(params.effects, "force"):
         return acc_w, Vec3(jnp.zeros_like(thrust_acc), jnp.zeros_like(thrust_acc), thrust_acc)
-    still = Vec3(0.0, 0.0, 0.0)
-    beside_b = compute_once(effects.fold("force", params.effects, memories, still, context))
+    zero = Vec3(0.0, 0.0, 0.0)
+    beside_b = compute_once(effects.fold("force", params.effects, memories, zero, context))
     acc_w = acc_w + (
         axes[0].scale(beside_b.x) + axes[1].scale(beside_b.y) + axes[2].scale(beside_b.z)
     )

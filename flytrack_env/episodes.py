@@ -144,7 +144,10 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
 
     def __repr__(self) -> str:
         effects = (
-            ", ".join(effect_of(one).name for one in self.default_params.model.effects) or "none"
+            ", ".join(
+                effect_of(parameters).name for parameters in self.default_params.model.effects
+            )
+            or "none"
         )
         track, plant, size = (
             self.track.name,
@@ -311,9 +314,9 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         has_ended: Any = None,
     ) -> Step:
         """Return what ``step`` does, of an action (4,) and one random word."""
-        found = one_kernel(self._transition_or_reset)(
+        outcome = one_kernel(self._transition_or_reset)(
             seed, state, clip_action(action, self._dtype(state)), params, has_ended
         )
-        rows, final_rows, state, reward, flags, info = found
+        rows, final_rows, state, reward, flags, info = outcome
         info = {**info, **flags, "final_observation": jnp.stack(final_rows)}
         return jnp.stack(rows), state, reward, flags["terminated"], flags["truncated"], info

@@ -193,7 +193,7 @@ def _follow(
     at the one behind it.
     """
 
-    def one(race: Race, segment: tuple[jax.Array, ...]) -> tuple[Race, Any]:
+    def follow_step(race: Race, segment: tuple[jax.Array, ...]) -> tuple[Race, Any]:
         start_w, end_w = Vec3(*segment[0]), Vec3(*segment[1])
         first = cross_gate(race.gate, start_w, end_w, DRONE_RADIUS_M).fraction
         middle_w = start_w + (end_w - start_w).scale(first)
@@ -208,10 +208,10 @@ def _follow(
     start = start_race(first_gate, course)
     indices = jnp.arange(len(positions) - 1)
     _, (races, events, fractions) = jax.lax.scan(
-        one, start, (positions[:-1], positions[1:], indices)
+        follow_step, start, (positions[:-1], positions[1:], indices)
     )
     return (
-        jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), start, races),
+        jax.tree.map(lambda first, later: jnp.concatenate([first[None], later]), start, races),
         events,
         fractions,
     )
@@ -221,13 +221,13 @@ def _passes(
     races: Race, fractions: np.ndarray, positions: np.ndarray, num_gates: int
 ) -> tuple[Pass, ...]:
     """Return the gates passed, in order; of two in one step each has its own time and place."""
-    found = []
+    passes = []
     for step in np.flatnonzero(np.diff(races.gates_passed)):
         before = int(races.gates_passed[step])
         for nth in range(int(races.gates_passed[step + 1]) - before):
             fraction = float(fractions[step, nth])
             is_lap = (before + nth + 1) % num_gates == 0
-            found.append(
+            passes.append(
                 Pass(
                     row=int(step) + 1,
                     time_s=(float(step) + fraction) * STEP_S,
@@ -237,4 +237,4 @@ def _passes(
                     lap_time_s=float(races.lap_time_s[step + 1]) if is_lap else 0.0,
                 )
             )
-    return tuple(found)
+    return tuple(passes)

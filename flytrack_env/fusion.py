@@ -40,10 +40,10 @@ def compute_once(tree: Tree) -> Tree:
     """
     leaves, structure = jax.tree.flatten(tree)
     leaves = [jnp.asarray(leaf) for leaf in leaves]
-    places = [i for i, leaf in enumerate(leaves) if leaf.size and _is_number(leaf)]
-    if places:
-        fenced = _compute_once_p.bind(*(leaves[i] for i in places))
-        for i, leaf in zip(places, fenced, strict=True):
+    indices = [i for i, leaf in enumerate(leaves) if leaf.size and _is_number(leaf)]
+    if indices:
+        fenced = _compute_once_p.bind(*(leaves[i] for i in indices))
+        for i, leaf in zip(indices, fenced, strict=True):
             leaves[i] = leaf
     return jax.tree.unflatten(structure, leaves)
 
@@ -111,12 +111,16 @@ def _batch(leaves, axes):  # type: ignore[no-untyped-def]
 
 def _jvp(primals, tangents):  # type: ignore[no-untyped-def]
     # Derivatives are shared as values are. Of integers there are none.
-    moves = [
-        i for i, one in enumerate(tangents) if type(one) is not ad.Zero and one.dtype != float0
+    moving = [
+        i
+        for i, tangent in enumerate(tangents)
+        if type(tangent) is not ad.Zero and tangent.dtype != float0
     ]
-    fenced = _compute_once_p.bind(*(tangents[i] for i in moves)) if moves else []
-    found = dict(zip(moves, fenced, strict=True))
-    return _compute_once_p.bind(*primals), [found.get(i, one) for i, one in enumerate(tangents)]
+    fenced = _compute_once_p.bind(*(tangents[i] for i in moving)) if moving else []
+    fenced_at = dict(zip(moving, fenced, strict=True))
+    return _compute_once_p.bind(*primals), [
+        fenced_at.get(i, tangent) for i, tangent in enumerate(tangents)
+    ]
 
 
 def _transpose(cotangents, *leaves):  # type: ignore[no-untyped-def]
@@ -256,19 +260,20 @@ def _divided(kernel: ClosedJaxpr, used: Sequence[int], element: _Element) -> Clo
         used: indices of the batch's arguments that the kernel has.
     """
     dims = [element.dims[i] for i in used]
-    own = element._replace(
+    partial_element = element._replace(
         dims=tuple(dim if i in used else None for i, dim in enumerate(element.dims))
     )
 
     def part(*leaves: jax.Array) -> Any:
-        given = dict(zip(used, leaves, strict=True))
-        avals = enumerate(own.jaxpr.in_avals)
+        leaf_at = dict(zip(used, leaves, strict=True))
+        avals = enumerate(partial_element.jaxpr.in_avals)
         return _bind(
-            own.batch(), [given[i] if i in given else jnp.zeros(a.shape, a.dtype) for i, a in avals]
+            partial_element.batch(),
+            [leaf_at[i] if i in leaf_at else jnp.zeros(a.shape, a.dtype) for i, a in avals],
         )
 
     def partition(mesh: Any, arguments: Any, results: Any) -> tuple[Any, ...]:
-        shardings = [[one.sharding for one in shapes] for shapes in (results, arguments)]
+        shardings = [[shape.sharding for shape in shapes] for shapes in (results, arguments)]
         return mesh, part, *shardings
 
     def mapping(name: str, ndim: int, batch: int | None) -> ArrayMapping:
@@ -314,19 +319,19 @@ def _batch_kernel(args, axes, *, jaxpr, divided):  # type: ignore[no-untyped-def
 
 def _jvp_kernel(primals, tangents, *, jaxpr, divided):  # type: ignore[no-untyped-def]
     moves = [type(tangent) is not ad.Zero for tangent in tangents]
-    directions = [tangent for tangent, does in zip(tangents, moves, strict=True) if does]
+    directions = [tangent for tangent, is_moving in zip(tangents, moves, strict=True) if is_moving]
 
     def derivative(primals: Any, directions: Any) -> Any:
         def of_moving(*moving: Any) -> Any:
-            given = iter(moving)
+            moved_primals = iter(moving)
             return jaxpr_as_fun(jaxpr)(
                 *(
-                    next(given) if does else still
-                    for does, still in zip(moves, primals, strict=True)
+                    next(moved_primals) if is_moving else primal
+                    for is_moving, primal in zip(moves, primals, strict=True)
                 )
             )
 
-        moving = [one for one, does in zip(primals, moves, strict=True) if does]
+        moving = [primal for primal, is_moving in zip(primals, moves, strict=True) if is_moving]
         return jax.jvp(of_moving, moving, directions)[1]
 
     # Apart, since a batch of directions has one result.
@@ -342,20 +347,20 @@ def _lower_kernel(ctx, *args, jaxpr, divided):  # type: ignore[no-untyped-def]
     # away that JAX sees; it does on some constants, too. So one more result reads something of each
     # argument, and what is small, as parameters are, is fenced.
     small = [i for i, aval in enumerate(ctx.avals_in) if 0 < aval.size <= MAX_FENCED]
-    given = dict(enumerate(args))
+    argument_at = dict(enumerate(args))
     if small:
         avals = [ctx.avals_in[i] for i in small]
         fenced = _lower(
-            _fence, ctx.replace(avals_in=avals, avals_out=avals), *(given[i] for i in small)
+            _fence, ctx.replace(avals_in=avals, avals_out=avals), *(argument_at[i] for i in small)
         )
-        given |= dict(zip(small, fenced, strict=True))
+        argument_at |= dict(zip(small, fenced, strict=True))
 
     def reading(*leaves: jax.Array) -> list[jax.Array]:
         read = [leaf.ravel()[0].astype(jnp.float32) for leaf in leaves if leaf.size]
         return [*jaxpr_as_fun(jaxpr)(*leaves), sum(read, jnp.float32(0.0))]
 
     calling = ctx.replace(avals_out=[*ctx.avals_out, core.ShapedArray((), jnp.float32)])
-    *results, _ = _lower(jax.jit(reading), calling, *given.values())
+    *results, _ = _lower(jax.jit(reading), calling, *argument_at.values())
     call = results[0].owner
     call.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(
         {name: ir.StringAttr.get(value) for name, value in ATTRIBUTES.items()}

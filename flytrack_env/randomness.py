@@ -67,9 +67,9 @@ def seed_of(key: jax.Array) -> jax.Array:
     return seed
 
 
-def seeds_of(word: jax.Array, places: jax.Array) -> jax.Array:
+def seeds_of(word: jax.Array, indices: jax.Array) -> jax.Array:
     """Return random words, uint32, of a single one: one for each index of an environment."""
-    return mix(word + places.astype(jnp.uint32) * jnp.uint32(GOLDEN_RATIO_32))
+    return mix(word + indices.astype(jnp.uint32) * jnp.uint32(GOLDEN_RATIO_32))
 
 
 def next_word(word: jax.Array) -> jax.Array:

@@ -124,10 +124,10 @@ def make_versus(
     """
     race = make_race(race_id, num_drones, "first", **arguments)
     if opponents is None:
-        delays_s = {place: GHOST_DELAY_S * (place - 1) for place in range(1, num_drones)}
+        delays_s = {index: GHOST_DELAY_S * (index - 1) for index in range(1, num_drones)}
         ghosts = {
-            place: time_optimal_ghost(race.env.track, delay_s)
-            for place, delay_s in delays_s.items()
+            index: time_optimal_ghost(race.env.track, delay_s)
+            for index, delay_s in delays_s.items()
         }
         race = MultiDroneRace(race.env, num_drones, "first", ghosts)
         opponents = [idle(race)] * len(ghosts)

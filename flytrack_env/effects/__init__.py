@@ -127,13 +127,13 @@ def check_parameters(parameters: Any, dt: Any, delay_steps: int = DEFAULT_DELAY_
     effect = effect_of(parameters)
     for name, bounds in effect.ranges.items():
         value = np.asarray(getattr(parameters, name))
-        longest = np.inf
+        max_delay_s = np.inf
         if name in effect.max_steps:  # what the other delays of the effect leave
-            others = lasting_s(parameters) - np.maximum(value, 0.0)
-            longest = delay_steps * np.asarray(dt, float) - others
-        high = np.minimum(bounds.high, longest)
+            other_delays_s = lasting_s(parameters) - np.maximum(value, 0.0)
+            max_delay_s = delay_steps * np.asarray(dt, float) - other_delays_s
+        high = np.minimum(bounds.high, max_delay_s)
         if not np.all((value >= bounds.low) & (value <= high * (1.0 + ROUNDING))):
-            reason = f" at steps of {dt} s" if np.any(longest < bounds.high) else ""
+            reason = f" at steps of {dt} s" if np.any(max_delay_s < bounds.high) else ""
             expected = f"{bounds.low:g} to {np.min(high):g} {bounds.unit}{reason}"
             raise ValueError(f"{effect.name}.{name}: found {value}, expected {expected}")
 
@@ -207,12 +207,12 @@ def respond(
     effects: tuple[Any, ...], memories: tuple[Any, ...], lagged: Any, context: CommandContext
 ) -> tuple[Any, tuple[Any, ...]]:
     """Return the applied action at the end of a span of the step, and the effects' memories."""
-    found = list(memories)
-    for place, parameters in enumerate(effects):
+    later = list(memories)
+    for index, parameters in enumerate(effects):
         hook = effect_of(parameters).hooks.get("respond")
         if hook is not None:
-            lagged, found[place] = hook(parameters, memories[place], lagged, context)
-    return lagged, tuple(found)
+            lagged, later[index] = hook(parameters, memories[index], lagged, context)
+    return lagged, tuple(later)
 
 
 def fold_rates(
@@ -231,8 +231,8 @@ def fold_rates(
     rates = [context.first_input_b]
     for index, (parameters, memory) in enumerate(zip(effects, memories, strict=True)):
         first_b = first_rates[index] if first_rates else rates[-1]
-        seen = context._replace(first_input_b=first_b)
-        rates.append(fold("rates", (parameters,), (memory,), rates[-1], seen))
+        effect_context = context._replace(first_input_b=first_b)
+        rates.append(fold("rates", (parameters,), (memory,), rates[-1], effect_context))
     return tuple(rates)
 
 
@@ -251,10 +251,10 @@ def remember(
     """
     later = []
     for parameters, memory, *inputs_b in zip(effects, memories, first_rates, rates, strict=False):
-        kept = effect_of(parameters).memory
-        if kept and kept.remember:
-            seen = context._replace(rate_inputs_b=tuple(inputs_b))
-            memory = kept.remember(parameters, memory, seen)
+        memory_kind = effect_of(parameters).memory
+        if memory_kind and memory_kind.remember:
+            effect_context = context._replace(rate_inputs_b=tuple(inputs_b))
+            memory = memory_kind.remember(parameters, memory, effect_context)
         later.append(memory)
     return tuple(later)
 
@@ -268,13 +268,13 @@ def observe(
         offset_b: measured rates minus the model's.
         dt: since the last measurement, s.
     """
-    found = []
+    corrected = []
     for parameters, memory in zip(reversed(effects), reversed(memories), strict=True):
-        kept = effect_of(parameters).memory
-        if kept and kept.observe:
-            memory, offset_b = kept.observe(parameters, memory, offset_b, dt)
-        found.append(memory)
-    return tuple(reversed(found)), offset_b
+        memory_kind = effect_of(parameters).memory
+        if memory_kind and memory_kind.observe:
+            memory, offset_b = memory_kind.observe(parameters, memory, offset_b, dt)
+        corrected.append(memory)
+    return tuple(reversed(corrected)), offset_b
 
 
 __all__ = [

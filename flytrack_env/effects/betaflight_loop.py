@@ -192,7 +192,7 @@ class Turn(NamedTuple):
     motors: Array
 
 
-class Given(NamedTuple):
+class SubstepInputs(NamedTuple):
     """What the substeps under one frame share.
 
     Attributes:
@@ -254,16 +254,16 @@ def _lowpass(
     correction = 1.0 / (2.0 ** (1.0 / len(stages)) - 1.0) ** 0.5
     cutoff_hz = jnp.where(cutoff_hz > 0.0, cutoff_hz * correction, NONE_HZ)
     turns = 2.0 * jnp.pi * cutoff_hz * dt
-    fade, found = jnp.exp(-turns), []
+    fade, filtered = jnp.exp(-turns), []
     offsets = [stage - target for stage in stages]
-    for place in range(len(stages)):
+    for index in range(len(stages)):
         share: Scalar = 1.0
-        left: Scalar = 0.0
-        for back in range(place + 1):
-            left = left + share * offsets[place - back]
+        remainder: Scalar = 0.0
+        for back in range(index + 1):
+            remainder = remainder + share * offsets[index - back]
             share = share * turns / (back + 1)
-        found.append(target + fade * left)
-    return tuple(found)
+        filtered.append(target + fade * remainder)
+    return tuple(filtered)
 
 
 def _received(
@@ -305,9 +305,9 @@ def _throttled(
 ) -> tuple[Throttle, Scalar, Scalar]:
     """Return the throttle's filters a substep later, the throttle, and its boost of the loop."""
     level = _lowpass(throttle.smooth, stick, loop.throttle_hz, 0.5 * dt)[-1]
-    rest = 1.0 - level
-    speed = jnp.abs(level - throttle.last) / dt * rest * rest
-    speed = jnp.where(level > throttle.last, 0.5 * speed * rest, speed)
+    headroom = 1.0 - level
+    speed = jnp.abs(level - throttle.last) / dt * headroom * headroom
+    speed = jnp.where(level > throttle.last, 0.5 * speed * headroom, speed)
     boost = loop.anti_gravity_gain * throttle.speed[-1]
     later = Throttle(
         _lowpass(throttle.smooth, stick, loop.throttle_hz, dt),
@@ -352,69 +352,75 @@ def _damped(
     first = _lowpass(axes.dterm[:1], gyro, cutoff_hz, dt)[0]
     second = _lowpass(axes.dterm[1:], first, loop.dterm_lpf2_static_hz, dt)[0]
     slope = (axes.dterm[1] - second) / dt
-    most = jnp.maximum(d_max / jnp.where(d > 0.0, d, jnp.inf), 1.0)
+    max_gain = jnp.maximum(d_max / jnp.where(d > 0.0, d, jnp.inf), 1.0)
     d_range = _lowpass(axes.d_range, slope, D_MAX_HZ, dt)
     jerk = jnp.maximum(jnp.abs(d_range[-1]), D_MAX_ADVANCE * jnp.abs(feedforward))
-    d_boost = _lowpass(axes.d_boost, 1.0 + (most - 1.0) * D_MAX_SCALE * jerk, D_BOOST_HZ, dt)
+    d_boost = _lowpass(axes.d_boost, 1.0 + (max_gain - 1.0) * D_MAX_SCALE * jerk, D_BOOST_HZ, dt)
     breakpoint = (loop.tpa_breakpoint - 1e3) * 1e-3
-    less = loop.tpa_rate / PERCENT / (1.0 - breakpoint) * jnp.maximum(level - breakpoint, 0.0)
-    term = D_SCALE * d * slope * jnp.minimum(d_boost[-1], most) * (1.0 - less)
+    attenuation = (
+        loop.tpa_rate / PERCENT / (1.0 - breakpoint) * jnp.maximum(level - breakpoint, 0.0)
+    )
+    term = D_SCALE * d * slope * jnp.minimum(d_boost[-1], max_gain) * (1.0 - attenuation)
     return term, ((first, second), d_range, d_boost)
 
 
-def _controlled(state: Turn, given: Given, level: Scalar, boost: Scalar) -> tuple[Axes, Array]:
+def _controlled(
+    state: Turn, inputs: SubstepInputs, level: Scalar, boost: Scalar
+) -> tuple[Axes, Array]:
     """Return the axes a substep later, and what they ask of the mixer, (3,)."""
-    axes, loop, dt = state.axes, given.loop, given.dt
+    axes, loop, dt = state.axes, inputs.loop, inputs.dt
     limits, factors = _like(SUM_LIMITS, state.rates), _like(I_FACTORS, state.rates)
-    setpoint = _lowpass(axes.setpoint, given.setpoint, loop.sticks_hz, 0.5 * dt)[-1]
-    feedforward = _lowpass(axes.feedforward, given.feedforward, loop.sticks_hz, 0.5 * dt)[-1]
+    setpoint = _lowpass(axes.setpoint, inputs.setpoint, loop.sticks_hz, 0.5 * dt)[-1]
+    feedforward = _lowpass(axes.feedforward, inputs.feedforward, loop.sticks_hz, 0.5 * dt)[-1]
     gyro = _filtered_gyro(loop, axes.gyro, state.rates, level, dt)
     error = setpoint - gyro
     damping, filters = _damped(loop, axes, gyro, feedforward, level, dt)
     # The integral halts while the setpoint changes fast, and grows faster while the throttle does.
     relax = _lowpass((axes.relax,), setpoint, loop.iterm_relax_cutoff, dt)[0]
     halted = jnp.where(IS_YAW, 1.0, jnp.maximum(1.0 - jnp.abs(setpoint - relax) / RELAX_DEG_S, 0.0))
-    own_boost = jnp.where(IS_YAW, 0.0, boost)
-    gain = (I_SCALE * factors * loop.axes("i") + ANTI_GRAVITY_I * own_boost) * halted
-    most = I_SHARE * limits
-    integral = jnp.clip(axes.integral + gain * error * dt, -most, most)
+    axis_boost = jnp.where(IS_YAW, 0.0, boost)
+    gain = (I_SCALE * factors * loop.axes("i") + ANTI_GRAVITY_I * axis_boost) * halted
+    max_integral = I_SHARE * limits
+    integral = jnp.clip(axes.integral + gain * error * dt, -max_integral, max_integral)
     p_hz = jnp.where(IS_YAW, loop.yaw_lowpass_hz, NONE_HZ)
     p_term = _lowpass((axes.p,), P_SCALE * loop.axes("p") * error, p_hz, dt)[0]
     calm = jnp.maximum(jnp.abs(setpoint) / ANTI_GRAVITY_DEG_S, 1.0)
-    asked = p_term * (1.0 + ANTI_GRAVITY_P * own_boost / calm) + integral + damping
-    asked = jnp.clip(asked + F_SCALE * loop.axes("f") * feedforward, -limits, limits)
+    demand = p_term * (1.0 + ANTI_GRAVITY_P * axis_boost / calm) + integral + damping
+    demand = jnp.clip(demand + F_SCALE * loop.axes("f") * feedforward, -limits, limits)
     later = Axes(
-        _lowpass(axes.setpoint, given.setpoint, loop.sticks_hz, dt),
-        _lowpass(axes.feedforward, given.feedforward, loop.sticks_hz, dt),
+        _lowpass(axes.setpoint, inputs.setpoint, loop.sticks_hz, dt),
+        _lowpass(axes.feedforward, inputs.feedforward, loop.sticks_hz, dt),
         gyro,
         *filters,
         relax,
         p_term,
         integral,
     )
-    return later, asked
+    return later, demand
 
 
-def _mixed(loop: BetaflightLoop, asked: Array, throttle: Throttle, level: Scalar) -> Array:
+def _mixed(loop: BetaflightLoop, demand: Array, throttle: Throttle, level: Scalar) -> Array:
     """Return the motors' commands, (4,) shares of full; the axes come before the throttle."""
     boost = loop.throttle_boost * BOOST_SCALE
     level = jnp.clip(level + boost * (level - throttle.slow), 0.0, 1.0)
     linear = loop.thrust_linear / PERCENT
     level = level / (1.0 + (linear - 0.5 * linear * linear) * (1.0 - level) ** 2)
-    mix = sum(one * signs for one, signs in zip(asked, _like(SIGNS, asked), strict=True))
-    none = jnp.zeros_like(level)
-    high, low = reduce(jnp.maximum, mix, none), reduce(jnp.minimum, mix, none)
-    fits = 1.0 / jnp.maximum(high - low, 1.0)
-    outputs = jnp.clip(level, -low * fits, 1.0 - high * fits) + fits * mix
-    bent = outputs * (1.0 + linear * (1.0 - outputs) ** 2)
-    return loop.idle + (1.0 - loop.idle) * jnp.clip(bent, 0.0, 1.0)
+    mix = sum(
+        axis_demand * signs for axis_demand, signs in zip(demand, _like(SIGNS, demand), strict=True)
+    )
+    zero = jnp.zeros_like(level)
+    high, low = reduce(jnp.maximum, mix, zero), reduce(jnp.minimum, mix, zero)
+    scale = 1.0 / jnp.maximum(high - low, 1.0)
+    outputs = jnp.clip(level, -low * scale, 1.0 - high * scale) + scale * mix
+    linearized = outputs * (1.0 + linear * (1.0 - outputs) ** 2)
+    return loop.idle + (1.0 - loop.idle) * jnp.clip(linearized, 0.0, 1.0)
 
 
-def _turned(state: Turn, given: Given, motors: Array) -> Array:
+def _turned(state: Turn, inputs: SubstepInputs, motors: Array) -> Array:
     """Return the body rates a substep later, deg/s, at whose end motors are as fast as given."""
-    loop, both, signs = given.loop, (motors, state.motors), _like(SIGNS, motors)
+    loop, both, signs = inputs.loop, (motors, state.motors), _like(SIGNS, motors)
     thrusts = sum(
-        collective_thrust(_action_of(speeds, loop), given.battery_v, given.thrust_coeffs)
+        collective_thrust(_action_of(speeds, loop), inputs.battery_v, inputs.thrust_coeffs)
         for speeds in both
     )
     thrusts = 0.125 * loop.health * thrusts  # of a motor, the mean of the substep
@@ -425,23 +431,23 @@ def _turned(state: Turn, given: Given, motors: Array) -> Array:
     x, y, z = state.rates
     # The midpoint rule turns roll and pitch by an angle; Euler's would feed a fast yaw until it
     # overflows.
-    half = 0.5 * given.dt * loop.precession * PER_DEGREE * z
+    half = 0.5 * inputs.dt * loop.precession * PER_DEGREE * z
     turned = jnp.stack([x - half * (2.0 * y + half * x), y + half * (2.0 * x - half * y)]) / (
         1.0 + half * half
     )
     rates = jnp.concatenate([turned, z[None]])
-    change = given.dt * loop.arms * torques + jnp.where(IS_YAW, spun, 0.0)
+    change = inputs.dt * loop.arms * torques + jnp.where(IS_YAW, spun, 0.0)
     return rates + change / PER_DEGREE
 
 
-def _substep(state: Turn, given: Given) -> Turn:
+def _substep(state: Turn, inputs: SubstepInputs) -> Turn:
     """Return the state a substep later under the same frames."""
-    loop, dt = given.loop, given.dt
-    throttle, level, boost = _throttled(loop, state.throttle, given.throttle, dt)
-    axes, asked = _controlled(state, given, level, boost)
+    loop, dt = inputs.loop, inputs.dt
+    throttle, level, boost = _throttled(loop, state.throttle, inputs.throttle, dt)
+    axes, demand = _controlled(state, inputs, level, boost)
     follow = 1.0 - jnp.exp(-dt / loop.motor_s)
-    motors = state.motors + follow * (_mixed(loop, asked, throttle, level) - state.motors)
-    return Turn(_turned(state, given, motors), axes, throttle, motors)
+    motors = state.motors + follow * (_mixed(loop, demand, throttle, level) - state.motors)
+    return Turn(_turned(state, inputs, motors), axes, throttle, motors)
 
 
 def _respond(
@@ -457,34 +463,34 @@ def _respond(
     )
     if begin == 0.0:  # a frame of the receiver comes with the step
         frames = _received(loop, frames, jnp.stack(acting[:3]), full, context.dt)
-    given = Given(
+    inputs = SubstepInputs(
         loop,
         frames.setpoint,
         frames.feedforward,
         0.5 * (acting.thrust + 1.0),
-        tuple(context.thrust_coeffs[place] for place in range(6)),
+        tuple(context.thrust_coeffs[index] for index in range(6)),
         context.drone.battery_v,
         context.dt / NUM_SUBSTEPS,
     )
 
     @one_kernel
-    def substeps(state: Turn, given: Given) -> Turn:
-        return jax.lax.fori_loop(0, num_substeps, lambda _, state: _substep(state, given), state)
+    def substeps(state: Turn, inputs: SubstepInputs) -> Turn:
+        return jax.lax.fori_loop(0, num_substeps, lambda _, state: _substep(state, inputs), state)
 
     rates = full * jnp.stack(context.drone.applied[:3])
-    moved = substeps(Turn(rates, *memory[1:]), given)
+    moved = substeps(Turn(rates, *memory[1:]), inputs)
     sticks = moved.rates / jnp.where(full, full, 1.0)
     share = jnp.sqrt(sum(loop.health * moved.motors**2) / 4.0)
-    found = Action(sticks[0], sticks[1], sticks[2], _action_of(share, loop))
+    response = Action(sticks[0], sticks[1], sticks[2], _action_of(share, loop))
     is_there = (loop.roll_arm > 0.0) & (loop.pitch_arm > 0.0)
-    applied = Action(*(jnp.where(is_there, *pair) for pair in zip(found, lagged, strict=True)))
+    applied = Action(*(jnp.where(is_there, *pair) for pair in zip(response, lagged, strict=True)))
     return applied, Loop(frames, *moved[1:])
 
 
 def observe(loop: BetaflightLoop, memory: Loop, offset_b: Vec3, dt: Scalar) -> tuple[Loop, Vec3]:
     """Return the memory with gyro filters moved to the measured rates, and the rates' offset."""
     step, axes = jnp.stack(offset_b) / PER_DEGREE, memory.axes
-    axes = axes._replace(gyro=axes.gyro + step, dterm=tuple(one + step for one in axes.dterm))
+    axes = axes._replace(gyro=axes.gyro + step, dterm=tuple(stage + step for stage in axes.dterm))
     return memory._replace(axes=axes), offset_b
 
 

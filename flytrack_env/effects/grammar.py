@@ -218,8 +218,8 @@ class Factor:
     def at(self, moment: Moment) -> Scalar:
         """Return its value."""
         shape = SHAPES[self.shape]
-        given = moment if shape.of_moment else QUANTITIES[self.quantity].of(moment)
-        return shape.at(given, *self.numbers)
+        argument = moment if shape.of_moment else QUANTITIES[self.quantity].of(moment)
+        return shape.at(argument, *self.numbers)
 
     def text(self) -> str:
         """Return its formula."""
@@ -265,7 +265,9 @@ class Term:
         if self.frame == "body":
             return unit
         if self.frame == "world":
-            return tuple(Vec3(*(axis.dot(one) for axis in moment.body_axes_w)) for one in unit)
+            return tuple(
+                Vec3(*(axis.dot(direction) for axis in moment.body_axes_w)) for direction in unit
+            )
         speed = jnp.maximum(moment.airspeed_b.norm(), MIN_SPEED)
         return (moment.airspeed_b.scale(1.0 / speed),)
 
@@ -282,10 +284,10 @@ class Term:
             spread: by how many standard errors each coefficient is larger.
         """
         signal, total = self.signal(moment), Vec3(0.0, 0.0, 0.0)
-        for place, one in enumerate(self.basis(moment)):
-            if self.coefficients[place] or self.standard_errors[place]:
-                size = self.coefficients[place] + spread * self.standard_errors[place]
-                total = total + one.scale(size * signal)
+        for index, direction in enumerate(self.basis(moment)):
+            if self.coefficients[index] or self.standard_errors[index]:
+                size = self.coefficients[index] + spread * self.standard_errors[index]
+                total = total + direction.scale(size * signal)
         return total
 
     def text(self) -> str:
@@ -304,7 +306,7 @@ class Law:
 
     def uses(self, quantity: str) -> bool:
         """Return whether any term looks at a quantity."""
-        return any(one.quantity == quantity for term in self.terms for one in term.factors)
+        return any(factor.quantity == quantity for term in self.terms for factor in term.factors)
 
     def text(self) -> str:
         """Return its formula, a line a term."""
@@ -320,11 +322,11 @@ class Law:
                 "standard_errors": list(term.standard_errors),
                 "factors": [
                     {
-                        "quantity": one.quantity,
-                        "shape": one.shape,
-                        **dict(zip(SHAPES[one.shape].numbers, one.numbers, strict=True)),
+                        "quantity": factor.quantity,
+                        "shape": factor.shape,
+                        **dict(zip(SHAPES[factor.shape].numbers, factor.numbers, strict=True)),
                     }
-                    for one in term.factors
+                    for factor in term.factors
                 ],
             }
             for term in self.terms
@@ -389,7 +391,7 @@ def _factor(where: str, value: dict[str, Any]) -> Factor:
 def _check_power(where: str, quantity: str, exponent: float, offset: float) -> None:
     """Raise ValueError for an exponent beyond the list, or a pole where a drone can fly."""
     if exponent not in EXPONENTS:
-        expected = ", ".join(f"{one:g}" for one in EXPONENTS)
+        expected = ", ".join(f"{allowed:g}" for allowed in EXPONENTS)
         raise ValueError(f"{where}.exponent: found {exponent:g}, expected one of {expected}")
     low, high = QUANTITIES[quantity].low + offset, QUANTITIES[quantity].high + offset
     if exponent < 0.0 and low <= 0.0 <= high:

@@ -42,9 +42,9 @@ class PastReadings(NamedTuple):
 
 def start(latency: ImuLatency, drone: Drone, num_steps: int) -> PastReadings:
     """Return the memory of a new episode: rates that have always been held, and no forces."""
-    still = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
+    zero = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
     size = min(num_steps, DEFAULT_DELAY_STEPS) + 1
-    none = (still,) * size
+    none = (zero,) * size
     return PastReadings(
         (drone.rates_b,) * size, none, none, none, jnp.ones_like(drone.battery_v, bool)
     )

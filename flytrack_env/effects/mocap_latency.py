@@ -38,7 +38,10 @@ def _same_sign(quat: Quaternion, like: Quaternion) -> Quaternion:
 
 def _pose(latency: MocapLatency, past: PastPoses, pose: Pose, dt: Scalar) -> Pose:
     """Return the mean of the poses between which the delayed time lies, by their nearness."""
-    poses = (pose, *(one._replace(quat=_same_sign(one.quat, pose.quat)) for one in past))
+    poses = (
+        pose,
+        *(past_pose._replace(quat=_same_sign(past_pose.quat, pose.quat)) for past_pose in past),
+    )
 
     def mean(*vectors: tuple[Scalar, ...]) -> list[Scalar]:
         return [late(parts, latency.latency_s, dt) for parts in zip(*vectors, strict=True)]

@@ -23,11 +23,11 @@ class QuadraticDrag(NamedTuple):
 
 def _force(drag: QuadraticDrag, memory: None, force_b: Vec3, context: ForceContext) -> Vec3:
     airspeed_b = context.airspeed_b
-    whole = drag.shared * airspeed_b.norm()
-    own = 1.0 - drag.shared
+    shared_speed = drag.shared * airspeed_b.norm()
+    axis_share = 1.0 - drag.shared
     coefficients = zip((drag.k_x, drag.k_y, drag.k_z), airspeed_b, strict=True)
     return force_b - Vec3(
-        *(k * (whole + own * jnp.abs(speed)) * speed for k, speed in coefficients)
+        *(k * (shared_speed + axis_share * jnp.abs(speed)) * speed for k, speed in coefficients)
     )
 
 

@@ -45,8 +45,8 @@ class _Response(NamedTuple):
 
 def start(loop: SecondOrderRates, drone: Drone) -> Turning:
     """Return the memory of an episode that begins: a rate that has been held."""
-    still = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
-    return Turning(drone.rates_b, still)
+    zero = Vec3(*(jnp.zeros_like(rate) for rate in drone.rates_b))
+    return Turning(drone.rates_b, zero)
 
 
 def _response(lag_s: Scalar, damping: Scalar, dt: Scalar) -> _Response:
@@ -61,8 +61,8 @@ def _response(lag_s: Scalar, damping: Scalar, dt: Scalar) -> _Response:
     fade = jnp.exp(-decay * dt)
     even = jnp.where(spread > 0.0, 0.5 * (slow + fast), fade * jnp.cos(size * dt))
     odd = jnp.where(spread > 0.0, 0.5 * (slow - fast), fade * jnp.sin(size * dt)) / size
-    found = (even + decay * odd, odd, -frequency * frequency * odd, even - decay * odd)
-    return _Response(*(jnp.where(is_lag, value, 0.0) for value in found))
+    elements = (even + decay * odd, odd, -frequency * frequency * odd, even - decay * odd)
+    return _Response(*(jnp.where(is_lag, value, 0.0) for value in elements))
 
 
 class _Input(NamedTuple):
@@ -96,10 +96,10 @@ def _turned(
     def follow(
         lag_s: Scalar, damping: Scalar, first: Scalar, new: Scalar, old: Scalar, slope: Scalar
     ) -> tuple[Scalar, Scalar]:
-        left, given = _response(lag_s, damping, dt), _input(lag_s, first, new, dt, motion)
-        offset, change, is_lag = old - given.first, slope - given.slope, lag_s > MIN_LAG_S
-        after = given.last + left.offset * offset + left.offset_of_slope * change
-        slope_after = given.slope + left.slope_of_offset * offset + left.slope * change
+        response, drive = _response(lag_s, damping, dt), _input(lag_s, first, new, dt, motion)
+        offset, change, is_lag = old - drive.first, slope - drive.slope, lag_s > MIN_LAG_S
+        after = drive.last + response.offset * offset + response.offset_of_slope * change
+        slope_after = drive.slope + response.slope_of_offset * offset + response.slope * change
         # Without a lag, nothing may change.
         return jnp.where(is_lag, after, new), jnp.where(is_lag, slope_after, 0.0)
 
@@ -127,13 +127,15 @@ def observe(
     Rates become the measured ones, and slopes come nearer to theirs. Axes without a lag hold none
     of the offset.
     """
-    own = [
+    held = [
         jnp.where(lag_s > MIN_LAG_S, offset, 0.0)
         for lag_s, offset in zip(loop, offset_b, strict=False)
     ]
-    held_b = Vec3(*own)
-    seen = Turning(memory.rates_b + held_b, memory.slopes_b + held_b.scale(OBSERVED_SLOPE / dt))
-    return seen, offset_b - held_b
+    held_b = Vec3(*held)
+    corrected = Turning(
+        memory.rates_b + held_b, memory.slopes_b + held_b.scale(OBSERVED_SLOPE / dt)
+    )
+    return corrected, offset_b - held_b
 
 
 SECOND_ORDER_RATES = Effect(

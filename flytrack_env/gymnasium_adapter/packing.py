@@ -20,26 +20,26 @@ HOST_DTYPES = {"f": np.float64, "i": np.int64, "u": np.int64, "b": np.bool_}
 
 
 class Layout(NamedTuple):
-    """Structure of a pytree, dtypes of its matrices, and the place of each leaf.
+    """Structure of a pytree, dtypes of its matrices, and the slot of each leaf.
 
     Attributes:
-        places: a leaf's shape, matrix, first row, and the row after its last.
+        slots: a leaf's shape, matrix, first row, and the row after its last.
     """
 
     structure: Any
     dtypes: tuple[Any, ...]
-    places: tuple[tuple[tuple[int, ...], int, int, int], ...]
+    slots: tuple[tuple[tuple[int, ...], int, int, int], ...]
 
 
 @cache  # so that equal layouts are one object, which compiled functions compare at once
 def _layout(structure: Any, forms: tuple[tuple[tuple[int, ...], Any], ...]) -> Layout:
     dtypes = tuple(dict.fromkeys(dtype for _, dtype in forms))
-    ends, places = [0] * len(dtypes), []
+    ends, slots = [0] * len(dtypes), []
     for shape, dtype in forms:
         matrix = dtypes.index(dtype)
         first, ends[matrix] = ends[matrix], ends[matrix] + math.prod(shape)
-        places.append((shape, matrix, first, ends[matrix]))
-    return Layout(structure, dtypes, tuple(places))
+        slots.append((shape, matrix, first, ends[matrix]))
+    return Layout(structure, dtypes, tuple(slots))
 
 
 @jax.tree_util.register_dataclass
@@ -57,7 +57,7 @@ class Packed:
         """Return the batch that was packed, leaves (num_envs, ...)."""
         rows = (
             (shape, self.matrices[matrix][first:end])
-            for shape, matrix, first, end in self.layout.places
+            for shape, matrix, first, end in self.layout.slots
         )
         leaves = [part.T.reshape(-1, *shape) for shape, part in rows]
         return jax.tree.unflatten(self.layout.structure, leaves)
@@ -69,7 +69,7 @@ class Packed:
         ]
         leaves = [
             arrays[matrix][first:end].T.reshape(-1, *shape) if shape else arrays[matrix][first]
-            for shape, matrix, first, end in self.layout.places
+            for shape, matrix, first, end in self.layout.slots
         ]
         return jax.tree.unflatten(self.layout.structure, leaves)
 
@@ -80,7 +80,7 @@ def pack(batch: Any) -> Packed:
     layout = _layout(structure, tuple((leaf.shape[1:], leaf.dtype) for leaf in leaves))
     columns: list[list[jax.Array]] = [[] for _ in layout.dtypes]
     # The fence: a concatenation would compute each of its parts again for every element.
-    for leaf, (_, matrix, *_) in zip(compute_once(leaves), layout.places, strict=True):
+    for leaf, (_, matrix, *_) in zip(compute_once(leaves), layout.slots, strict=True):
         columns[matrix].append(leaf.reshape(leaf.shape[0], -1).T)
     return Packed(tuple(jnp.concatenate(parts) for parts in columns), layout)
 

@@ -52,17 +52,17 @@ def begin(
         words: of their keys, (num_envs, KEY_WORDS).
         start: as of ``options.read_start``, the same for all.
     """
-    own = _params_of(params)
+    unpacked = _params_of(params)
 
     def begin_one(words: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
         seed = seed_of(_make_key(words))
-        drone, gate_index = env.sample_start(seed, own)
+        drone, gate_index = env.sample_start(seed, unpacked)
         if "drone" in start:
             drone, gate_index = unpack(start["drone"]), start["gate_index"]
         if "battery_v" in start:
             drone = drone._replace(battery_v=start["battery_v"])
-        state = env.begin(drone, gate_index, own, seed)
-        return state, env.observe(None, state, None, own), _scene(env, state)
+        state = env.begin(drone, gate_index, unpacked, seed)
+        return state, env.observe(None, state, None, unpacked), _scene(env, state)
 
     states, observations, scenes = jax.vmap(begin_one)(words)
     return pack(states), observations, scenes
@@ -76,11 +76,11 @@ def step(
 
     Return states, observations, scenes, and (rewards, terminated, truncated, info).
     """
-    own = _params_of(params)
+    unpacked = _params_of(params)
 
     def step_one(state: Any, action: jax.Array) -> tuple[Any, ...]:
-        observation, state, reward, terminated, info = env.step_env(None, state, action, own)
-        outcome = reward, terminated, env.is_truncated(state, own), info
+        observation, state, reward, terminated, info = env.step_env(None, state, action, unpacked)
+        outcome = reward, terminated, env.is_truncated(state, unpacked), info
         return state, observation, _scene(env, state), outcome
 
     after, observations, scenes, outcomes = jax.vmap(step_one)(states.unpack(), actions)
@@ -110,8 +110,8 @@ def step_batch(
             before.
     """
     key = jax.random.fold_in(_make_key(words), count)
-    found = env.step_batch(key, states.unpack(), actions, _params_of(params), has_ended)
-    observations, after, rewards, terminated, truncated, info = found
+    outcome = env.step_batch(key, states.unpack(), actions, _params_of(params), has_ended)
+    observations, after, rewards, terminated, truncated, info = outcome
     final_observations = info["final_observation"] if has_ended is None else None
     info = {name: value for name, value in info.items() if name not in NOT_INFO}
     grouped = jax.vmap(_group)(rewards, terminated, truncated, info, has_ended)
@@ -195,10 +195,10 @@ class Simulation:
 
     def make_renderer(self) -> Any:
         """Return a renderer with the ids of the track's gates, or indices on any other course."""
-        course, own = self.params.course, self.env.default_params.course
-        is_own = jax.tree.all(jax.tree.map(np.array_equal, course, own))
+        course, default = self.params.course, self.env.default_params.course
+        is_default = jax.tree.all(jax.tree.map(np.array_equal, course, default))
         ids = [gate.id for gate in self.env.track.gates]
-        return make_renderer(course, ids if is_own else range(course.num_gates))
+        return make_renderer(course, ids if is_default else range(course.num_gates))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Simulation":
         return self
@@ -214,8 +214,8 @@ def _check_shapes(params: EnvParams, default: EnvParams) -> None:
     params = params.replace(course=default.course)
     if jax.tree.structure(params) != jax.tree.structure(default):  # type: ignore[operator]  # jaxlib's stub has no !=
         return  # other effects, say
-    found = jax.tree_util.tree_leaves_with_path(params)
-    for (path, leaf), expected in zip(found, jax.tree.leaves(default), strict=True):
+    leaves = jax.tree_util.tree_leaves_with_path(params)
+    for (path, leaf), expected in zip(leaves, jax.tree.leaves(default), strict=True):
         if np.shape(leaf) != np.shape(expected):
             name = f"params{jax.tree_util.keystr(path)}"
             raise ValueError(f"{name}: found shape {np.shape(leaf)}, expected {np.shape(expected)}")

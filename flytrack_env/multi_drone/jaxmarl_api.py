@@ -30,12 +30,17 @@ class JaxMarlRace(MultiAgentEnv):
     def __init__(self, race: MultiDroneRace, params: RaceParams | None = None) -> None:
         super().__init__(num_agents=race.num_drones)
         self.race, self.params = race, race.default_params if params is None else params
-        self.agents = [f"drone_{place}" for place in range(race.num_drones)]
-        seen, flown = race.observation_space(), race.action_space()
+        self.agents = [f"drone_{index}" for index in range(race.num_drones)]
+        observation_space, action_space = race.observation_space(), race.action_space()
         self.observation_spaces = {
-            one: spaces.Box(seen.low, seen.high, seen.shape) for one in self.agents
+            agent: spaces.Box(
+                observation_space.low, observation_space.high, observation_space.shape
+            )
+            for agent in self.agents
         }
-        self.action_spaces = {one: spaces.Box(-1.0, 1.0, flown.shape) for one in self.agents}
+        self.action_spaces = {
+            agent: spaces.Box(-1.0, 1.0, action_space.shape) for agent in self.agents
+        }
 
     @property
     def name(self) -> str:
@@ -80,4 +85,4 @@ class JaxMarlRace(MultiAgentEnv):
         return {agent: jnp.ones(self.action_spaces[agent].shape, bool) for agent in self.agents}
 
     def _by_agent(self, values: jax.Array) -> dict[str, jax.Array]:
-        return {agent: values[place] for place, agent in enumerate(self.agents)}
+        return {agent: values[index] for index, agent in enumerate(self.agents)}

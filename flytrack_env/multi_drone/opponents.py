@@ -89,15 +89,15 @@ def _nearest(own: Standing, others: Sequence[Standing]) -> list[Standing]:
         apart = other.pos_w - own.pos_w
         return jnp.where(other.is_out, jnp.inf, apart.dot(apart))
 
-    row = compute_once([(distance(other), other) for other in others])
-    for place in range(min(len(row) - 1, MAX_OBSERVED)):
-        for i in reversed(range(place, len(row) - 1)):
-            pair = (first, one), (second, other) = row[i], row[i + 1]
-            is_wrong = (second < first) | ((second == first) & (other.progress > one.progress))
-            row[i] = jax.tree.map(lambda a, b, swap=is_wrong: jnp.where(swap, b, a), *pair)
-            row[i + 1] = jax.tree.map(lambda a, b, swap=is_wrong: jnp.where(swap, a, b), *pair)
-        row = compute_once(row)
-    return [other for _, other in row[:MAX_OBSERVED]]
+    ranking = compute_once([(distance(other), other) for other in others])
+    for rank in range(min(len(ranking) - 1, MAX_OBSERVED)):
+        for i in reversed(range(rank, len(ranking) - 1)):
+            pair = (first, nearer), (second, other) = ranking[i], ranking[i + 1]
+            is_wrong = (second < first) | ((second == first) & (other.progress > nearer.progress))
+            ranking[i] = jax.tree.map(lambda a, b, swap=is_wrong: jnp.where(swap, b, a), *pair)
+            ranking[i + 1] = jax.tree.map(lambda a, b, swap=is_wrong: jnp.where(swap, a, b), *pair)
+        ranking = compute_once(ranking)
+    return [other for _, other in ranking[:MAX_OBSERVED]]
 
 
 def rank_of(own: Standing, others: Sequence[Standing]) -> jax.Array:

@@ -32,14 +32,14 @@ class ParallelRace(ParallelEnv[str, np.ndarray, np.ndarray]):
     def __init__(self, race: MultiDroneRace, params: RaceParams | None = None) -> None:
         self.race, self.params = race, race.default_params if params is None else params
         self.render_mode = None
-        self.possible_agents = [f"drone_{place}" for place in range(race.num_drones)]
+        self.possible_agents = [f"drone_{index}" for index in range(race.num_drones)]
         self.agents: list[str] = []
-        seen, flown = race.observation_space(), race.action_space()
+        observation_space, action_space = race.observation_space(), race.action_space()
         self.observation_spaces = {
-            agent: gymnax_space_to_gym_space(seen) for agent in self.possible_agents
+            agent: gymnax_space_to_gym_space(observation_space) for agent in self.possible_agents
         }
         self.action_spaces = {
-            agent: gymnax_space_to_gym_space(flown) for agent in self.possible_agents
+            agent: gymnax_space_to_gym_space(action_space) for agent in self.possible_agents
         }
         self._rng = np.random.default_rng()
         self._states: Any = None
@@ -70,22 +70,23 @@ class ParallelRace(ParallelEnv[str, np.ndarray, np.ndarray]):
         if set(actions) != set(self.agents):
             raise ValueError(f"actions: found {sorted(actions)}, expected {self.agents}")
         sticks = np.zeros((self.race.num_drones, self.race.env.num_actions), np.float32)
-        for place, agent in self._racing():
-            sticks[place] = _as_sticks(agent, actions[agent], sticks.shape[1:])
-        flown = jax.device_get(self.race.step_env(self._states, sticks, self.params))
-        observations, self._states, *outcomes, info = flown
+        for index, agent in self._racing():
+            sticks[index] = _as_sticks(agent, actions[agent], sticks.shape[1:])
+        outcome = jax.device_get(self.race.step_env(self._states, sticks, self.params))
+        observations, self._states, *outcomes, info = outcome
         del info["final_observation"]
         infos = {
-            agent: {name: value[place] for name, value in info.items()}
-            for place, agent in self._racing()
+            agent: {name: value[index] for name, value in info.items()}
+            for index, agent in self._racing()
         }
-        found = (
-            self._by_agent(observations),
-            *({agent: one[place].item() for place, agent in self._racing()} for one in outcomes),
+        rewards, terminated, truncated = (
+            {agent: values[index].item() for index, agent in self._racing()} for values in outcomes
         )
-        _, _, terminated, truncated = found
-        self.agents = [one for one in self.agents if not (terminated[one] or truncated[one])]
-        return *found, infos
+        observations = self._by_agent(observations)
+        self.agents = [
+            agent for agent in self.agents if not (terminated[agent] or truncated[agent])
+        ]
+        return observations, rewards, terminated, truncated, infos
 
     def observation_space(self, agent: str) -> Any:
         """Return the space of an agent's observations."""
@@ -103,11 +104,13 @@ class ParallelRace(ParallelEnv[str, np.ndarray, np.ndarray]):
 
     def _racing(self) -> list[tuple[int, str]]:
         return [
-            (place, one) for place, one in enumerate(self.possible_agents) if one in self.agents
+            (index, agent)
+            for index, agent in enumerate(self.possible_agents)
+            if agent in self.agents
         ]
 
     def _by_agent(self, values: np.ndarray) -> dict[str, np.ndarray]:
-        return {agent: values[place] for place, agent in self._racing()}
+        return {agent: values[index] for index, agent in self._racing()}
 
 
 def _as_sticks(agent: str, action: Any, shape: tuple[int, ...]) -> np.ndarray:

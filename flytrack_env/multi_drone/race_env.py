@@ -42,7 +42,7 @@ from flytrack_env.randomness import Draws, check_key, seed_of, seeds_of
 from flytrack_env.state import Action, Drone
 
 CLEAR_OF_GHOSTS_M = 2.0
-PLACE_BITS = MAX_DRONES - 1  # of a random word: which drone of the race it is
+INDEX_BITS = MAX_DRONES - 1  # of a random word: which drone of the race it is
 
 
 class EntrantState(NamedTuple):
@@ -64,7 +64,7 @@ class EntrantState(NamedTuple):
     step: jax.Array
 
 
-class Flown(NamedTuple):
+class SoloStep(NamedTuple):
     """The result of a drone's step without the others: state, standing, path, and outcome."""
 
     state: EntrantState
@@ -199,7 +199,8 @@ class MultiDroneRace:
         """
         if not isinstance(drones.pos_w.x, jax.core.Tracer):
             check_apart(
-                np.stack([np.asarray(one, float) for one in drones.pos_w], -1), params.rules
+                np.stack([np.asarray(coordinate, float) for coordinate in drones.pos_w], -1),
+                params.rules,
             )
         words = self._words(jnp.asarray(seed, jnp.uint32)[None])
         states = jax.vmap(self._enter, (0, 0, None, 0))(drones, gate_indices, params, words)
@@ -259,8 +260,8 @@ class MultiDroneRace:
         shape = actions.shape[:-1]
         seeds = seeds_of(seed_of(key), jnp.arange(shape[0]))
         flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (states, actions))
-        found = self._advance_flat(seeds, flat[0], flat[1], params, resets=True)
-        return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), found)
+        outcome = self._advance_flat(seeds, flat[0], flat[1], params, resets=True)
+        return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), outcome)
 
     # Below, drones of all races are one flat vector.
 
@@ -292,25 +293,23 @@ class MultiDroneRace:
         ghosts: tuple[jax.Array, Path, Standing] | None,
     ) -> tuple[Any, ...]:
         """Return observation rows, those before the reset, states, rewards, flags and info."""
-        flown = jax.vmap(self._fly, (0, 0, None))(states, commands, params.flight)
+        solo = jax.vmap(self._fly, (0, 0, None))(states, commands, params.flight)
         if ghosts is not None:
-            flown = jax.vmap(_with_ghost)(flown, *ghosts)
-        states, reward, info = flown.state, flown.reward, flown.info
+            solo = jax.vmap(_with_ghost)(solo, *ghosts)
+        states, reward, info = solo.state, solo.reward, solo.info
         others: list[Standing] = []
         if self.num_drones > 1:
-            meetings = [
-                self._shift((flown.standing.is_out, flown.path), k) for k in self._distances
-            ]
+            meetings = [self._shift((solo.standing.is_out, solo.path), k) for k in self._distances]
             meet = jax.vmap(self._meet, (0, 0, None))
-            states, collision, reward = meet(flown, meetings, params)
-            standings = flown.standing._replace(is_out=states.is_out)
+            states, collision, reward = meet(solo, meetings, params)
+            standings = solo.standing._replace(is_out=states.is_out)
             others = [self._shift(standings, k) for k in self._distances]
-            states, reward, told = jax.vmap(self._rank, (0, 0, 0, 0, None))(
+            states, reward, standing_info = jax.vmap(self._rank, (0, 0, 0, 0, None))(
                 states, standings, others, reward, params.rules
             )
-            info = {**info, **told, "collision": collision}
+            info = {**info, **standing_info, "collision": collision}
         terminated = states.is_out
-        done = compute_once(self._is_over(terminated | flown.truncated))
+        done = compute_once(self._is_over(terminated | solo.truncated))
         truncated = done & ~terminated  # for those that would have flown on
         final_rows = jax.vmap(self._observe, (0, 0, None))(states, others, params)
         rows = final_rows
@@ -337,11 +336,11 @@ class MultiDroneRace:
             state = self._enter(drone, gate_index, params, word)
             return self._observe(state, [], params), state
         # Every drone of a race draws the same head of the grid, and so knows where the others are.
-        race_word, place = word & ~jnp.uint32(PLACE_BITS), (word & PLACE_BITS).astype(jnp.int32)
+        race_word, index = word & ~jnp.uint32(INDEX_BITS), (word & INDEX_BITS).astype(jnp.int32)
         head, gate_index = self.env.sample_start(race_word, params.flight)
         drawn = Draws(race_word).index("slot", self.num_drones)
         first = jnp.where(jnp.asarray(params.rules.first_slot) < 0, drawn, params.rules.first_slot)
-        slots = [(place + first + k) % self.num_drones for k in range(self.num_drones)]
+        slots = [(index + first + k) % self.num_drones for k in range(self.num_drones)]
         drone, *opponents = [
             place_on_grid(head, slot.astype(jnp.int32), params.rules) for slot in slots
         ]
@@ -350,14 +349,15 @@ class MultiDroneRace:
         own = self._standing(state)
         others = [
             own._replace(
-                pos_w=one.pos_w, progress=progress_of(0, one.pos_w, gate.centre, state.leg_m)
+                pos_w=opponent.pos_w,
+                progress=progress_of(0, opponent.pos_w, gate.centre, state.leg_m),
             )
-            for one in opponents
+            for opponent in opponents
         ]
-        for ghost_place, ghost in self.ghosts.items():
+        for ghost_index, ghost in self.ghosts.items():
             standing = jax.tree.map(lambda leaf: leaf[0], ghost.standing(jnp.zeros(1, jnp.int32)))
             for k, other in enumerate(others, start=1):
-                is_ghost = (place + k) % self.num_drones == ghost_place
+                is_ghost = (index + k) % self.num_drones == ghost_index
                 others[k - 1] = jax.tree.map(partial(jnp.where, is_ghost), standing, other)
         state = state._replace(gap=gap_of(own, others))
         return self._observe(state, others, params), state
@@ -390,7 +390,7 @@ class MultiDroneRace:
         gate = self.env.race(state.inner).gate
         return [*rows, *observe_opponents(self._standing(state), others, gate)]
 
-    def _fly(self, state: EntrantState, command: Action, flight: Any) -> Flown:
+    def _fly(self, state: EntrantState, command: Action, flight: Any) -> SoloStep:
         """Return the result of a drone's step without the others; one that is out stays put."""
         env, was_out = self.env, state.is_out
         before, old_gate = env.drone(state.inner), env.race(state.inner).gate
@@ -408,7 +408,7 @@ class MultiDroneRace:
         state = EntrantState(
             inner, leg_m, progress, was_out | terminated, state.gap, state.step + 1
         )
-        return Flown(
+        return SoloStep(
             state=state,
             standing=Standing(drone.pos_w, drone.vel_w, progress, was_out),
             path=Path(before.pos_w, drone.pos_w),
@@ -419,7 +419,7 @@ class MultiDroneRace:
         )
 
     def _meet(
-        self, flown: Flown, opponents: list[tuple[jax.Array, Path]], params: RaceParams
+        self, solo: SoloStep, opponents: list[tuple[jax.Array, Path]], params: RaceParams
     ) -> tuple[EntrantState, jax.Array, jax.Array]:
         """Return a drone's state after a step, whether a collision put it out, and its reward.
 
@@ -427,11 +427,11 @@ class MultiDroneRace:
         """
         hit = jnp.asarray(False)
         for is_out, path in opponents:
-            hit = hit | (is_put_out(flown.path, path, params.rules) & ~is_out)
-        hit = compute_once(hit & ~flown.standing.is_out)
-        is_new = hit & ~flown.terminated
-        reward = flown.reward + jnp.where(is_new, params.flight.reward.termination, 0.0)
-        return flown.state._replace(is_out=flown.state.is_out | hit), hit, reward
+            hit = hit | (is_put_out(solo.path, path, params.rules) & ~is_out)
+        hit = compute_once(hit & ~solo.standing.is_out)
+        is_new = hit & ~solo.terminated
+        reward = solo.reward + jnp.where(is_new, params.flight.reward.termination, 0.0)
+        return solo.state._replace(is_out=solo.state.is_out | hit), hit, reward
 
     def _rank(
         self,
@@ -444,43 +444,45 @@ class MultiDroneRace:
         """Return a drone's state with its gap, its reward with the gap's gain, and info."""
         gap = compute_once(gap_of(own, others))
         gain = jnp.where(own.is_out, 0.0, gap - state.gap)
-        told = {"rank": rank_of(own, others), "gap_gates": gap}
-        return state._replace(gap=gap), reward + rules.lead * gain, told
+        standing_info = {"rank": rank_of(own, others), "gap_gates": gap}
+        return state._replace(gap=gap), reward + rules.lead * gain, standing_info
 
     # Of the flat vector.
 
     def _standings(self, states: EntrantState) -> Standing:
         """Return all standings, those of ghosts on their lines."""
         standings = jax.vmap(self._standing)(states)
-        place = jnp.arange(len(states.step)) % self.num_drones
-        for ghost_place, ghost in self.ghosts.items():
-            choose = partial(jnp.where, place == ghost_place)
+        index = jnp.arange(len(states.step)) % self.num_drones
+        for ghost_index, ghost in self.ghosts.items():
+            choose = partial(jnp.where, index == ghost_index)
             standings = jax.tree.map(choose, ghost.standing(states.step), standings)
         return standings
 
     def _ghosts_at(self, steps: jax.Array) -> tuple[jax.Array, Path, Standing] | None:
         """Return which drones are ghosts, their next paths and standings; None without ghosts."""
-        found: Any = None
-        place = jnp.arange(len(steps)) % self.num_drones
-        for ghost_place, ghost in self.ghosts.items():
+        ghosts: Any = None
+        index = jnp.arange(len(steps)) % self.num_drones
+        for ghost_index, ghost in self.ghosts.items():
             before, after = ghost.standing(steps), ghost.standing(steps + 1)
-            is_ghost = place == ghost_place
-            own = (is_ghost, Path(before.pos_w, after.pos_w), after)
-            found = own if found is None else jax.tree.map(partial(jnp.where, is_ghost), own, found)
-        return found
+            is_ghost = index == ghost_index
+            line = (is_ghost, Path(before.pos_w, after.pos_w), after)
+            ghosts = (
+                line if ghosts is None else jax.tree.map(partial(jnp.where, is_ghost), line, ghosts)
+            )
+        return ghosts
 
     def _words(self, seeds: jax.Array) -> jax.Array:
         """Return a random word for each drone of each race, from one for each race."""
         if self.num_drones == 1:
             return seeds
-        places = jnp.arange(self.num_drones, dtype=jnp.uint32)
-        return ((seeds & ~jnp.uint32(PLACE_BITS))[:, None] | places).reshape(-1)
+        indices = jnp.arange(self.num_drones, dtype=jnp.uint32)
+        return ((seeds & ~jnp.uint32(INDEX_BITS))[:, None] | indices).reshape(-1)
 
     def _shift(self, tree: Any, distance: int) -> Any:
         """For each drone, take the leaves of the drone ``distance`` places later, cyclically."""
         size = len(jax.tree.leaves(tree)[0])
-        place = jnp.arange(size) % self.num_drones
-        is_later = compute_once(place + distance < self.num_drones)
+        index = jnp.arange(size) % self.num_drones
+        is_later = compute_once(index + distance < self.num_drones)
 
         def shift(leaf: jax.Array) -> jax.Array:
             back = self.num_drones - distance
@@ -497,26 +499,26 @@ class MultiDroneRace:
             for k in self._distances:
                 over = over & self._shift(done, k)
             return over
-        place, over = jnp.arange(len(done)) % self.num_drones, done
+        index, over = jnp.arange(len(done)) % self.num_drones, done
         for k in self._distances:
-            over = jnp.where(place == self.num_drones - k, self._shift(done, k), over)
+            over = jnp.where(index == self.num_drones - k, self._shift(done, k), over)
         return over
 
 
-def _with_ghost(flown: Flown, is_ghost: jax.Array, path: Path, standing: Standing) -> Flown:
+def _with_ghost(solo: SoloStep, is_ghost: jax.Array, path: Path, standing: Standing) -> SoloStep:
     """Return a drone's step as it is, or as that of a ghost, which is never out."""
 
     def choose(ghost: Any, own: Any) -> Any:
         return jax.tree.map(partial(jnp.where, is_ghost), ghost, own)
 
-    state = flown.state
-    return flown._replace(
+    state = solo.state
+    return solo._replace(
         state=state._replace(
             progress=choose(standing.progress, state.progress), is_out=state.is_out & ~is_ghost
         ),
-        standing=choose(standing, flown.standing),
-        path=choose(path, flown.path),
-        terminated=flown.terminated & ~is_ghost,
+        standing=choose(standing, solo.standing),
+        path=choose(path, solo.path),
+        terminated=solo.terminated & ~is_ghost,
     )
 
 

@@ -72,7 +72,7 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
         if len(opponents) != race.num_drones - 1:
             expected = f"{race.num_drones - 1}, one for each drone but the learner's"
             raise ValueError(f"opponents: found {len(opponents)}, expected {expected}")
-        sizes = {one.observation_space().shape[0] for one in (race, race.env)}
+        sizes = {env.observation_space().shape[0] for env in (race, race.env)}
         for number, opponent in enumerate(opponents):
             if opponent.observation_size not in sizes:
                 expected = " or ".join(map(str, sorted(sizes)))
@@ -93,7 +93,9 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
     @property
     def default_params(self) -> VersusParams:  # type: ignore[override]  # as in EpisodicEnvironment
         """The race's parameters, and the opponents' own."""
-        return VersusParams(self.race.default_params, tuple(one.params for one in self.opponents))
+        return VersusParams(
+            self.race.default_params, tuple(opponent.params for opponent in self.opponents)
+        )
 
     @property
     def num_actions(self) -> int:
@@ -146,8 +148,12 @@ class Versus(environment.Environment[VersusState, VersusParams]):  # type: ignor
     ) -> jax.Array:
         """Return the actions of all drones, (..., num_drones, 4)."""
         actions = [action]
-        for place, (opponent, own) in enumerate(zip(self.opponents, params.opponents, strict=True)):
-            actions.append(opponent.act(own, observations[..., place, : opponent.observation_size]))
+        for index, (opponent, policy_params) in enumerate(
+            zip(self.opponents, params.opponents, strict=True)
+        ):
+            actions.append(
+                opponent.act(policy_params, observations[..., index, : opponent.observation_size])
+            )
         return jnp.stack(actions, axis=-2)
 
     def _of_learner(self, step: Step) -> Step:

@@ -81,9 +81,11 @@ class Wrapper(EpisodicEnvironment):
     def default_params(self) -> EnvParams:  # type: ignore[override]  # of gymnax: see EpisodicEnvironment
         """The inner environment's, with this wrapper's own."""
         params = self.env.default_params
-        own = self.own_defaults()
+        defaults = self.own_defaults()
         return (
-            params if own is None else params.replace(wrappers={**params.wrappers, self.key: own})
+            params
+            if defaults is None
+            else params.replace(wrappers={**params.wrappers, self.key: defaults})
         )
 
     @property
@@ -118,14 +120,14 @@ class Wrapper(EpisodicEnvironment):
     def check_params(self, params: EnvParams) -> None:
         """Raise ValueError for parameters that cannot be flown, or that lack this wrapper's own."""
         self.env.check_params(params)
-        own = self.own_defaults()
-        if own is None:
+        defaults = self.own_defaults()
+        if defaults is None:
             return
         found = params.wrappers.get(self.key)
-        if jax.tree.structure(found) != jax.tree.structure(own):  # type: ignore[operator]  # jaxlib's stub has no !=
+        if jax.tree.structure(found) != jax.tree.structure(defaults):  # type: ignore[operator]  # jaxlib's stub has no !=
             raise ValueError(
-                f"params.wrappers[{self.key!r}]: found {found!r}, expected {type(own).__name__}, "
-                "as in this environment's default_params"
+                f"params.wrappers[{self.key!r}]: found {found!r}, "
+                f"expected {type(defaults).__name__}, as in this environment's default_params"
             )
 
 
