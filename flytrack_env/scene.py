@@ -111,9 +111,9 @@ def ground_grid(low: np.ndarray, high: np.ndarray, spacing_m: float) -> np.ndarr
     lines = []
     for axis, other in ((0, 1), (1, 0)):
         first, last = np.ceil(low[axis] / spacing_m), np.floor(high[axis] / spacing_m)
-        for place in spacing_m * np.arange(first, last + 1):
+        for offset in spacing_m * np.arange(first, last + 1):
             line = np.full((2, 3), low[2])
-            line[:, axis] = place
+            line[:, axis] = offset
             line[:, other] = low[other], high[other]
             lines.append(line)
     return np.array(lines).reshape(-1, 2, 3)
@@ -124,9 +124,9 @@ def speed_colours(speeds_m_s: np.ndarray) -> list[Colour]:
     steps = np.clip(
         speeds_m_s * (NUM_SPEED_COLOURS / FASTEST_M_S), 0, NUM_SPEED_COLOURS - 1
     ).astype(int)
-    places = np.linspace(0.0, len(SPEED_STOPS) - 1.0, NUM_SPEED_COLOURS)[steps]
+    positions = np.linspace(0.0, len(SPEED_STOPS) - 1.0, NUM_SPEED_COLOURS)[steps]
     channels = [
-        np.interp(places, np.arange(len(SPEED_STOPS)), channel) for channel in SPEED_STOPS.T
+        np.interp(positions, np.arange(len(SPEED_STOPS)), channel) for channel in SPEED_STOPS.T
     ]
     return [(int(r), int(g), int(b)) for r, g, b in zip(*channels, strict=True)]
 

@@ -130,24 +130,28 @@ def _members(kind: inspect.Type) -> tuple[inspect.Type, ...]:
     if isinstance(kind, inspect.Metadata):
         return _members(kind.type)
     alternatives = kind.types if isinstance(kind, inspect.UnionType) else (kind,)
-    return tuple(one for one in alternatives if not isinstance(one, inspect.NoneType))
+    return tuple(
+        alternative for alternative in alternatives if not isinstance(alternative, inspect.NoneType)
+    )
 
 
 def _field_types(kind: inspect.Type) -> dict[str, inspect.Type]:
     """Return the fields of the struct that a table has to be."""
     (struct,) = (
-        one for one in _members(kind) if isinstance(one, inspect.StructType | inspect.DataclassType)
+        alternative
+        for alternative in _members(kind)
+        if isinstance(alternative, inspect.StructType | inspect.DataclassType)
     )
     return {field.encode_name: field.type for field in struct.fields}
 
 
 def _item_type(kind: inspect.Type) -> inspect.Type:
     """Return the type of a list's items, which are all alike."""
-    for one in _members(kind):
-        if isinstance(one, inspect.TupleType):
-            return one.item_types[0]
-        if isinstance(one, inspect.ListType | inspect.VarTupleType):
-            return one.item_type
+    for alternative in _members(kind):
+        if isinstance(alternative, inspect.TupleType):
+            return alternative.item_types[0]
+        if isinstance(alternative, inspect.ListType | inspect.VarTupleType):
+            return alternative.item_type
     raise AssertionError(f"{kind} has no items")
 
 

@@ -87,9 +87,9 @@ def write_animation(flight: Flight, reference: Reference, folder: str | Path) ->
         raise ValueError(f"{flight.name}: found no complete flying lap, expected one to animate")
     start, end = flight.fastest_flying_lap
     first = round(start.time_s / STEP_S)  # the state nearest to the crossing
-    own = flight.states[first : first + round(end.lap_time_s / STEP_S) + 1]
+    states = flight.states[first : first + round(end.lap_time_s / STEP_S) + 1]
     laps = (
-        Lap(flight.name, FLIGHT_COLOURS[0], own, end.lap_time_s),
+        Lap(flight.name, FLIGHT_COLOURS[0], states, end.lap_time_s),
         Lap("time-optimal", FLIGHT_COLOURS[2], reference.states, reference.time_s),
     )
     path = Path(folder) / f"{flight.name}.gif"

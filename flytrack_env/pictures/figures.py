@@ -52,16 +52,16 @@ def draw_top(flight: Flight) -> Figure:
     top = drawing.HEADROOM * max(float(speeds.max()), 1.0)
     lines = drawing.draw_path(axes, points, speeds[:-1], top, 2.2)
     failures = np.reshape(
-        [one.pos_w[:2] for one in flight.meetings if one.outcome != PASSED], (-1, 2)
+        [meeting.pos_w[:2] for meeting in flight.meetings if meeting.outcome != PASSED], (-1, 2)
     )
     axes.plot(*failures.T, "X", color="black", markersize=8, markeredgecolor="white", zorder=5)
     marks = (
         ("start", points[0], BLUE, "o"),
         (drawing.escape(flight.ended), points[-1], ORANGE, "X"),
     )
-    for text, place, colour, marker in marks:
+    for text, point, colour, marker in marks:
         axes.plot(
-            *place,
+            *point,
             marker,
             color=colour,
             markersize=9,
@@ -106,8 +106,8 @@ def _course(flights: Sequence[Flight], beside_in: float) -> tuple[Figure, Axes]:
     """Return a figure with bounds and gates, wide enough for flights that leave the bounds."""
     track = flights[0].track
     ends = np.array([track.bounds_low, track.bounds_high])[:, :2]
-    seen = np.concatenate([*(flight.states[:, POSITION][:, :2] for flight in flights), ends])
-    low, high = seen.min(axis=0), seen.max(axis=0)
+    points = np.concatenate([*(flight.states[:, POSITION][:, :2] for flight in flights), ends])
+    low, high = points.min(axis=0), points.max(axis=0)
     margin = MARGIN_SHARE * (high - low).max()
     low, high = low - margin, high + margin
     width, height = PANEL_IN * np.maximum((high - low) / (high - low).max(), NARROWEST)
@@ -208,7 +208,9 @@ def _draw_fronts(figure: SubFigure, flight: Flight, top: float, shape: tuple[int
     for panel in panels:
         panel.set_axis_off()
     for index, (panel, gate) in enumerate(zip(panels, flight.track.gates, strict=False)):
-        _draw_front(panel, gate, [one for one in flight.meetings if one.gate == index], top)
+        _draw_front(
+            panel, gate, [meeting for meeting in flight.meetings if meeting.gate == index], top
+        )
     figure.suptitle(
         "Gates as the drone approaches them, and how often it passed of how often it met them. "
         f"Dashed: free for a drone of {DRONE_RADIUS_M:g} m radius.\n"
@@ -227,16 +229,16 @@ def _draw_front(panel: Axes, gate: Gate, meetings: list[Meeting], top: float) ->
             Rectangle(corner, edge, edge, facecolor=face, edgecolor=colour, linestyle=line)
         )
     for is_pass, marker, size in ((True, "o", 36), (False, "X", 110)):
-        shown = [one for one in meetings if (one.outcome == PASSED) is is_pass]
+        shown = [meeting for meeting in meetings if (meeting.outcome == PASSED) is is_pass]
         panel.scatter(
-            [one.right_m for one in shown], [one.up_m for one in shown], size,
-            [one.speed_m_s for one in shown], marker=marker, edgecolors="black", linewidths=0.6,
+            [meeting.right_m for meeting in shown], [meeting.up_m for meeting in shown], size,
+            [meeting.speed_m_s for meeting in shown], marker=marker, edgecolors="black", linewidths=0.6,
             vmin=0.0, vmax=top,
         )  # fmt: skip
     reach = AROUND * max(
-        [0.5 * gate.frame, *(max(abs(one.right_m), abs(one.up_m)) for one in meetings)]
+        [0.5 * gate.frame, *(max(abs(meeting.right_m), abs(meeting.up_m)) for meeting in meetings)]
     )
-    num_passed = sum(one.outcome == PASSED for one in meetings)
+    num_passed = sum(meeting.outcome == PASSED for meeting in meetings)
     panel.set(aspect="equal", xlim=(-reach, reach), ylim=(-reach, reach))
     panel.set_title(f"gate {gate.id}: {num_passed} of {len(meetings)}", fontsize="small")
 
@@ -263,9 +265,12 @@ def draw_commands(flight: Flight) -> Figure:
     panels[4].set_ylabel("speed (m/s)")
     panels[5].set(ylabel="battery (V)", xlabel="time (s)")
     marks = [
-        (one.time_s, "lap complete" if one.lap else "gate passed") for one in flight.race.passes
+        (gate_pass.time_s, "lap complete" if gate_pass.lap else "gate passed")
+        for gate_pass in flight.race.passes
     ]
-    marks += [(one.time_s, "not passed") for one in flight.meetings if one.outcome != PASSED]
+    marks += [
+        (meeting.time_s, "not passed") for meeting in flight.meetings if meeting.outcome != PASSED
+    ]
     for panel in panels:
         drawing.plain(panel)
         for time_s, mark in marks:

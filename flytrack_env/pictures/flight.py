@@ -71,12 +71,12 @@ class Flight(NamedTuple):
     @property
     def lap_times_s(self) -> list[float]:
         """Times of the complete laps, in order."""
-        return [one.lap_time_s for one in self.race.passes if one.lap]
+        return [gate_pass.lap_time_s for gate_pass in self.race.passes if gate_pass.lap]
 
     @property
     def fastest_flying_lap(self) -> tuple[Pass, Pass] | None:
         """The passes that begin and end the fastest flying lap; None if there is none."""
-        ends = [one for one in self.race.passes if one.lap]
+        ends = [gate_pass for gate_pass in self.race.passes if gate_pass.lap]
         return min(itertools.pairwise(ends), key=lambda lap: lap[1].lap_time_s, default=None)
 
     @property
@@ -134,12 +134,15 @@ def _meetings(
     gates = build_course(track).gates
     of_step = jax.tree.map(lambda leaf: leaf[race.gate], gates)
     met = cross_gate(of_step, Vec3(*positions.T), Vec3(*ends.T), DRONE_RADIUS_M)
-    found = [(one.row - 1, one.pos_w, one.time_s, one.gate, PASSED) for one in race.passes]
+    crossings = [
+        (gate_pass.row - 1, gate_pass.pos_w, gate_pass.time_s, gate_pass.gate, PASSED)
+        for gate_pass in race.passes
+    ]
     for outcome, is_met in ((TOUCHED, met.is_frame), (MISSED, met.is_miss)):
         for step in np.flatnonzero(is_met):
             fraction = float(met.fraction[step])
             where = positions[step] + fraction * (ends[step] - positions[step])
-            found.append(
+            crossings.append(
                 (int(step), where, STEP_S * (int(step) + fraction), int(race.gate[step]), outcome)
             )
 
@@ -157,4 +160,6 @@ def _meetings(
             speed_m_s=float(np.linalg.norm(states[step, VELOCITY])),
         )
 
-    return tuple(meeting(*one) for one in sorted(found, key=lambda one: one[2]))
+    return tuple(
+        meeting(*crossing) for crossing in sorted(crossings, key=lambda crossing: crossing[2])
+    )

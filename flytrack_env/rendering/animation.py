@@ -91,11 +91,11 @@ class FixedView:
         outwards = unit(outwards, scene.UP_W)
         eye_w = middle + DISTANCE * np.linalg.norm(size) * outwards
         at_one = Camera(eye_w, -outwards, np.zeros(2), 1.0)
-        seen = at_one.pixels(at_one.look(points_w))
+        points_px = at_one.pixels(at_one.look(points_w))
         room = PIXEL * (np.array([WIDTH, HEIGHT - HEADER]) - 2 * MARGIN)
-        focal_px = float((room / np.ptp(seen, axis=0)).min())
+        focal_px = float((room / np.ptp(points_px, axis=0)).min())
         centre_px = PIXEL * np.array([0.5 * WIDTH, 0.5 * (HEIGHT + HEADER)])
-        centre_px -= 0.5 * focal_px * (seen.min(axis=0) + seen.max(axis=0))
+        centre_px -= 0.5 * focal_px * (points_px.min(axis=0) + points_px.max(axis=0))
         return Camera(eye_w, -outwards, centre_px, focal_px)
 
     def draw(self, laps: Sequence[Lap], row: int) -> Image.Image:
@@ -109,9 +109,9 @@ class FixedView:
         for index in np.argsort(-gates_c[:, :, 2].mean(axis=1)):
             draw_gate(draw, self.camera, gates_c[index], GATE_COLOUR)
             corners_px = self.camera.pixels(gates_c[index])
-            place = (float(corners_px[:, 0].mean()), float(corners_px[:, 1].min()) - 4 * PIXEL)
+            label_px = (float(corners_px[:, 0].mean()), float(corners_px[:, 1].min()) - 4 * PIXEL)
             text = str(self.gate_ids[index])
-            draw.text(place, text, scene.TEXT, font(GATE_TEXT_SIZE * PIXEL), anchor="ms")
+            draw.text(label_px, text, scene.TEXT, font(GATE_TEXT_SIZE * PIXEL), anchor="ms")
         for lap in laps:
             path_w = lap.states[: max(row, 1) + 1, POSITION].astype(float)
             dim = scene.blend(lap.colour, scene.GROUND, 0.45)

@@ -117,8 +117,8 @@ class TopView:
             left = np.array([-forward[1], forward[0]]) / max(np.hypot(forward[0], forward[1]), 1e-6)
             outwards = left if left @ (centre - 0.5 * (low + high))[:2] >= 0.0 else -left
             distance = self.enlargement * self.half_edges_m[index] + LABEL_DISTANCE * self.pixel_m
-            (place,) = self._pairs((centre[:2] + distance * outwards)[None])
-            draw.text(place, str(gate_ids[index]), scene.TEXT, font(13 * PIXEL), anchor="mm")
+            (label_px,) = self._pairs((centre[:2] + distance * outwards)[None])
+            draw.text(label_px, str(gate_ids[index]), scene.TEXT, font(13 * PIXEL), anchor="mm")
 
     def _draw_gate(self, draw: ImageDraw.ImageDraw, index: int, colour: Colour) -> None:
         """Draw a gate as a bar with a gap as its opening, and an arrow in its flight direction."""
@@ -240,7 +240,7 @@ class ChaseView:
         self._draw_trail(draw, camera, log.rows)
         drones = [*([] if ghost is None else [(ghost, GHOST_COLOURS)]), (row, DRONE_COLOURS)]
         for state, shades in sorted(
-            drones, key=lambda one: -float(camera.look(one[0][POSITION])[2])
+            drones, key=lambda drone: -float(camera.look(drone[0][POSITION])[2])
         ):
             draw_drone(draw, camera, state[POSITION], state[QUATERNION], shades)
         for index in order[~is_beyond[order]]:
@@ -311,7 +311,7 @@ def draw_drone(
     body_w = pos_w + enlargement * BODY_M * (
         CIRCLE @ np.stack([camera.axes[0], camera.axes[1], UP_W])
     )
-    parts = [(motor_w + disc_w, colours[1 + place // 2]) for place, motor_w in enumerate(motors_w)]
+    parts = [(motor_w + disc_w, colours[1 + index // 2]) for index, motor_w in enumerate(motors_w)]
     looked = [
         (camera.look(points_w), colour) for points_w, colour in [*parts, (body_w, colours[0])]
     ]
@@ -360,8 +360,8 @@ class Renderer:
         picture = self.canvas.reduce(PIXEL)
         draw = ImageDraw.Draw(picture)
         self._write(draw, log)
-        place = (TOP_VIEW_WIDTH + COLUMNS[0], BAR_HEIGHT + TEXT_TOP)
-        draw.multiline_text(place, notes, scene.TEXT, font(TEXT_SIZE), spacing=6)
+        notes_px = (TOP_VIEW_WIDTH + COLUMNS[0], BAR_HEIGHT + TEXT_TOP)
+        draw.multiline_text(notes_px, notes, scene.TEXT, font(TEXT_SIZE), spacing=6)
         return np.array(picture)
 
     def _write(self, draw: ImageDraw.ImageDraw, log: FlightLog) -> None:

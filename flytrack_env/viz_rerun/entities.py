@@ -223,10 +223,12 @@ class Writer:
             "recent": (steps, [strips(a, b) for a, b in zip(starts, steps, strict=True)]),
             "flown": (steps[is_new_block], [strips(0, a) for a in starts[is_new_block]]),
         }
-        for name, (rows, found) in paths.items():
-            if found:
-                columns = rr.LineStrips3D.columns(strips=[strip for one in found for strip in one])
-                lengths = [len(one) for one in found]
+        for name, (rows, line_sets) in paths.items():
+            if line_sets:
+                columns = rr.LineStrips3D.columns(
+                    strips=[strip for lines in line_sets for strip in lines]
+                )
+                lengths = [len(lines) for lines in line_sets]
                 self._send(f"{self.world}/trajectory/{name}", rows, columns.partition(lengths))
 
     def _send_plot(self, plot: Plot, label: str) -> None:
@@ -241,16 +243,22 @@ class Writer:
     def _send_passes(self, race: FlownRace) -> None:
         """Send markers where gates were passed, all so far, and at the last lap's end its time."""
         # Of two gates passed in one step the later has both markers.
-        last = {one.row: count for count, one in enumerate(race.passes, start=1)}
-        places = [[one.pos_w for one in race.passes[:count]] for count in last.values()]
-        points = rr.Points3D.columns(positions=np.concatenate(places))
-        lengths = [len(one) for one in places]
+        last = {gate_pass.row: count for count, gate_pass in enumerate(race.passes, start=1)}
+        positions = [
+            [gate_pass.pos_w for gate_pass in race.passes[:count]] for count in last.values()
+        ]
+        points = rr.Points3D.columns(positions=np.concatenate(positions))
+        lengths = [len(group) for group in positions]
         self._send(f"{self.world}/passes", np.array(list(last)), points.partition(lengths))
-        laps = [one for one in race.passes if one.lap]
+        laps = [gate_pass for gate_pass in race.passes if gate_pass.lap]
         if laps:
-            labels = [f"lap {one.lap}: {one.lap_time_s:.3f} s" for one in laps]
-            markers = rr.Points3D.columns(positions=[one.pos_w for one in laps], labels=labels)
-            self._send(f"{self.world}/laps", np.array([one.row for one in laps]), markers)
+            labels = [f"lap {gate_pass.lap}: {gate_pass.lap_time_s:.3f} s" for gate_pass in laps]
+            markers = rr.Points3D.columns(
+                positions=[gate_pass.pos_w for gate_pass in laps], labels=labels
+            )
+            self._send(
+                f"{self.world}/laps", np.array([gate_pass.row for gate_pass in laps]), markers
+            )
 
     def _send_arrows(self, model: str, forces_w: np.ndarray) -> None:
         """Send arrows at the drone for the specific force that a model does not explain."""

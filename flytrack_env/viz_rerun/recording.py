@@ -109,31 +109,39 @@ def _record(flights: Sequence[Trajectory], track: Track | None, app_id: str) -> 
     models = [model for flight in flights for model in flight.residuals_w]
     names = dict.fromkeys([*(flight.name for flight in flights), *models])
     colours = {
-        name: FLIGHT_COLOURS[place % len(FLIGHT_COLOURS)] for place, name in enumerate(names)
+        name: FLIGHT_COLOURS[index % len(FLIGHT_COLOURS)] for index, name in enumerate(names)
     }
-    writers = [Writer(flight, place == 0, colours) for place, flight in enumerate(flights)]
+    writers = [Writer(flight, index == 0, colours) for index, flight in enumerate(flights)]
     races = [flight.race(track) for flight in flights]
     plots = [plots_of(flight, race) for flight, race in zip(flights, races, strict=True)]
     # The first flight has all the entities of the handout, others only those with numbers.
-    plots[1:] = [[plot for plot in own if np.isfinite(plot.values).any()] for own in plots[1:]]
+    plots[1:] = [
+        [plot for plot in flight_plots if np.isfinite(plot.values).any()]
+        for flight_plots in plots[1:]
+    ]
     ends = [flight.reason_ended(track, race) for flight, race in zip(flights, races, strict=True)]
     memory = recording.memory_recording()
     recording.send_blueprint(
         make_blueprint(
-            writers, {plot.path for own in plots for plot in own}, centres_of(track), len(colours)
+            writers,
+            {plot.path for flight_plots in plots for plot in flight_plots},
+            centres_of(track),
+            len(colours),
         )
     )
     log_course(recording, track)
-    places = [(0.0, float(place)) for place in range(len(colours))]
+    points = [(0.0, float(index)) for index in range(len(colours))]
     key = rr.Points2D(
-        places, labels=list(colours), colors=list(colours.values()), radii=0.1, show_labels=True
+        points, labels=list(colours), colors=list(colours.values()), radii=0.1, show_labels=True
     )
     recording.log(KEY, key, static=True, strict=True)
     about = rr.TextDocument(_describe(flights, races, ends), media_type=rr.MediaType.MARKDOWN)
     recording.log("about", about, static=True, strict=True)
-    for writer, own, race, ended in zip(writers, plots, races, ends, strict=True):
+    for writer, flight_plots, race, ended in zip(writers, plots, races, ends, strict=True):
         label = "" if len(flights) == 1 else f"{writer.trajectory.name}: "
-        writer.write(recording, own, label, _events(writer.trajectory, track, race, ended), race)
+        writer.write(
+            recording, flight_plots, label, _events(writer.trajectory, track, race, ended), race
+        )
     return memory.drain_as_bytes()
 
 
@@ -143,11 +151,16 @@ def _events(
     """Return row and text of every gate passed, every lap, and the end."""
     events = []
     if track is not None and race is not None:
-        for one in race.passes:
-            gate = track.gates[one.gate].id
-            events.append((one.row, f"{flight.name}: gate {gate}, {one.time_s:.3f} s"))
-            if one.lap:  # an event of its own, as the panel is narrow
-                events.append((one.row, f"{flight.name}: lap {one.lap}, {one.lap_time_s:.3f} s"))
+        for gate_pass in race.passes:
+            gate = track.gates[gate_pass.gate].id
+            events.append((gate_pass.row, f"{flight.name}: gate {gate}, {gate_pass.time_s:.3f} s"))
+            if gate_pass.lap:  # an event of its own, as the panel is narrow
+                events.append(
+                    (
+                        gate_pass.row,
+                        f"{flight.name}: lap {gate_pass.lap}, {gate_pass.lap_time_s:.3f} s",
+                    )
+                )
     return [*events, (len(flight.states) - 1, f"{flight.name}: ended, {ended}")]
 
 
