@@ -146,7 +146,7 @@ def _field_types(kind: inspect.Type) -> dict[str, inspect.Type]:
 
 
 def _item_type(kind: inspect.Type) -> inspect.Type:
-    """Return the type of a list's items, which are all alike."""
+    """Return the type of a list's items, which all have the same one."""
     for alternative in _members(kind):
         if isinstance(alternative, inspect.TupleType):
             return alternative.item_types[0]

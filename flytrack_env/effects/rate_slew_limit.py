@@ -22,7 +22,7 @@ THROUGHOUT = 0.75 - 1e-5  # mean of a stick that moves all the step, less what f
 class RateSlewLimit(NamedTuple):
     """Least time from centre to full stick of each axis, s: 0 is no limit.
 
-    The largest angular acceleration that is asked for is ``max_rate`` over this.
+    The largest angular acceleration of the setpoint is ``max_rate`` over this.
     """
 
     roll_s: Scalar = 0.0

@@ -46,8 +46,9 @@ def check_names(options: Mapping[str, Any] | None) -> dict[str, Any]:
 def read_start(options: Mapping[str, Any], course: Course, battery: Battery) -> dict[str, Any]:
     """Return the start that checked options ask for on a course; what is not in it is drawn.
 
-    drone, gate_index: (21,), laid out as in ``flytrack_env.state``, and the gate to fly first.
-    battery_v: V.
+    Returns:
+        ``drone``, (21,) laid out as in ``flytrack_env.state``, with ``gate_index``, the gate to fly
+        first; and ``battery_v``, V.
 
     Raises:
         ValueError: a value that no episode can start with; it names option, found and expected.

@@ -25,7 +25,7 @@ class Ghost(NamedTuple):
     progress: np.ndarray
 
     def standing(self, step: jax.Array) -> Standing:
-        """Return a ghost's standing so many steps after the start, int32 of any shape."""
+        """Return a ghost's standing ``step`` steps after the start, int32 of any shape."""
         row = jnp.clip(step, 0, NUM_ROWS - 1)
         pos_w, vel_w, progress = jax.tree.map(lambda leaf: jnp.asarray(leaf)[row], tuple(self))
         return Standing(pos_w, vel_w, progress, jnp.zeros(jnp.shape(step), bool))

@@ -49,7 +49,7 @@ class JaxMarlRace(MultiAgentEnv):
 
     @property
     def agent_classes(self) -> dict[str, list[str]]:
-        """All drones are alike."""
+        """One class: all drones have the same spaces."""
         return {"drones": list(self.agents)}
 
     @partial(jax.jit, static_argnums=(0,))

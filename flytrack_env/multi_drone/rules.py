@@ -40,7 +40,7 @@ class RaceParams(NamedTuple):
 
 
 def check_num_drones(num_drones: int) -> None:
-    """Raise ValueError unless so many drones can race."""
+    """Raise ValueError unless this number of drones can race."""
     if not isinstance(num_drones, int) or not 1 <= num_drones <= MAX_DRONES:
         raise ValueError(f"num_drones: found {num_drones!r}, expected 1 to {MAX_DRONES}")
 

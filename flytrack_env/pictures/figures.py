@@ -231,10 +231,16 @@ def _draw_front(panel: Axes, gate: Gate, meetings: list[Meeting], top: float) ->
     for is_pass, marker, size in ((True, "o", 36), (False, "X", 110)):
         shown = [meeting for meeting in meetings if (meeting.outcome == PASSED) is is_pass]
         panel.scatter(
-            [meeting.right_m for meeting in shown], [meeting.up_m for meeting in shown], size,
-            [meeting.speed_m_s for meeting in shown], marker=marker, edgecolors="black", linewidths=0.6,
-            vmin=0.0, vmax=top,
-        )  # fmt: skip
+            [meeting.right_m for meeting in shown],
+            [meeting.up_m for meeting in shown],
+            size,
+            [meeting.speed_m_s for meeting in shown],
+            marker=marker,
+            edgecolors="black",
+            linewidths=0.6,
+            vmin=0.0,
+            vmax=top,
+        )
     reach = AROUND * max(
         [0.5 * gate.frame, *(max(abs(meeting.right_m), abs(meeting.up_m)) for meeting in meetings)]
     )
