@@ -29,6 +29,7 @@ from flytrack_env.state import ACTION_SIZE, Action, Drone, pack, unpack, unpack_
 from flytrack_env.thrust import collective_thrust
 
 SECONDS_PER_MINUTE = 60.0
+FULL_STICKS = Action(1.0, 1.0, 1.0, 0.0)
 HELD_S = 1e6  # s, long enough for lags and limits of the rates to settle, to float32's rounding
 
 
@@ -189,7 +190,7 @@ def _force_context(
 
 
 def _forces(
-    context: ForceContext, params: ModelParameters, memories: tuple[Any, ...]
+    context: ForceContext, memories: tuple[Any, ...], params: ModelParameters
 ) -> tuple[Vec3, Vec3]:
     """Return acceleration, world, and specific force, body, m/s^2, with what effects add."""
     axes, thrust_acc = context.body_axes_w, context.thrust_acc
@@ -258,9 +259,14 @@ def _respond(
     params: ModelParameters,
 ) -> _Response:
     """Return the response to a command; drone: at the beginning of the span."""
-    full_stick_b = body_rates(Action(1.0, 1.0, 1.0, 0.0), params.max_rate)
     context = CommandContext(
-        drone, command, dt, span, params.motion, full_stick_b, params.thrust_coeffs
+        drone=drone,
+        command=command,
+        dt=dt,
+        span=span,
+        motion=params.motion,
+        full_stick_b=body_rates(FULL_STICKS, params.max_rate),
+        thrust_coeffs=params.thrust_coeffs,
     )
     acting = effects.fold("command", params.effects, memories, command, context)
     context = context._replace(command=acting)
@@ -310,7 +316,7 @@ def _move_at_once(
         quat = compute_once(quat)
         axes = compute_once(quat.axes())
         context = _force_context(drone, memories, applied, axes, params)
-    acc_w, force_b = _forces(context, params, memories)
+    acc_w, force_b = _forces(context, memories, params)
     acc_w = compute_once(acc_w)
     after = Drone(
         pos_w=drone.pos_w + drone.vel_w.scale(dt) + acc_w.scale(0.5 * dt * dt),
@@ -322,7 +328,15 @@ def _move_at_once(
         battery_v=_voltage(drone, memories, applied, dt, params),
     )
     step_context = StepContext(
-        drone, command, acting, dt, params.motion, rates_b, force_b, None, (rates[0], rates[0])
+        drone=drone,
+        command=command,
+        acting=acting,
+        dt=dt,
+        motion=params.motion,
+        rates_b=rates_b,
+        force_b=force_b,
+        middle_b=None,
+        rate_inputs_b=(rates[0], rates[0]),
     )
     later = effects.remember(params.effects, memories, step_context, rates, rates)
     reading = AccelerometerContext(
@@ -414,7 +428,7 @@ def _move_continuously(
         )
         axes = compute_once(quat.axes())
         context = _force_context(there, memories, instant.applied, axes, params)
-        return compute_once(_forces(context, params, memories))
+        return compute_once(_forces(context, memories, params))
 
     half, vel_w = 0.5 * dt, drone.vel_w
     acc_0, _ = force_at(instants[0], drone.quat, vel_w, 0.0)
@@ -434,17 +448,16 @@ def _move_continuously(
         1.0 / dt
     )  # the parabola's slope
     first, last = instants[0].rates, instants[2].rates
-    middle_b = rates_m, force_m
     context = StepContext(
-        drone,
-        command,
-        response.acting,
-        dt,
-        params.motion,
-        last[-1],
-        force_1,
-        middle_b,
-        (first[0], last[0]),
+        drone=drone,
+        command=command,
+        acting=response.acting,
+        dt=dt,
+        motion=params.motion,
+        rates_b=last[-1],
+        force_b=force_1,
+        middle_b=(rates_m, force_m),
+        rate_inputs_b=(first[0], last[0]),
     )
     later = effects.remember(params.effects, response.memories, context, first, last)
     reading = AccelerometerContext(dt, last[-1], turning, force_1)
@@ -463,7 +476,7 @@ def observe_rates(
         dt: since the last measurement, s.
     """
     memories, rest_b = effects.observe(params.effects, memories, rates_b - drone.rates_b, dt)
-    full_stick = body_rates(Action(1.0, 1.0, 1.0, 0.0), params.max_rate)
+    full_stick = body_rates(FULL_STICKS, params.max_rate)
     applied = drone.applied._replace(
         roll=drone.applied.roll + rest_b.x / full_stick.x,
         pitch=drone.applied.pitch + rest_b.y / full_stick.y,
@@ -496,8 +509,7 @@ def sensed(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: ModelPar
         memories: of the effects, up to this drone.
         dt: s, the step between readings.
     """
-    pose = effects.Pose(drone.pos_w, drone.vel_w, drone.quat)
-    pose = effects.fold("pose", params.effects, memories, pose, dt)
+    pose = effects.fold("pose", params.effects, memories, effects.Pose.of(drone), dt)
     return drone._replace(**pose._asdict(), rates_b=read_gyro(drone, memories, dt, params))
 
 

@@ -139,7 +139,7 @@ def check_parameters(parameters: Any, dt: Any, delay_steps: int = DEFAULT_DELAY_
 
 
 def merge(present: tuple[Any, ...], *added: Any) -> tuple[Any, ...]:
-    """Return parameters of effects in the order of ``ORDER``; an added one replaces that of its effect."""
+    """Return parameters of effects in the order of ``ORDER``; added ones replace present ones."""
     by_name = {effect_of(parameters).name: parameters for parameters in (*present, *added)}
     return tuple(by_name[effect.name] for effect in ORDER if effect.name in by_name)
 

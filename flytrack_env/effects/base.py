@@ -73,6 +73,11 @@ class Pose(NamedTuple):
     vel_w: Vec3
     quat: Quaternion
 
+    @staticmethod
+    def of(drone: Drone) -> "Pose":
+        """Return the pose of a drone."""
+        return Pose(drone.pos_w, drone.vel_w, drone.quat)
+
 
 class CommandContext(NamedTuple):
     """What acts before the lag: a command in a span of the step.

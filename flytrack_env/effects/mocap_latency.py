@@ -21,13 +21,9 @@ class MocapLatency(NamedTuple):
 PastPoses = tuple[Pose, ...]  # true ones before the present one, the latest first
 
 
-def _of(drone: Drone) -> Pose:
-    return Pose(drone.pos_w, drone.vel_w, drone.quat)
-
-
 def start(latency: MocapLatency, drone: Drone, num_steps: int) -> PastPoses:
     """Return the memory of an episode that begins: as if the drone had been there all along."""
-    return (_of(drone),) * num_steps
+    return (Pose.of(drone),) * num_steps
 
 
 def _same_sign(quat: Quaternion, like: Quaternion) -> Quaternion:
@@ -56,7 +52,7 @@ def _pose(latency: MocapLatency, past: PastPoses, pose: Pose, dt: Scalar) -> Pos
 
 def remember(latency: MocapLatency, past: PastPoses, context: StepContext) -> PastPoses:
     """Return the memory after a step."""
-    return (_of(context.drone), *past[:-1])
+    return (Pose.of(context.drone), *past[:-1])
 
 
 MOCAP_LATENCY = Effect(
