@@ -176,6 +176,9 @@ def offset_between(
     stretches = _stretches(log, sums, rates)
     if sum(stretch.block[-1] - stretch.block[0] + 1 for stretch in stretches) < FEWEST_BLOCKS:
         return *unknown, f"not compared: less than {FEWEST_BLOCKS * BLOCK_S:g} s without a gap"
+    if any(not np.ptp(values, axis=0).any() for values in (sums, rates)):
+        # All offsets fit a constant signal equally well: rounding would choose between the reasons.
+        return *unknown, "not compared: correlation 0.00: they do not show one motion clearly"
     # Windows keep the largest offset away from the ends of the data; the grid stays within it.
     grid = np.arange(-LARGEST_OFFSET_S + GRID_S, LARGEST_OFFSET_S - GRID_S / 2, GRID_S)
     best = int(np.argmin([_cost(stretches, offset) for offset in grid]))
