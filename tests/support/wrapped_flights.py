@@ -64,11 +64,14 @@ def steps_of(env):
     return jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
 
 
-def fly(env, params=None, actions=None, **wrappers):
+def fly(env, params=None, actions=None, step=None, **wrappers):
     """Return flights of random actions, or of given ones (T, NUM_ENVS, 4).
 
-    wrappers: parameters of wrappers that are not the default ones.
+    Args:
+        step: in place of ``steps_of(env)``.
+        wrappers: parameters of wrappers that are not the default ones.
     """
+    step = steps_of(env) if step is None else step
     params = env.default_params if params is None else params
     params = arrays(params.replace(wrappers={**params.wrappers, **wrappers}))
     key_reset, key_actions, key_steps = jax.random.split(jax.random.key(0), 3)
@@ -78,7 +81,7 @@ def fly(env, params=None, actions=None, **wrappers):
     state, outputs = start, []
     for index, action in enumerate(actions):
         keys = jax.random.split(jax.random.fold_in(key_steps, index), NUM_ENVS)
-        outputs.append(steps_of(env)(keys, state, action, params))
+        outputs.append(step(keys, state, action, params))
         state = outputs[-1][1]
     return Flight(first, start, actions, *jax.tree.map(lambda *leaves: np.stack(leaves), *outputs))
 
@@ -97,15 +100,18 @@ ENDS = {
 
 def before_ends(env, params, ends, **fields):
     """Return a batch of states a step before some ``ENDS``, and the actions of that step."""
+    positions, velocities, own, times, actions, *_ = zip(*ends, strict=True)
+    drones = [
+        drone_at(position, velocity, **values, **fields)
+        for position, velocity, values in zip(positions, velocities, own, strict=True)
+    ]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *drones)
+    begin = jax.jit(jax.vmap(env.begin, in_axes=(0, None, None, 0)))
+    states = begin(batch, 0, params, jnp.arange(len(drones), dtype=jnp.uint32))
 
-    def with_time(steps, path, leaf):
-        return jnp.int32(steps) if getattr(path[-1], "name", "") == "time" else leaf
+    def with_time(path, leaf):
+        is_time = getattr(path[-1], "name", "") == "time"
+        return jnp.array(times, jnp.int32) if is_time else leaf
 
-    states, actions = [], []
-    for position, velocity, own, time, action, *_ in ends:
-        drone = drone_at(position, velocity, **own, **fields)
-        state = env.begin(drone, 0, params, jnp.uint32(len(states)))
-        states.append(jax.tree_util.tree_map_with_path(partial(with_time, time), state))
-        actions.append(action)
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
-    return batch, jnp.array(actions, jnp.float32)
+    states = jax.tree_util.tree_map_with_path(with_time, states)
+    return states, jnp.array(actions, jnp.float32)

@@ -99,12 +99,14 @@ def test_artifact_of_18_components(tmp_path):
 
 def test_environment_flies_the_black_box(black_box, fly_black_box):
     env, params = gymnax.make("FlyTrack-v0", plant=black_box)
-    keys, drones = jax.random.split(jax.random.key(0), 3), jax.vmap(lambda s: pack(env.drone(s)))
+    keys = jax.random.split(jax.random.key(0), 3)
+    drones = jax.jit(jax.vmap(lambda state: pack(env.drone(state))))
     actions = jnp.array([[0.1, 0.2, -0.3, 0.4], [0.0, 0.1, 0.0, 0.2], [0.3, 0.0, 0.1, -0.5]])
     _, states = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)
+    step = jax.jit(env.step_batch)
     for _ in range(3):
         before = drones(states)
-        _, states, *_ = jax.jit(env.step_batch)(keys[0], states, actions, params)
+        _, states, *_ = step(keys[0], states, actions, params)
         expected = [fly_black_box(x, u) for x, u in zip(before, actions, strict=True)]
         assert_allclose(drones(states), expected, rtol=1e-5, atol=1e-4)
     with pytest.raises(ValueError, match=r"dt: found 0\.02 s, expected 0\.01 s"):
@@ -118,8 +120,8 @@ def test_airless_plant_is_the_minimal_model():
     constants = map(np.float32, (AIRLESS.lag, AIRLESS.thrust, AIRLESS.max_rate))
     model = ModelParameters(*constants, AIRLESS.mass, AIRLESS.gravity)
     states, actions = random_inputs(64)
-    after = jax.vmap(lambda x, u: plant.step(x, u, AIRLESS))(states, actions)
-    expected = jax.vmap(lambda x, u: model_step(x, u, 0.01, model))(states, actions)
+    after = jax.jit(jax.vmap(lambda x, u: plant.step(x, u, AIRLESS)))(states, actions)
+    expected = jax.jit(jax.vmap(lambda x, u: model_step(x, u, 0.01, model)))(states, actions)
     assert_allclose(after, expected, rtol=1e-5, atol=2e-5)
 
 
@@ -159,7 +161,7 @@ def test_runtime_interface(tmp_path, fly_black_box):
     assert_allclose(acro_step_runtime.step(x, u), fly_black_box(x, u), rtol=1e-6, atol=1e-6)
     path = build(AIRLESS, tmp_path / "airless.bin")
     elsewhere = acro_step_runtime.step(x, u, bin_path=str(path))
-    expected = plant.step(x, jnp.asarray(u), AIRLESS)
+    expected = jax.jit(lambda x, u: plant.step(x, u, AIRLESS))(x, u)
     assert_allclose(elsewhere, expected, rtol=1e-5, atol=1e-5)
     assert not np.allclose(fly_black_box(x, u), expected, rtol=1e-3, atol=1e-3)
     with pytest.raises(OSError):

@@ -9,18 +9,17 @@ import pytest
 
 from flytrack_env import compile_cache
 
-STEP = """
-import jax, gymnax, flytrack_env
-env, params = gymnax.make("FlyTrack-v0")
-_, state = env.reset(jax.random.key(0), params)
+COMPILE = """
+import jax, flytrack_env
 hits = []
 def listen(name, **_):
     if name.endswith("/cache_hits"):
         hits.append(name)
 jax.monitoring.register_event_listener(listen)
-env.step(jax.random.key(1), state, jax.numpy.zeros(4), params)
+jax.jit(lambda x: jax.numpy.sin(x) + 1.0).lower(0.5).compile()
 print(len(hits))
 """
+MIN_COMPILE_TIME = compile_cache.LEAST_S.upper()
 
 
 @pytest.fixture
@@ -30,14 +29,19 @@ def config(monkeypatch, tmp_path):
     settings.update = lambda name, value: setattr(settings, name, value)
     monkeypatch.setattr(compile_cache.jax, "config", settings)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.delenv(compile_cache.SWITCH, raising=False)
+    for variable in (compile_cache.SWITCH, MIN_COMPILE_TIME):
+        monkeypatch.delenv(variable, raising=False)
     return settings
 
 
-def test_the_next_process_compiles_nothing_that_is_slow(tmp_path):
+def test_the_next_process_does_not_compile_again(tmp_path):
     kept = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
-    environment = kept | {"XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu"}
-    command = [sys.executable, "-c", STEP]
+    environment = kept | {
+        "XDG_CACHE_HOME": str(tmp_path),
+        "JAX_PLATFORMS": "cpu",
+        MIN_COMPILE_TIME: "0",
+    }
+    command = [sys.executable, "-c", COMPILE]
     runs = [
         subprocess.run(command, env=environment, capture_output=True, check=True) for _ in range(2)
     ]
@@ -63,6 +67,7 @@ def test_a_folder_that_cannot_be_made_or_is_not_wanted_is_not_used(config, monke
 
 def test_a_folder_that_has_grown_too_large_is_begun_afresh(config, monkeypatch):
     compile_cache.keep_compiled_programs()
+    assert config.jax_persistent_cache_min_compile_time_secs == 0.3
     folder = compile_cache.Path(config.jax_compilation_cache_dir)
     (folder / "old").write_bytes(b"12345")
     config.jax_compilation_cache_dir = None

@@ -32,6 +32,7 @@ from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, Verdict,
 from flytrack_sysid.parameters import names_of, to_vector, with_values
 from tests.contract.test_effects import inside_ranges
 from tests.support.hidden_flights import scripted
+from tests.support.slow import slow_but
 
 SECONDS, DT_S = 12.0, 0.01
 SETTLED = 150  # rows until a start is forgotten
@@ -125,16 +126,22 @@ def shown(model, cause):
     return model.with_effects(inside_ranges(effect, 0.9))
 
 
-def test_every_cause_has_a_plot_in_which_it_shows(flown):
-    base, log = flown
-    low = log["p"] - [
-        0.0,
-        0.0,
-        log["p"][:, 2].min() - 0.1,
-    ]  # some effects are there near the ground only
+SETTINGS = [effect for effect in EFFECTS if effect.search.is_setting]
+
+
+# A diagnosis does not search settings, so that their models take another compiled program.
+@pytest.mark.parametrize("are_settings", slow_but([False], [False, True]))
+def test_every_cause_has_a_plot_in_which_it_shows(flown, are_settings):
+    model, log = flown
+    effects = [effect for effect in EFFECTS if (effect in SETTINGS) == are_settings]
+    base = model.with_effects(*(effect.parameters() for effect in effects))
+    # Some effects act near the ground only.
+    low = log["p"] - [0.0, 0.0, log["p"][:, 2].min() - 0.1]
     log = replace(log, channels={**log.channels, "p": low})
-    causes = [*(effect.name for effect in EFFECTS), *BASE_CAUSES]
-    assert set(EVIDENCE) == set(causes)
+    causes = [effect.name for effect in effects]
+    if not are_settings:
+        causes += BASE_CAUSES
+        assert set(EVIDENCE) == {*causes, *(effect.name for effect in SETTINGS)}
     models = {"without": base, **{cause: shown(base, cause) for cause in causes}}
     found = traces(log, models, like="without")
     sizes = {"rates": 0.01, "attitude": 0.01, "force": 0.05, "velocity": 0.05, "battery": 0.02}

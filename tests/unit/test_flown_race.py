@@ -17,13 +17,14 @@ from tests.support.coasting import drone_at, track_of_row
 
 TRACK = load_track("flytrack")
 REFERENCES = shipped_references(TRACK, ("nominal",))
+NUM_STATES = 900  # of flights in the environment: one shape, compiled once
 
 
 class Recorded(Plant):
     """A plant that moves the drone along recorded states (T, 21), whatever is commanded."""
 
     def __init__(self, states):
-        self.states = jnp.asarray(states, jnp.float32)
+        self.states = states
 
     def reset(self, drone, model):
         return jnp.int32(0)
@@ -35,27 +36,33 @@ class Recorded(Plant):
         return unpack(self.states[state])
 
 
-def fly_recorded(states, first_gate):
-    """Return the environment's races at each state and its causes after each step."""
+@jax.jit
+def races_and_causes(states):
+    """Return the environment's first race, its races and its causes after each step."""
     env = FlyTrack(plant=Recorded(states), missed_gate="fly_on")
     params = env.default_params
-    begun = env.begin(unpack(states[0]), first_gate, params)
+    begun = env.begin(unpack(states[0]), 0, params)
 
     def one(state, _):
         after, _, causes, events = env.transition(state, Action(0.0, 0.0, 0.0, 0.0), params)
         return after, (after.race, causes._replace(missed_gate=events.is_miss))
 
-    _, (races, causes) = jax.jit(lambda: jax.lax.scan(one, begun, None, len(states) - 1))()
-    return jax.tree.map(lambda a, b: np.append(a, b), begun.race, races), jax.device_get(causes)
+    return begun.race, *jax.lax.scan(one, begun, None, len(states) - 1)[1]
+
+
+def fly_recorded(states):
+    """Return the environment's races at each state and its causes after each step."""
+    first, races, causes = races_and_causes(jnp.asarray(states, jnp.float32))
+    return jax.tree.map(lambda a, b: np.append(a, b), first, races), jax.device_get(causes)
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.9, 2.0])
 def test_race_is_the_environments_number_by_number(shift):
     """Flown aside by up to 2 m: gates are passed, touched and missed."""
-    states, _ = ghost_rollout(REFERENCES, 900)
-    states[:, POSITION] += np.linspace(0.0, 1.0, 900)[:, None] * (0.0, shift, 0.0)
+    states, _ = ghost_rollout(REFERENCES, NUM_STATES)
+    states[:, POSITION] += np.linspace(0.0, 1.0, NUM_STATES)[:, None] * (0.0, shift, 0.0)
     race = follow_race(states[:, POSITION], TRACK, first_gate=0)
-    races, _ = fly_recorded(states, 0)
+    races, _ = fly_recorded(states)
     assert_array_equal(race.gate, races.gate_index)
     assert_array_equal(race.laps, races.laps)
     assert_allclose(race.lap_time_s, races.lap_time_s, atol=1e-5)
@@ -95,10 +102,10 @@ ENDS = {  # the first gate, at (12.5, 2, 1.35), is flown towards -x
 @pytest.mark.parametrize("end", ENDS)
 def test_end_is_the_environments(end):
     """The last state before the environment ends a flight shows why."""
-    (start, velocity), (states, _) = ENDS[end], ghost_rollout(REFERENCES, 500)
+    (start, velocity), (states, _) = ENDS[end], ghost_rollout(REFERENCES, NUM_STATES)
     states[:, VELOCITY] = velocity
-    states[:, POSITION] = start + 0.01 * np.arange(500)[:, None] * np.array(velocity)
-    _, causes = fly_recorded(states, 0)
+    states[:, POSITION] = start + 0.01 * np.arange(NUM_STATES)[:, None] * np.array(velocity)
+    _, causes = fly_recorded(states)
     last = int(np.argmax(np.any(list(causes), axis=0)))
     names = [
         name.replace("_", " ") for name, happened in causes._asdict().items() if happened[last]

@@ -25,6 +25,7 @@ from tests.support.grounded_flights import (
 )
 from tests.support.handout_plant import GRAVITY
 from tests.support.real_logs import shared
+from tests.support.slow import slow_but
 from tests.support.tables import table
 
 SLACK_S = 0.6  # two blocks and the one beside them
@@ -116,12 +117,13 @@ def test_wrong_rows_are_refused(tmp_path, form, rows, message):
         import_log(path, form, tmp_path / "map.toml")
 
 
-@pytest.mark.parametrize(
-    ("where", "form", "mapping", "before_s", "after_s"), table("real_flights")["ground"]
-)
-def test_real_flights_lose_their_ground_and_nothing_else(
-    tmp_path, where, form, mapping, before_s, after_s
-):
+REAL_FLIGHTS = {flight[0]: flight for flight in table("real_flights")["ground"]}
+FAST_FLIGHT = "cf_arpl_motors/log15"  # on the ground at both ends
+
+
+@pytest.mark.parametrize("name", slow_but([FAST_FLIGHT], REAL_FLIGHTS))
+def test_real_flights_lose_their_ground_and_nothing_else(tmp_path, name):
+    where, form, mapping, before_s, after_s = REAL_FLIGHTS[name]
     folder, _, file = where.partition("/")
     path = shared(folder) / file
     log = import_log(path, form, mapping or None, align=False).log

@@ -250,6 +250,7 @@ def test_real_log_holds_what_another_decoder_found(tmp_path):
         assert decoded[f"setpoint[{axis}]"].max() == 1022 and log["u"][:, axis].max() == 1.0
 
 
+@pytest.mark.slow
 def test_gecko_flies_without_a_mapping():
     """The first 14 frames change a frame that the decoder lost; smoothing overshoots full stick."""
     imported = import_shared("bf_gecko/btfl_002.bbl", "betaflight", None)

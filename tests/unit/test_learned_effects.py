@@ -5,7 +5,6 @@ import math
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,7 +15,9 @@ from flytrack_env.model_file import ModelFileError, load_model, save_model
 from flytrack_env.params import EnvParams
 from flytrack_env.state import Action
 from flytrack_env.wrappers import DomainRandomization, RandomizationParams
-from tests.support.simulated_flights import NOMINAL, drone_with, flown, held
+from flytrack_env.wrappers.domain_randomization import sample_model
+from tests.support.coasting import drone_at
+from tests.support.simulated_flights import NOMINAL, drone_with, fly, held
 from tests.support.tables import table
 
 NO = (0.0, 0.0, 0.0)
@@ -32,12 +33,21 @@ FLAP = Term(
 )
 WARM = Term("force", "world", (Factor("time", "saturation", (0.05,)),), (0.0, 0.0, 3.0), NO)
 LAW = Law((DRAG, FLAP, WARM))
+NUM_STEPS = 20  # of all flights: one shape, compiled once for a law
 
 
-def acceleration(effects, **state):
+def flown(effects, commands, drone=None):
+    """Return a flight, (num_steps, 37), with effects and no others."""
+    model = NOMINAL.with_effects(*effects)
+    padded = np.pad(commands, ((0, NUM_STEPS - len(commands)), (0, 0)), mode="edge")
+    flight = fly(drone_with() if drone is None else drone, padded, model)
+    return np.asarray(flight, float)[: len(commands)]
+
+
+def acceleration(effect, **state):
     """Return what effects add to the acceleration of one step, world frame."""
     drone = drone_with(**state)
-    return (flown(effects, held(), drone) - flown((), held(), drone))[0, 6:9]
+    return (flown((effect,), held(), drone) - flown((), held(), drone))[0, 6:9]
 
 
 def test_a_term_along_the_air_brakes_as_its_formula_says():
@@ -51,7 +61,8 @@ def test_a_term_along_the_air_brakes_as_its_formula_says():
 
 def test_a_product_turns_the_drone():
     drone = drone_with(vel_w=(3.0, 0.0, 0.0))
-    plain, law = (flown(one, held(), drone)[0] for one in ((), LearnedLaw(1.0, 0.0, Law((FLAP,)))))
+    effects = (LearnedLaw(1.0, 0.0, Law((FLAP,))),)
+    plain, law = (flown(own, held(), drone)[0] for own in ((), effects))
     thrust = plain[8] + NOMINAL.g
     np.testing.assert_allclose(
         law[13:16] - plain[13:16], [0.0, 0.01 * thrust * 3.0, 0.0], rtol=1e-4
@@ -59,15 +70,16 @@ def test_a_product_turns_the_drone():
 
 
 def test_time_since_the_start_acts():
-    flight = flown(LearnedLaw(1.0, 0.0, Law((WARM,))), held(20)) - flown((), held(20))
-    expected = 3.0 * (1.0 - np.exp(-0.01 * np.arange(20) / 0.05))
+    sticks = held(NUM_STEPS)
+    flight = flown((LearnedLaw(1.0, 0.0, Law((WARM,))),), sticks) - flown((), sticks)
+    expected = 3.0 * (1.0 - np.exp(-0.01 * np.arange(NUM_STEPS) / 0.05))
     np.testing.assert_allclose(flight[:, 8], expected, atol=2e-3)
 
 
 def test_neutral_and_empty_are_absent():
     plain = flown((), held(5))
     for effect in (LearnedLaw(0.0, 0.0, LAW), LearnedLaw(1.0)):
-        np.testing.assert_array_equal(flown(effect, held(5)), plain)
+        np.testing.assert_array_equal(flown((effect,), held(5)), plain)
 
 
 def extended():
@@ -84,23 +96,18 @@ def test_files_keep_what_was_learnt(tmp_path):
 
 def test_the_environment_flies_it_and_has_gradients():
     env = make("FlyTrack-v0", model=extended())
-    keys = jax.random.split(jax.random.key(0), 16)
-    _, states = jax.vmap(env.reset, (0, None))(keys, env.default_params)
-    step = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))
-    observations = step(keys, states, jnp.zeros((16, 4)), env.default_params)[0]
-    assert np.isfinite(observations).all()
+    drone = drone_at((15.0, 2.0, 1.35), (-4.0, 0.0, 1.0))
+    state = env.begin(drone, 0, env.default_params)
 
-    def speed(scale):
+    def flown(scale):
+        """Return the speed after a step, and the observation."""
         model = env.default_params.model.with_effects(LearnedLaw(scale, 0.0, LAW))
         params = env.default_params.replace(model=model)
+        after, *_ = env.advance(state, Action(0.0, 0.0, 0.0, 0.0), params)
+        return env.drone(after).vel_w.norm(), env.observe(None, after, None, params)
 
-        def after(state):
-            return env.drone(env.advance(state, Action(0.0, 0.0, 0.0, 0.0), params)[0]).vel_w.norm()
-
-        return jax.vmap(after)(states).sum()
-
-    slope = jax.grad(speed)(1.0)
-    assert np.isfinite(slope) and slope != 0.0
+    slope, observation = jax.jit(jax.grad(flown, has_aux=True))(1.0)
+    assert np.isfinite(observation).all() and np.isfinite(slope) and slope != 0.0
 
 
 def test_its_spread_can_be_drawn():
@@ -109,12 +116,11 @@ def test_its_spread_can_be_drawn():
     ranges = RandomizationParams(low=ends[0], high=ends[1])
     params: EnvParams = env.default_params.replace(wrappers={DomainRandomization.key: ranges})
     env.check_params(params)
-    states = [env.reset(jax.random.key(seed), params)[1] for seed in range(8)]
-    spreads = [float(env.model(state, params).effect("learned_law").spread) for state in states]
-    assert min(spreads) < -0.2 and max(spreads) > 0.2
-    assert all(
-        float(env.model(state, params).effect("learned_law").scale) == 1.0 for state in states
-    )
+    words = jax.random.bits(jax.random.key(0), (8,))
+    draw = jax.jit(jax.vmap(lambda word: sample_model(word, params.model, ranges)))
+    drawn = draw(words).effect("learned_law")
+    assert drawn.spread.min() < -0.2 and drawn.spread.max() > 0.2
+    assert (drawn.scale == 1.0).all()
 
 
 def test_every_quantity_has_a_value_and_every_shape_a_formula():

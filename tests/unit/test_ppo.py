@@ -89,8 +89,10 @@ ALL_OFF = {"min_std": 0.0, **dict.fromkeys(SWITCHES, False)}
 # The clock is hidden, so a constant reward of 1 has one value: 1 / (1 - gamma) if it never ends.
 @pytest.mark.parametrize(
     ("changes", "expected", "near"),
-    [({}, 10.0, 0.05), (ALL_OFF, VALUE_OF_EIGHT, 0.1)],
-    ids=["on", "all off"],
+    [
+        pytest.param({}, 10.0, 0.05, id="on"),
+        pytest.param(ALL_OFF, VALUE_OF_EIGHT, 0.1, id="all off", marks=pytest.mark.slow),
+    ],
 )
 def test_value_bootstraps_through_truncation_unless_switched_off(changes, expected, near):
     network, params = train(Probe(terminates=False), **changes)

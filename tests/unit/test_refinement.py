@@ -15,6 +15,7 @@ from flytrack_sysid.log import FlightLog
 from flytrack_sysid.prediction_windows import QUANTITIES
 from flytrack_sysid.split import held_out_rows
 from tests.support.hidden_flights import scripted
+from tests.support.slow import slow_but
 
 SECONDS = 40.0
 TRUE_DRAG = {"d_x": 0.4, "d_y": 0.4, "d_z": 0.2}
@@ -68,7 +69,7 @@ def test_values_are_refined_by_flights(dragged):
     assert found.judge.worst_ratio(found.fit.vector) < 1.0
 
 
-@pytest.mark.parametrize("step_s", [0.01, 0.005])
+@pytest.mark.parametrize("step_s", slow_but([0.01], [0.01, 0.005]))
 def test_a_late_gyro_starts_flights_at_the_rates_of_their_time(step_s):
     """Rates are corrected by a late reading until it arrives, however many steps late."""
     late = {"imu_latency": {"latency_s": 3.7 * step_s}}

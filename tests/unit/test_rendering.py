@@ -87,9 +87,8 @@ def test_animation_shows_the_flying_lap_beside_the_time_optimal_one(tmp_path, mo
 
 def test_gates_have_the_ids_of_the_track_file():
     env = gymnasium.make(BASE, render_mode="rgb_array").unwrapped
-    for track, ids in (("flytrack", [0, 1, 2, 3, 4, 8, 9, 10]), ("split_s", list(range(7)))):
-        env.reset(options={"track": track})
-        assert list(env._renderer.gate_ids) == ids
+    env.reset()
+    assert list(env._renderer.gate_ids) == [0, 1, 2, 3, 4, 8, 9, 10]
 
 
 def test_single_environment_renders_its_own_flight_and_record_video_every_step(tmp_path):

@@ -28,6 +28,7 @@ from flytrack_env.wrappers import (
     RandomizationParams,
 )
 from flytrack_env.wrappers.domain_randomization import sample_model
+from tests.support.coasting import Coasting
 from tests.support.wrapped_flights import (
     ALL,
     ENDS,
@@ -328,7 +329,7 @@ def test_what_begins_depends_on_nothing_of_what_ended(flight, poison):
 
 
 def test_the_handouts_environment_steps_as_flytrack_does():
-    env, same = DroneRaceEnv(track="split_s"), FlyTrack(track="split_s")
+    env, same = (make(track="split_s", plant=Coasting()) for make in (DroneRaceEnv, FlyTrack))
     params, key, action = env.default_params, jax.random.key(3), jnp.array([0.1, -0.2, 0.3, 0.4])
     begun, expected = env.reset(rng=key, params=params), same.reset(key, params)
     chex.assert_trees_all_equal(begun, expected)
