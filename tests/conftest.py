@@ -1,16 +1,24 @@
 """Shared fixtures: an environment, its compiled functions, the trainer, the shipped black box."""
 
+import os
 from pathlib import Path
 
-import gymnax
 import jax
 import numpy as np
 import pytest
 
-from flytrack_env.blackbox import load as load_black_box
-from tests.support.black_boxes import SHIPPED
-
 MEMORY_MAPS, MOST_MEMORY_MAPS = Path("/proc/self/maps"), 25_000
+
+
+def pytest_configure(config):
+    """Have programs compiled without LLVM's optimisation where slow tests are left out.
+
+    Fast tests run most programs once: compiling them takes longer than running them. The slow tests
+    and those of a single file (``-m ""``) run optimised programs. XLA reads its flags once, so that
+    this file imports nothing that computes before this function is called.
+    """
+    if config.getoption("markexpr") == "not slow":
+        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -28,6 +36,10 @@ def few_programs_at_a_time():
 @pytest.fixture(scope="session")
 def env():
     """The environment as gymnax makes it."""
+    import gymnax
+
+    import flytrack_env  # noqa: F401, registers the ids
+
     return gymnax.make("FlyTrack-v0")[0]
 
 
@@ -57,7 +69,9 @@ def whole(trainer, tmp_path_factory):
 @pytest.fixture(scope="module")
 def black_box():
     """The shipped black box."""
-    return load_black_box(SHIPPED)
+    from flytrack_env import blackbox
+
+    return blackbox.load(blackbox.SHIPPED)
 
 
 @pytest.fixture(scope="module")
