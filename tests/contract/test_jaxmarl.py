@@ -46,5 +46,5 @@ def test_jaxmarls_wrapper_logs_returns_of_episodes():
     env, actions = short_race()
     env = LogWrapper(env)
     _, state = env.reset(jax.random.key(0))
-    *_, dones, info = jax.jit(env.step)(jax.random.key(1), state, actions)
+    *_, dones, info = env.step(jax.random.key(1), state, actions)
     assert dones["__all__"] and (info["returned_episode_lengths"] == 1).all()

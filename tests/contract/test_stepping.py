@@ -10,20 +10,16 @@ import jax
 import numpy as np
 import pytest
 
-from flytrack_env.registration import ENVIRONMENTS, RACES
 from tests.support.slow import slow_but
-from tests.support.stepping import WAYS, XLA_FLAGS, flight, inputs
+from tests.support.stepping import XLA_FLAGS, flight, inputs
 
 PLAIN, EVERY_WRAPPER, SEVERAL_DRONES = "FlyTrack-v0", "FlyTrackRobust-v0", "FlyTrackDuel-v0"
-# Types and promotion are asked of every id without compiling it. Flights cost a compilation or more
-# each: they are of one id of each kind.
-OVER_IDS = pytest.mark.parametrize("env_id", slow_but([PLAIN], (*ENVIRONMENTS, *RACES)))
 OVER_KINDS = pytest.mark.parametrize(
     "env_id", slow_but([PLAIN], (PLAIN, EVERY_WRAPPER, SEVERAL_DRONES))
 )
 
 
-@OVER_IDS
+@OVER_KINDS
 def test_with_x64_a_step_keeps_the_types_of_the_state(env_id):
     env = gymnax.make(env_id)[0]
     with jax.enable_x64(True):
@@ -56,7 +52,7 @@ def test_with_x64_a_flight_is_the_same(env_id):
         np.testing.assert_allclose(leaf, expected_leaf, rtol=1e-5, atol=1e-5)
 
 
-@OVER_IDS
+@OVER_KINDS
 def test_with_strict_promotion_reset_and_step_compile(env_id):
     env = gymnax.make(env_id)[0]
     with jax.numpy_dtype_promotion("strict"):
@@ -71,10 +67,20 @@ def test_a_flight_has_no_nan(env_id):
         jax.block_until_ready(jax.jit(flight(env))(*inputs(env)))
 
 
-@OVER_KINDS
-def test_flights_on_four_devices_are_those_on_one(env_id):
+# JAX's maps run the whole program on each device, so that they do not depend on the environment.
+SHARDED = (PLAIN, "sharding")
+DIVIDED = (
+    SHARDED,
+    (PLAIN, "shard_map", "pmap"),
+    (EVERY_WRAPPER, "sharding"),
+    (SEVERAL_DRONES, "sharding"),
+)
+
+
+@pytest.mark.parametrize("case", slow_but([SHARDED], DIVIDED), ids="-".join)
+def test_flights_on_four_devices_are_those_on_one(case):
     environment = {**os.environ, "XLA_FLAGS": XLA_FLAGS}
-    command = [sys.executable, "-m", "tests.support.stepping", env_id]
+    command = [sys.executable, "-m", "tests.support.stepping", *case]
     result = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     assert result.returncode == 0, result.stderr[-3000:]
-    assert f"flown in {len(WAYS)} ways" in result.stdout
+    assert all(f"flown by {way}\n" in result.stdout for way in case[1:])

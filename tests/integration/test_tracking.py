@@ -6,7 +6,7 @@ from baselines.purejaxrl_ppo import load_checkpoint, monitor, tracking
 from baselines.purejaxrl_ppo.training import Options
 from flytrack_env.rollout import load_rollout
 from tests.support.pages import ROOT
-from tests.support.ppo_runs import BATCH, DEAD_URI, SEED, assert_same_end
+from tests.support.ppo_runs import BATCH, DEAD_URI, ENV_ID, SEED, assert_same_end
 
 METRICS = {
     "race/episode_return",
@@ -53,7 +53,7 @@ def test_everything_is_recorded_once_though_the_run_was_cut_off(
     assert capsys.readouterr().out.count(f"MLflow: {page} after `mlflow ui") == 1
     description = load_checkpoint(tmp_path / "final.safetensors").meta
     parts = {part: description[part] for part in ("config", "environment", "model")}
-    expected = tracking.describe_params(parts) | {"seed": str(SEED), "env_id": "FlyTrackRobust-v0"}
+    expected = tracking.describe_params(parts) | {"seed": str(SEED), "env_id": ENV_ID}
     assert expected.items() <= run.data.params.items()
     page = (ROOT / "docs" / "baseline.md").read_text(encoding="utf-8")
     assert set(run.data.metrics) >= METRICS

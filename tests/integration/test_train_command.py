@@ -8,7 +8,7 @@ from baselines.purejaxrl_ppo import Config, load_checkpoint, train_ppo
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.train_ppo import make_trainer, parse
 from baselines.purejaxrl_ppo.training import DEFAULT_OPTIONS, DivergedError, Stopped, Trainer
-from tests.support.ppo_runs import CONFIG, SEED
+from tests.support.ppo_runs import CONFIG, ENV_ID, SEED
 from tests.support.ppo_runs import make_trainer as make_shared_trainer
 from tests.support.tables import table
 
@@ -54,7 +54,7 @@ def test_what_does_not_fit_a_run_is_refused(
 
 def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole):
     settings, start = read("--resume", whole[0], "--evaluate-every", 5)
-    assert settings.hyperparameters == CONFIG and settings.env_id == "FlyTrackRobust-v0"
+    assert settings.hyperparameters == CONFIG and settings.env_id == ENV_ID
     assert (settings.seed, start.path) == (SEED, whole[0] / "final.safetensors")
     assert settings.run.evaluate_every == 5
     assert settings.run.checkpoint_every == DEFAULT_OPTIONS.checkpoint_every

@@ -24,7 +24,7 @@ from baselines.purejaxrl_ppo.checkpoint import (
 )
 from baselines.purejaxrl_ppo.training import DivergedError, Options, Run, Stopped, Trainer
 from tests.support.pages import ROOT
-from tests.support.ppo_runs import BATCH, CONFIG, EVERY_OTHER_UPDATE, SEED, assert_same_end
+from tests.support.ppo_runs import BATCH, CONFIG, ENV_ID, EVERY_OTHER_UPDATE, SEED, assert_same_end
 from tests.support.slow import slow_but
 
 
@@ -103,7 +103,7 @@ def test_another_machine_or_software_is_a_warning(whole, caplog):
 
 def test_a_complete_run_is_extended(whole, tmp_path, capsys):
     """The first 7 updates are those of the shorter run; a cut in what follows changes no bit."""
-    longer = Trainer(dataclasses.replace(CONFIG, total_timesteps=10 * BATCH), "FlyTrackRobust-v0")
+    longer = Trainer(dataclasses.replace(CONFIG, total_timesteps=10 * BATCH), ENV_ID)
     for name in ("one", "two"):
         shutil.copytree(whole[0], tmp_path / name)
     final, metrics = longer.train(tmp_path / "one", SEED, EVERY_OTHER_UPDATE, tmp_path / "one")
@@ -117,7 +117,7 @@ def test_a_complete_run_is_extended(whole, tmp_path, capsys):
     with pytest.raises(
         CheckpointError, match=f"steps: found {10 * BATCH}, expected at most {7 * BATCH}"
     ):
-        Trainer(CONFIG, "FlyTrackRobust-v0").train(tmp_path / "one", SEED, resume=tmp_path / "one")
+        Trainer(CONFIG, ENV_ID).train(tmp_path / "one", SEED, resume=tmp_path / "one")
 
 
 def poison(trainer, monkeypatch, from_update):
@@ -205,6 +205,7 @@ def start(out, *flags):
 
 @pytest.mark.slow
 def test_a_run_killed_at_any_moment_ends_in_the_same_bits(tmp_path, monkeypatch):
+    """Of the id with the most state: a drone and noise of each episode, and earlier commands."""
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "compiled"))
     flags = (
         "--env-id FlyTrackRobust-v0 --num-envs 16 --num-steps 24 --num-minibatches 4 "

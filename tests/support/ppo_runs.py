@@ -9,6 +9,7 @@ from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.training import Options, Trainer
 
 SEED = 3
+ENV_ID = "FlyTrackNoisy-v0"  # whose episodes remember the word of their noise
 BATCH = 16 * 24
 CONFIG = Config(
     total_timesteps=7 * BATCH, num_envs=16, num_steps=24, num_minibatches=4, hidden_sizes=(8,)
@@ -20,9 +21,7 @@ DEAD_URI = "http://127.0.0.1:9"  # the port at which nothing listens
 @cache
 def make_trainer():
     """Return the trainer, compiled once for all tests of a process."""
-    # The id with the most state: another drone in every episode, sensor noise, a history of
-    # commands.
-    return Trainer(CONFIG, "FlyTrackRobust-v0")
+    return Trainer(CONFIG, ENV_ID)
 
 
 def assert_same_end(path, expected):
