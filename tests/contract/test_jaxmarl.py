@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import pytest
 from jaxmarl.environments import MultiAgentEnv
 from jaxmarl.environments.spaces import Space
 from jaxmarl.wrappers.baselines import LogWrapper
@@ -42,6 +43,7 @@ def test_a_race_that_is_over_is_reset_to_the_state_that_is_given():
     assert all(jax.tree.leaves(jax.tree.map(jnp.array_equal, state, given)))
 
 
+@pytest.mark.slow  # it compiles a step with auto-reset
 def test_jaxmarls_wrapper_logs_returns_of_episodes():
     env, actions = short_race()
     env = LogWrapper(env)

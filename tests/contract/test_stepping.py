@@ -14,9 +14,8 @@ from tests.support.slow import slow_but
 from tests.support.stepping import XLA_FLAGS, flight, inputs
 
 PLAIN, EVERY_WRAPPER, SEVERAL_DRONES = "FlyTrack-v0", "FlyTrackRobust-v0", "FlyTrackDuel-v0"
-OVER_KINDS = pytest.mark.parametrize(
-    "env_id", slow_but([PLAIN], (PLAIN, EVERY_WRAPPER, SEVERAL_DRONES))
-)
+KINDS = (PLAIN, EVERY_WRAPPER, SEVERAL_DRONES)
+OVER_KINDS = pytest.mark.parametrize("env_id", slow_but([PLAIN], KINDS))
 
 
 @OVER_KINDS
@@ -41,7 +40,8 @@ def as_type(dtype, leaf):
     return jax.ShapeDtypeStruct(leaf.shape, dtype if is_float else leaf.dtype)
 
 
-@OVER_KINDS
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", KINDS)
 def test_with_x64_a_flight_is_the_same(env_id):
     env = gymnax.make(env_id)[0]
     keys, actions, params = inputs(env)

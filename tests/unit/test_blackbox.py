@@ -26,6 +26,7 @@ from tests.support.black_boxes import (
     start,
     write_artifact,
 )
+from tests.support.coasting import drone_at
 
 REFUSALS = [
     (
@@ -99,16 +100,13 @@ def test_artifact_of_18_components(tmp_path):
 
 def test_environment_flies_the_black_box(black_box, fly_black_box):
     env, params = gymnax.make("FlyTrack-v0", plant=black_box)
-    keys = jax.random.split(jax.random.key(0), 3)
-    drones = jax.jit(jax.vmap(lambda state: pack(env.drone(state))))
-    actions = jnp.array([[0.1, 0.2, -0.3, 0.4], [0.0, 0.1, 0.0, 0.2], [0.3, 0.0, 0.1, -0.5]])
-    _, states = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)
-    step = jax.jit(env.step_batch)
-    for _ in range(3):
-        before = drones(states)
-        _, states, *_ = step(keys[0], states, actions, params)
-        expected = [fly_black_box(x, u) for x, u in zip(before, actions, strict=True)]
-        assert_allclose(drones(states), expected, rtol=1e-5, atol=1e-4)
+    state = env.begin(drone_at((15.0, 2.0, 1.35), (-4.0, 0.0, 1.0)), 0, params)
+    step = jax.jit(env.step_env)
+    for action in jnp.array([[0.1, 0.2, -0.3, 0.4], [0.0, 0.1, 0.0, 0.2], [0.3, 0.0, 0.1, -0.5]]):
+        before = pack(env.drone(state))
+        _, state, *_ = step(None, state, action, params)
+        expected = fly_black_box(before, action)
+        assert_allclose(pack(env.drone(state)), expected, rtol=1e-5, atol=1e-4)
     with pytest.raises(ValueError, match=r"dt: found 0\.02 s, expected 0\.01 s"):
         black_box.step(None, None, 0.02, None)
 
