@@ -115,11 +115,8 @@ def diagnose(
         selection = select(*extended(state, base, base))
         # Drones, and who is late, are told by their clocks; two simulator's steps only by what they
         # leave. A measured log is continuous, and never gets here.
-        if (
-            motion is None
-            and not parts.moves.late_s
-            and parts.moves.motion is not Motion.CONTINUOUS
-        ):
+        moves = parts.moves
+        if not (moves.is_sure or moves.late_s or moves.motion is Motion.CONTINUOUS):
             likelier = likelier_motion(selection.state.problem, selection.model.vector)
             if likelier is not parts.moves.motion:
                 parts = split(log, model, held_out, likelier)

@@ -1,7 +1,8 @@
 """How a log moves: by which motion, and how late its poses are against its gyro.
 
 A motion is a simulator's step, or the continuous motion of a drone. Half a step of another motion
-looks like clocks that are half a step apart, so both are chosen together. The correlation of gyro
+looks like clocks that are half a step apart, so both are chosen together, where the sensors do not
+show the motion by themselves (``motion_of_sensors``). The correlation of gyro
 and attitude says how late poses are under each motion. Each is fitted so with the base and the few
 effects that can pass for half a step (delays, drag, scales), on some seconds of the log, the
 lateness of the likely ones along with it, and the likelihoods of what was logged are compared.
@@ -24,10 +25,10 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, Effect
 from flytrack_env.motion import Motion
-from flytrack_sysid.clocks import PAIRS, offset_between
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.lanes import Lanes, lanes_of
 from flytrack_sysid.diagnosis.lateness import judged_as_logged, read_poses
+from flytrack_sysid.diagnosis.motion_of_sensors import apparent_lateness, motion_of_sensors
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_weight
 from flytrack_sysid.diagnosis.score_test import Linearization, solve
 from flytrack_sysid.diagnosis.search import refine
@@ -71,6 +72,7 @@ class Moves(NamedTuple):
     """How a log moves, and how late its poses are.
 
     late_s: the poses against the gyro, 0 if on time. sigma_s: the standard error of ``late_s``.
+    is_sure: the motion was given, or is what the sensors show.
 
     While a motion is chosen, ``late_s`` is negative where the gyro and the accelerometer are late.
     """
@@ -78,6 +80,7 @@ class Moves(NamedTuple):
     motion: Motion
     late_s: float = 0.0
     sigma_s: float = 0.0
+    is_sure: bool = False
 
 
 class Trial(NamedTuple):
@@ -205,24 +208,16 @@ def _costs(trials: Sequence[Trial], misfits: Sequence[float]) -> list[float]:
     ]
 
 
-def _apparent_lateness(log: FlightLog) -> tuple[float, float] | None:
-    """Return the lateness of poses by correlation, s, and its standard error; None if unknown."""
-    for _, _, needed, sums, rates in PAIRS[:2]:
-        if all(name in log for name in needed):
-            offset_s, sigma_s, _, reason = offset_between(log, sums(log), rates(log))
-            return None if reason else (offset_s, sigma_s)
-    return None
-
-
 def how_it_moves(
     log: FlightLog, model: ModelParameters, judged: np.ndarray, motion: Motion | None = None
 ) -> Moves:
     """Return how a log moves, likeliest on judged rows, (num_rows,) bool, in float64.
 
-    model: where the search starts. motion: the only one that is tried, if given. A drone's where
-    the log hardly tells.
+    model: where the search starts. motion: the only one that is tried, if given, or if the sensors
+    are sure of one. A drone's where the log hardly tells.
     """
-    motions, apparent = tuple(Motion) if motion is None else (motion,), _apparent_lateness(log)
+    motion = motion_of_sensors(log) if motion is None else motion
+    motions, apparent = tuple(Motion) if motion is None else (motion,), apparent_lateness(log)
     late = {one: Moves(one) for one in motions}
     if apparent is not None:
         offset_s, sigma_s = apparent
@@ -234,7 +229,7 @@ def how_it_moves(
             if abs(late_s) > is_small:
                 late[one] = Moves(one, late_s, sigma_s)
     if motion is not None and late[motion].late_s <= 0.0:
-        return Moves(motion)
+        return Moves(motion, is_sure=True)
     if apparent is not None and [one for one in motions if late[one] == Moves(one)] == [
         Motion.CONTINUOUS
     ]:
@@ -243,7 +238,8 @@ def how_it_moves(
     num_parts = max(lanes_of(log, seen.judged, model).row.shape[1] // MOST_LANES, 1)
     found = _chosen(seen._replace(num_parts=num_parts), list(late.values()))
     is_late = found.late_s > max(LEAST_S, STANDARD_ERRORS * found.sigma_s)
-    return found if is_late else Moves(found.motion)
+    found = found if is_late else Moves(found.motion)
+    return found._replace(is_sure=motion is not None)
 
 
 def _known_around(log: FlightLog, moves: Sequence[Moves]) -> np.ndarray:
@@ -320,5 +316,7 @@ def motion_of(log: FlightLog, model: ModelParameters) -> Motion:
         return required
     if "w" not in log and "q" not in log:
         return model.motion
+    if (shown := motion_of_sensors(log)) is not None:
+        return shown
     with jax.enable_x64(True):
         return how_it_moves(log, model, np.ones(len(log), bool)).motion

@@ -20,9 +20,11 @@ from flytrack_env import (
 from flytrack_env.model_file import ModelFileError
 from flytrack_env.state import unpack_action
 from flytrack_sysid.importing.flight import Craft
+from tests.support.slow import slow_but
 
 HANDOUT = Battery()
 CELL_V = (3.4, 4.2)
+MASS_KG = {1: 0.032, 4: 0.6, 6: 0.75}  # by cells: a whoop, a freestyle quadcopter, a racer
 NUM_STARTS = 256
 BATTERY_ROW = 22  # of the observation
 
@@ -32,9 +34,9 @@ def craft_model(cells, mass_kg):
     return Craft((800.0, 800.0, 500.0), mass_kg, volts).nominal_model("a test")
 
 
-def test_episodes_stay_within_the_battery_of_the_craft():
-    cells = 4
-    model = craft_model(cells, 0.6)
+@pytest.mark.parametrize("cells", slow_but([4], MASS_KG))
+def test_episodes_stay_within_the_battery_of_the_craft(cells):
+    model = craft_model(cells, MASS_KG[cells])
     assert model.battery == Battery(4.2 * cells, 3.4 * cells, 3.4 * cells, 4.2 * cells)
     env, params = gymnax.make("FlyTrack-v0", model=model)
     keys = jax.random.split(jax.random.key(0), NUM_STARTS)

@@ -10,6 +10,7 @@ import pytest
 from flytrack_sysid import LogError, import_log
 from flytrack_sysid.timestamps import number_segments, put_on_one_line, read_clock
 from tests.support.foreign_logs import WRITERS, flying
+from tests.support.slow import slow_but
 from tests.support.tables import table
 
 STEP_S, NUM_ROWS, ROW = 0.004, 1000, 400  # of the written logs; the row at which the clock fails
@@ -67,7 +68,7 @@ def test_what_fits_is_kept_and_the_rest_is_counted(name):
 OUTCOMES = ("a stray stamp an hour later", "set back by 1.5 s", "a roll-over of us")
 
 
-@pytest.mark.parametrize("fault", OUTCOMES)
+@pytest.mark.parametrize("fault", slow_but(OUTCOMES, FAULTS))
 @pytest.mark.parametrize("kind", WRITERS)
 def test_every_format_reads_its_clock(kind, fault, tmp_path):
     form, write = WRITERS[kind]
