@@ -49,14 +49,15 @@ from flytrack_sysid.trace_cache import keep_trace
 
 BATCH = 8  # models at once
 SPACING_S, SHORT_SPACING_S = 0.25, 0.05
-MOST_WINDOWS = 3 * CHUNK
+# To fit and to judge by. Windows overlap: fewer say nearly as much, and a fit flies them often.
+MOST_FITTED, MOST_JUDGED = CHUNK, 3 * CHUNK
 FEWEST_WINDOWS, FEWEST_BLOCKS = 12, 3  # fewer say nothing of a cell
 RIDGE = 0.05  # of the placebo, in units of its regressors' variance
 ALWAYS_FITTED_S = 0.25  # horizons up to this are fitted even where the placebo is as good
 OUTLIER = 3.0  # errors beyond so many of the base's rms count by their size, not its square
 MOST_ROUNDS, REFIT_ROUNDS, LEAST_GAIN = (
     10,
-    4,
+    2,
     1e-3,
 )  # of a fit, of one without an effect; share of the cost
 NEUTRAL = 1e-3  # of a parameter's scale
@@ -393,9 +394,9 @@ class Refined(NamedTuple):
         return next((found[key] for key in keys if key in found), {})
 
 
-def windows_of(log: FlightLog, rows: np.ndarray) -> Windows | None:
+def windows_of(log: FlightLog, rows: np.ndarray, most: int = MOST_JUDGED) -> Windows | None:
     """Return windows over some rows of a log; None where there are none."""
-    found = make_windows(log, rows, SPACING_S, MOST_WINDOWS)
+    found = make_windows(log, rows, SPACING_S, most)
     if len(found.start) < CHUNK:  # a chunk costs the same, full or not
         found = make_windows(log, rows, SHORT_SPACING_S, CHUNK)
     return found if len(found.start) else None
@@ -446,7 +447,7 @@ def refine(
     residuals leave noise only; the model is then the most likely one already, and stands as long as
     it predicts no horizon worse than the base.
     """
-    learnt, judged = windows_of(log, ~held_out), windows_of(log, held_out)
+    learnt, judged = windows_of(log, ~held_out, MOST_FITTED), windows_of(log, held_out)
     problem, candidates, extended = state.problem, model.candidates, model.vector
     as_found = Refined(candidates, None, None, (), {}, problem, None)
     if learnt is None or judged is None:
