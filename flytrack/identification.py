@@ -117,8 +117,7 @@ def run_fit(flags: Fit) -> None:
     save_model(flags.out, found.model, provenance)
     is_other = flags.start is not None and start.motion is not told
     print(
-        f"motion: {found.model.motion.value}"
-        + f", by likelihood; --from says {told.value}" * is_other
+        f"motion: {found.model.motion.value}" + f", by the log; --from says {told.value}" * is_other
     )
     print(found.describe())
     print_written([flags.out])
@@ -153,6 +152,8 @@ def run_diagnose(flags: Diagnose) -> None:
     model = None if flags.model is None else load_model(flags.model)
     motion = None if flags.motion == "auto" else Motion(flags.motion)
     if flags.quick:
+        if before:
+            raise ValueError("--quick: found beside --before, expected one of the two")
         print(f"{first_look(logs, model, held_out, motion).text()}\n{NOT_CHECKED}")
         return
     if flags.out is None:

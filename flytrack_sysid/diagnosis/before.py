@@ -21,7 +21,6 @@ from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis import search
 from flytrack_sysid.diagnosis.diagnose import (
-    Judged,
     Split,
     held_out_under,
     refined_within_range,
@@ -151,7 +150,7 @@ def diagnose_change(
         report(2, 3)
         selection = selection_of(later, earlier)
         test = held_out_under(selection, parts.test)
-        judged = refined_within_range(Judged(selection, {}), test, parts)
+        judged = refined_within_range(selection, {}, test, parts)
         found = summarize(judged, parts._replace(test=test))
         # A change is named by its steps and size; the extended model has it only if flights gain by
         # it.

@@ -14,7 +14,7 @@ from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis import summary
-from flytrack_sysid.diagnosis.beyond import with_and_without, with_learned
+from flytrack_sysid.diagnosis.beyond import Learned, with_and_without, with_learned
 from flytrack_sysid.diagnosis.first_look import FirstLook
 from flytrack_sysid.diagnosis.lanes import (
     Lanes,
@@ -38,6 +38,7 @@ from flytrack_sysid.diagnosis.outliers import outlier_notes, outliers_of
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Refined, reduced, refine
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis
+from flytrack_sysid.diagnosis.score_test import Linearization
 from flytrack_sysid.diagnosis.search import (
     FittedModel,
     SearchState,
@@ -123,10 +124,10 @@ def diagnose(
                 state, base = begun(parts)
                 selection = select(*extended(state, base, base))
         report(2, len(STAGES))
-        judged = judged_in_time(selection, parts)
-        selection, test = judged.selection, held_out_under(judged.selection, parts.test)
+        selection, rejected = vetoed_in_time(selection, parts)
+        test = held_out_under(selection, parts.test)
         report(3, len(STAGES))
-        judged = refined_within_range(judged, test, parts)
+        judged = refined_within_range(selection, rejected, test, parts)
         report(4, len(STAGES))
         found = summarize(judged, parts._replace(test=test))
         nominal = nominal_parameters() if model is None else model
@@ -209,19 +210,23 @@ def held_out_under(selection: Selection, test: Problem) -> Problem:
 
 
 class Judged(NamedTuple):
-    """A selection after its vetoes: the veto of each effect that is gone, and how it was refined.
+    """A selection after its vetoes and its refinement.
 
-    refused: effects that are gone since they fit best at the end of what is searched.
+    Attributes:
+        selection: what is left.
+        rejected: the veto of each effect that is gone.
+        refused: effects that are gone since they fit best at the end of what is searched.
+        refined: how free flight judges the selection.
     """
 
     selection: Selection
     rejected: Mapping[str, Veto]
-    refined: Refined | None = None
-    refused: tuple[Cause, ...] = ()
+    refused: tuple[Cause, ...]
+    refined: Refined
 
 
-def judged_in_time(selection: Selection, parts: Split) -> Judged:
-    """Return a selection with its changes within the log, after its vetoes.
+def vetoed_in_time(selection: Selection, parts: Split) -> tuple[Selection, dict[str, Veto]]:
+    """Return a selection with its changes within the log, after its vetoes, and these by effect.
 
     A change may hide behind an effect that held-out rows contradict, so it is looked for again
     without that.
@@ -236,25 +241,25 @@ def judged_in_time(selection: Selection, parts: Split) -> Judged:
                 name: one for name, one in rejected.items() if one is not contradicted_on_held_out
             }
             rejected |= again
-    return Judged(selection, rejected)
+    return selection, rejected
 
 
-def refined_within_range(judged: Judged, test: Problem, parts: Split) -> Judged:
+def refined_within_range(
+    selection: Selection, rejected: Mapping[str, Veto], test: Problem, parts: Split
+) -> Judged:
     """Return a selection and its refinement, without effects that end where the search does.
 
     A law that fits best beyond anything known stands in for another one, and bends the values of
     the rest.
     """
+    refused: tuple[Cause, ...] = ()
     while True:
-        selection = judged.selection
         refined = refined_by_prediction(selection, parts)
         stuck = summary.causes_at_end(selection, refined, test)
         if not stuck:
-            return judged._replace(refined=refined)
-        selection, rejected = apply_vetoes(reject(selection, [one.effect for one in stuck]), test)
-        judged = Judged(
-            selection, {**judged.rejected, **rejected}, refused=(*judged.refused, *stuck)
-        )
+            return Judged(selection, rejected, refused, refined)
+        selection, again = apply_vetoes(reject(selection, [one.effect for one in stuck]), test)
+        rejected, refused = {**rejected, **again}, (*refused, *stuck)
 
 
 def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
@@ -273,24 +278,43 @@ def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
     return refined._replace(kept=tuple(kept))
 
 
-def summarize(judged: Judged, parts: Split) -> Diagnosis:
-    """Return the diagnosis of a refined model, in float64; so is the nominal model in it."""
+class Named(NamedTuple):
+    """What a refined model is named by, and the model.
+
+    Attributes:
+        selection: reduced to the effects that the refinement kept.
+        linearization: of its model.
+        extended: the model with refined values, all effects of the log in it.
+        found: causes that matter, those beyond the list among them.
+        negligible: as in ``Diagnosis``.
+        lost: causes that held-out rows contradict.
+    """
+
+    selection: Selection
+    linearization: Linearization
+    extended: FittedModel
+    found: tuple[Cause, ...]
+    negligible: tuple[Cause, ...]
+    lost: tuple[str, ...]
+
+
+def name_causes(judged: Judged, parts: Split) -> Named:
+    """Return the causes of a refined model, in float64."""
     test, refined = parts.test, judged.refined
-    assert refined is not None, "refined_within_range comes first"
     selection = reduced(judged.selection, refined)
-    problem, model = selection.state.problem, selection.model
+    model = selection.model
     # Intervals are of the model itself: those of ground_effect were a third too short with slopes
     # of a model nearby.
     state, linearization = selection.state.linearized(model.vector, max_distance=0.0)
+    selection = selection._replace(state=state)
     effects = summary.effect_causes(selection, test, linearization)
     in_base, lost_in_base = summary.base_causes(selection, test, linearization, effects)
     contradicted = [
         name for name, veto in judged.rejected.items() if veto is contradicted_on_held_out
     ]
-    lost = [*contradicted, *lost_in_base]
     extended = model if refined.fit is None else model._replace(vector=refined.fit.vector)
     found = summary.with_refined_values([*effects, *in_base], refined, extended.vector)
-    spans = spans_of(selection, parts.test, parts.log)
+    spans = spans_of(selection, test, parts.log)
     found = tuple(replace(one, **spans.get(one.effect, {})) for one in found)
 
     def without(cause: Cause) -> np.ndarray:
@@ -299,57 +323,85 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
         return refined.vector_without(cause.effect)
 
     found, negligible = split_by_size(
-        found, problem, extended.vector, refined.flight_errors, without
+        found, state.problem, extended.vector, refined.flight_errors, without
     )
-    causes = tuple(one for one in found if not one.beyond)
-    beyond = (*judged.refused, *(one for one in found if one.beyond))
+    return Named(
+        selection=selection,
+        linearization=linearization,
+        extended=extended,
+        found=found,
+        negligible=negligible,
+        lost=(*contradicted, *lost_in_base),
+    )
+
+
+def learn_rest(
+    named: Named, extended: FittedModel, refined: Refined, test: Problem
+) -> tuple[Learned | None, np.ndarray]:
+    """Return the law of what is left unexplained, if one is found, and the vector with it.
+
+    A law that acts for a part of the log is not looked for beside an effect that does, nor one
+    beside another that the given model has.
+    """
+    selection, problem = named.selection, named.selection.state.problem
+    changing = [one.effect for one in problem.windows]
+    if (
+        not selection.unexplained.shares
+        or not extended.effects.isdisjoint(changing)
+        or problem.has_given_law
+    ):
+        return None, extended.vector
+    always, always_held = (replace(one, windows=()) for one in (problem, test))
+    return find_learned(always, always_held, extended, selection.base.vector, refined.judge)
+
+
+def summarize(judged: Judged, parts: Split) -> Diagnosis:
+    """Return the diagnosis of a refined model, in float64; so is the nominal model in it."""
+    test, refined = parts.test, judged.refined
+    named = name_causes(judged, parts)
+    selection, linearization = named.selection, named.linearization
+    problem, unexplained = selection.state.problem, selection.unexplained
+    causes = tuple(one for one in named.found if not one.beyond)
+    beyond = (*judged.refused, *(one for one in named.found if one.beyond))
+    outliers = outliers_of((problem, test), named.extended.vector)
     vectors = {
         "nominal": problem.start,
         "refitted_base": selection.base.vector,
-        "extended": extended.vector,
+        "extended": named.extended.vector,
     }
-    outliers = outliers_of((problem, test), extended.vector)
-    extended = at_end(selection, extended)
+    extended = at_end(selection, named.extended)
     flying = {**vectors, "extended": extended.vector}
-    learned, judged_by = None, (test, refined)
-    # A law that acts for a part of the log is not looked for beside an effect that does, nor one
-    # beside another that the given model has.
-    others = (one.effect for one in problem.windows)
-    if (
-        selection.unexplained.shares
-        and extended.effects.isdisjoint(others)
-        and not problem.has_given_law
-    ):
-        always, always_held = (replace(one, windows=()) for one in (problem, test))
-        learned, vector = find_learned(
-            always, always_held, extended, selection.base.vector, refined.judge
-        )
+    learned, vector = learn_rest(named, extended, refined, test)
     if learned is not None:
         change = vector - extended.vector
         vectors, flying = (with_and_without(learned, one, change) for one in (vectors, flying))
         extended = extended._replace(vector=vector)
-        judged_by = test.with_law(learned.effect), refined.with_law(learned.effect)
-    limits = summary.not_identifiable(state, linearization, model, (*found, *negligible))
-    prediction = summary.prediction_of(judged_by[1], flying)
+        test, refined = test.with_law(learned.effect), refined.with_law(learned.effect)
+    prediction = summary.prediction_of(refined, flying)
     notes = [
         *outlier_notes(outliers),
-        *summary.warnings_of(problem, (*causes, *beyond), lost),
-        *summary.refinement_notes(refined, selection.model),
+        *summary.warnings_of(problem, (*causes, *beyond), named.lost),
+        *summary.refinement_notes(judged.refined, selection.model),
         *summary.stand_in_notes(selection, flying["extended"]),
-        *summary.given_law_notes(problem, selection.unexplained),
+        *summary.given_law_notes(problem, unexplained),
         *summary.unseen_at_rest_notes(judged.rejected),
         *notes_of(selection, linearization, parts.log),
     ]
-    rest = summary.with_lost_causes(selection.unexplained, lost)
+    rest = summary.with_lost_causes(unexplained, named.lost)
     rest = replace(rest, flagged=rest.flagged or bool(beyond))
     return Diagnosis(
         verdict=summary.verdict_of(causes, rest),
         causes=causes,
-        negligible=negligible,
+        negligible=named.negligible,
         beyond=beyond,
         unexplained=rest,
-        not_identifiable=limits,
-        error=summary.errors_of(judged_by[0], vectors, prediction),
+        not_identifiable=summary.not_identifiable(
+            selection.state,
+            linearization,
+            selection.model,
+            (*named.found, *named.negligible),
+        ),
+        error=summary.errors_of(test, vectors, prediction),
         nominal=problem.like,
         base=summary.model_of(problem, selection.base),
         extended=with_learned(summary.model_of(problem, extended), learned),
@@ -359,8 +411,8 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
         sha256=parts.logged.sha256,
         warnings=(*parts.warnings, *notes),
         prediction=prediction,
-        changed=summary.changed_parameters(linearization, extended, refined),
-        half_response_s=summary.half_responses_of(linearization, model, judged_by[1], flying),
+        changed=summary.changed_parameters(linearization, extended, judged.refined),
+        half_response_s=summary.half_responses_of(linearization, selection.model, refined, flying),
         outliers=outliers,
         learned=learned,
     )

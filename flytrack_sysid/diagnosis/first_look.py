@@ -16,7 +16,8 @@ from flytrack_sysid.diagnosis.summary import estimates
 MOST_LISTED = 6  # effects
 NOT_CHECKED = (
     "Not checked: whether an effect stands in for another or for something unknown, whether "
-    "held-out rows and free flight agree, changes within the log, and what no cause explains."
+    "held-out rows and free flight agree, changes within the log, and what no cause explains. "
+    "Nothing is written."
 )
 
 

@@ -278,12 +278,14 @@ def _chosen(seen: Seen, late: Sequence[Moves]) -> Moves:
 
 def _both(first: Trial, second: Trial) -> Trial:
     """Return the second trial with the lateness that both say."""
-    (motion, one_s, sigma_s), (_, other_s, other_sigma_s) = first.moves, second.moves
+    one_s, sigma_s = first.moves.late_s, first.moves.sigma_s
+    other_s, other_sigma_s = second.moves.late_s, second.moves.sigma_s
     if one_s <= 0.0:
         return second
     weights = np.array([sigma_s, other_sigma_s]) ** -2.0
     late_s = float(weights @ [one_s, other_s] / weights.sum())
-    return second._replace(moves=Moves(motion, late_s, float(weights.sum() ** -0.5)))
+    sigma_s = float(weights.sum() ** -0.5)
+    return second._replace(moves=first.moves._replace(late_s=late_s, sigma_s=sigma_s))
 
 
 def likelier_motion(problem: Problem, vector: np.ndarray) -> Motion:

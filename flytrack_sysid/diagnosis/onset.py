@@ -105,20 +105,15 @@ def windowed_gains(
 class Hypothesis(NamedTuple):
     """An effect that changes within the log.
 
-    window: when it acts; None where it drifts instead. gain: of chi2 to first order, over its
-    inflation. num_parameters: those that change.
+    way: "start", "end" or "drift". row: of the record, at which it begins or ends, 0 where it
+    drifts. gain: of chi2 to first order, over its inflation. num_parameters: those that change.
     """
 
     candidate: Candidate
-    window: Window | None
+    way: str
+    row: int
     gain: float
     num_parameters: int
-
-    @property
-    def row(self) -> int:
-        """The row of the record at which the effect begins or ends."""
-        assert self.window is not None
-        return self.window.start if self.window.start != ALWAYS else self.window.end
 
     @property
     def margin(self) -> float:
@@ -185,11 +180,7 @@ def _change_of(
     place = int(np.argmax(gains[way]))
     inflation = _inflation(score, information, given, own, ways[way][place])
     row = int(changes[place]) if way != "drift" else 0
-    window = {
-        "start": Window(candidate.effect, start=row),
-        "end": Window(candidate.effect, end=row),
-    }.get(way)
-    return Hypothesis(candidate, window, float(gains[way][place]) / inflation, len(own))
+    return Hypothesis(candidate, way, row, float(gains[way][place]) / inflation, len(own))
 
 
 def _inflation(
@@ -343,7 +334,7 @@ def notes_of(selection: Selection, linearization: Linearization, log: FlightLog)
     lacking = (*selection.state.unobservable, *selection.state.refused)
     left = changes_of(linearization, selection.model, lacking) if is_one_flight(log) else []
     if left and left[0].margin > 0.0:
-        name, how = left[0].candidate.effect, "drifts" if left[0].window is None else "changes"
+        name, how = left[0].candidate.effect, "drifts" if left[0].way == "drift" else "changes"
         value = ": its value is a mean" if name in selection.model.effects else ""
         notes.append(f"{name} {how} within the log{value}")
     return notes
@@ -376,9 +367,12 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     """Return the selection with one change more; None where none is clear."""
     state, linearization = selection.state.linearized(selection.model.vector)
     found = changes_of(linearization, selection.model, (*state.unobservable, *state.refused))
-    if not found or found[0].margin < 0.0 or found[0].window is None:
+    if not found or found[0].margin < 0.0 or found[0].way == "drift":
         return None
-    first, near = found[0], [one for one in found if one.window and one.gain > NEAR * found[0].gain]
+    first, near = (
+        found[0],
+        [one for one in found if one.way != "drift" and one.gain > NEAR * found[0].gain],
+    )
     state, model = _likeliest_side(
         selection, first, [one.candidate.effect for one in near[:MOST_NEAR]]
     )

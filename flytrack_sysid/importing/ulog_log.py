@@ -200,9 +200,9 @@ def _best_instance(
 ) -> tuple[Samples, Clock, list[str]] | None:
     """Return ``_samples_of`` the topic instance with most valid samples; the first of equals."""
     found = {
-        number: samples
+        number: whole
         for number, topic in instances.items()
-        if (samples := _samples_of(path, name, topic, fields)) is not None
+        if (whole := _samples_of(path, name, topic, fields)) is not None
     }
     if not found:
         return None
