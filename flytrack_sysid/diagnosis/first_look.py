@@ -57,7 +57,7 @@ class FirstLook(NamedTuple):
     def text(self) -> str:
         """Return it as lines of text."""
         base = [
-            f"{parameter} = {one.value:.4g} {one.unit}"
+            f"{parameter} = {one.value:.4g}" + f" {one.unit}" * (one.unit != "1")
             for values in self.base.values()
             for parameter, one in values.items()
             if parameter == "mean_factor" or not parameter.startswith("c")
