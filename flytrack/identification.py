@@ -160,14 +160,16 @@ def run_diagnose(flags: Diagnose) -> None:
         raise ValueError("--out: missing, expected a folder for the report, or --quick")
     bar = ProgressBar("stages")
     if before:
-        found = diagnose_change(logs, before, model, held_out, bar, motion)
+        diagnosis = diagnose_change(logs, before, model, held_out, bar, motion)
     else:
-        found = diagnose(logs, model, held_out, bar, motion, lambda look: bar.write(look.text()))
-    written = write_diagnosis(flags.out, found, log)
-    print(text_of_diagnosis(found))
+        diagnosis = diagnose(
+            logs, model, held_out, bar, motion, lambda look: bar.write(look.text())
+        )
+    written = write_diagnosis(flags.out, diagnosis, log)
+    print(text_of_diagnosis(diagnosis))
     recording = flags.out / RECORDING_NAME
-    models = {"nominal": found.nominal, "extended": found.extended}
-    reason = write_flight_recording(recording, log, models, traces_of(found, log))
+    models = {"nominal": diagnosis.nominal, "extended": diagnosis.extended}
+    reason = write_flight_recording(recording, log, models, traces_of(diagnosis, log))
     print_written([*written, *[recording] * (not reason)])
     if reason:
         print(f"{recording}: left out: {reason}")

@@ -18,8 +18,8 @@ from flytrack_env.fusion import compute_once, has_kernels, is_in_kernel, one_ker
 Shown = tuple[list[jax.Array], Any]  # observation, row by row, and state
 Begin = Callable[[jax.Array, Any], Shown]
 
-# Starts per round: one for so many environments, and some to spare. Random actions end 1 episode in
-# 70 per step, so that one round is the rule.
+# Each round of resets samples one start per 32 environments, plus eight. With random actions, one
+# environment in 70 ends an episode at each step, so one round usually suffices.
 ENVS_PER_START = 32
 SPARE_STARTS = 8
 WORD_BITS = 32  # bits

@@ -101,7 +101,7 @@ def diagnose(
             blocks of at most 5 s if None.
         report: called with stages done and to do.
         motion: how the log moves within a step, whatever the model says; if None, continuously
-            where the log is measured, else by likelihood.
+            where the log is measured, else by the sensors or by likelihood.
         show: called with the first look, before the search.
 
     Raises:
@@ -183,8 +183,13 @@ def split(
     warnings += voltage_notes(log, model.battery)
     log = with_voltage(log, model)
     model = model._replace(battery=battery_of_craft(log, model.battery))
-    for cleaned in (partial(with_causal_commands, model=model), at_usual_rate):
-        log, is_kept, notes = cleaned(log)
+    reductions: list[Callable[[FlightLog], tuple[FlightLog, np.ndarray, list[str]]]] = [
+        partial(with_causal_commands, model=model)
+    ]
+    if motion is Motion.CONTINUOUS:  # two steps of a simulator are not one step of twice the length
+        reductions.append(at_usual_rate)
+    for reduce in reductions:
+        log, is_kept, notes = reduce(log)
         warnings, out = [*warnings, *notes], out[is_kept]
     with_motion = how_it_moves(log, model, ~out, motion)
     model = model._replace(motion=with_motion.motion)

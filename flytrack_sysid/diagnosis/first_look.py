@@ -13,7 +13,7 @@ from flytrack_sysid.diagnosis.score_test import threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState, score_candidates
 from flytrack_sysid.diagnosis.summary import estimates
 
-MOST_LISTED = 6  # effects
+MAX_LISTED = 6  # effects
 NOT_CHECKED = (
     "Not checked: whether an effect stands in for another or for something unknown, whether "
     "held-out rows and free flight agree, changes within the log, and what no cause explains. "
@@ -64,7 +64,7 @@ class FirstLook(NamedTuple):
         ]
         likely = [
             f"{one.effect}: {one.gain:.0f}, named from {one.threshold:.0f}"
-            for one in self.likely[:MOST_LISTED]
+            for one in self.likely[:MAX_LISTED]
         ]
         return "\n".join(
             [

@@ -20,9 +20,10 @@ from flytrack_sysid.record import Record, is_applied_certain, make_record, measu
 LEAD_IN_S, LANE_S = 1, 5
 PIECES = LEAD_IN_S + LANE_S  # of a second each, the lead-in first
 FEWEST_ROWS_PER_S = 20
-MOST_RATE_HZ = 250.0  # a rate loop takes 10 to 50 ms: more rows cost more and show no more of it
+# A rate loop takes 10 to 50 ms. Chosen for cost: what a lower rate hides was not measured.
+MAX_RATE_HZ = 250.0
 # replayed without lead-ins: all of their slopes are in memory at once, some 50 kB a row
-MOST_ROWS = 15_000
+MAX_ROWS = 15_000
 LANES_PADDED_TO = 2  # logs of about the same length share one compiled program
 # Axes of a residual: rotation x, y, z, force x, y, z (all world), battery. Channels of an axis: a
 # direct one, and a level, whose rate of change the direct one measures.
@@ -154,7 +155,7 @@ def at_usual_rate(log: FlightLog) -> tuple[FlightLog, np.ndarray, list[str]]:
     Rows between those that are kept are left out; commands are their means until the next row.
     """
     rate_hz = 1.0 / float(np.median(usual_step(log)))
-    every = max(round(rate_hz / MOST_RATE_HZ), 1)
+    every = max(round(rate_hz / MAX_RATE_HZ), 1)
     if every == 1:
         return log, np.ones(len(log), bool), []
     begins = np.flatnonzero(log.is_start())
@@ -175,10 +176,10 @@ def voltages_of(lanes: Lanes) -> tuple[float, float] | None:
 
 
 def thinned(lanes: Lanes, most: int | None = None) -> Lanes:
-    """Return at most ``most`` lanes, evenly spread over a log; by default MOST_ROWS rows."""
+    """Return at most ``most`` lanes, evenly spread over a log; by default MAX_ROWS rows."""
     rows, number = lanes.row.shape
     most = (
-        most or max(MOST_ROWS // (rows - lead_in_of(rows)) // LANES_PADDED_TO, 1) * LANES_PADDED_TO
+        most or max(MAX_ROWS // (rows - lead_in_of(rows)) // LANES_PADDED_TO, 1) * LANES_PADDED_TO
     )
     if number <= most:
         return lanes

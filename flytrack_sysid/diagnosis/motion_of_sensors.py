@@ -1,10 +1,11 @@
-"""By which motion a log moves, as its sensors show without any model.
+"""Read a log's integrator from its sensors, without a model.
 
-A simulator turns the force of a step by the attitude before it or after it; a drone turns on
-meanwhile. So where between both attitudes the one lies that makes the change of velocity out of the
-measured force tells the motions apart, whoever is late: attitude and velocity are on one clock.
-Attitude and velocity are needed, and gyro and accelerometer. Of 36 hidden plants, 12 of each
-motion, with up to two effects or late poses, the sensors were sure of 27, all rightly.
+A discrete simulator rotates the specific force of a step by the attitude before or after the step.
+A real drone rotates during the step. Regress the change of velocity on the measured force at the
+middle attitude and on the rest of the rotation: the coefficient identifies the integrator.
+Attitude and velocity share a clock, so a late clock does not bias it. The thresholds were chosen on
+36 hidden plants (12 of each motion, up to two effects or late poses): 27 decided, none wrong.
+On 24 plants of other seeds, none was wrong (tests/unit/test_motion_of_sensors.py).
 """
 
 import numpy as np

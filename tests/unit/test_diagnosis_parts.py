@@ -380,7 +380,7 @@ def test_a_long_log_is_thinned_with_a_warning_that_counts_judged_rows(state, mon
     half = lanes.counts & (np.arange(len(lanes.row)) % 2 == 0)[:, None, None, None]
     every = lanes._replace(counts=half)
     assert thinned(every) is every and thinning_warning(every, every) == []
-    monkeypatch.setattr("flytrack_sysid.diagnosis.lanes.MOST_ROWS", 4 * LANE_S * 100 + 10)
+    monkeypatch.setattr("flytrack_sysid.diagnosis.lanes.MAX_ROWS", 4 * LANE_S * 100 + 10)
     (warning,) = thinning_warning(every, thinned(every))
     kept, number = thinned(every).num_judged, every.num_judged
     assert kept < 0.8 * number and warning.startswith(
