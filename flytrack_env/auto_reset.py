@@ -1,8 +1,10 @@
 """Auto-reset of a batch of which, as a rule, few episodes end in the same step.
 
 Sampling, observing and selecting a start for every environment cost almost as much as the step. So
-under ``vmap`` only as many starts are sampled as a step is likely to need, and they are put in the
-place of the environments that ended. Each environment starts as it would alone.
+on the CPU, under ``vmap``, only as many starts are sampled as a step is likely to need, and they
+are put in the place of the environments that ended. Elsewhere the starts of all are a part of the
+step's few kernels, and rounds would be a hundred kernels more. Each environment starts as it would
+alone.
 """
 
 from collections.abc import Callable
@@ -42,8 +44,8 @@ class Ended(NamedTuple):
 def reset_if_ended(begin: Begin, step: Ended, params: Any) -> Shown:
     """Return the start ``begin(seed, params)`` if an episode ended, else what there is.
 
-    Of one environment. Under ``vmap`` starts are sampled only for those that ended, as long as all
-    share the parameters.
+    Of one environment. Under ``vmap`` on the CPU starts are sampled only for those that ended, as
+    long as all share the parameters.
     """
     batch = reset_ended(begin, jax.tree.map(lambda leaf: leaf[None], step), params)
     return jax.tree.map(lambda leaf: leaf[0], batch)
@@ -55,7 +57,8 @@ def reset_ended(begin: Begin, steps: Ended, params: Any) -> Shown:
 
     @custom_vmap
     def reset(steps: Ended, params: Any) -> Shown:
-        return (_reset_all if len(steps.done) == 1 else _reset_in_rounds)(begin, steps, params)
+        is_in_rounds = len(steps.done) > 1 and has_kernels()
+        return (_reset_in_rounds if is_in_rounds else _reset_all)(begin, steps, params)
 
     @reset.def_vmap
     def reset_batch(size: int, is_batched: Any, steps: Ended, params: Any) -> Any:
@@ -97,11 +100,8 @@ def _reset_in_rounds(begin: Begin, steps: Ended, params: Any) -> Shown:
     """Return what ``reset_ended`` does, sampling as many starts at once as a step may need."""
     num_envs = len(steps.done)
     count = min(num_envs, num_envs // ENVS_PER_START + SPARE_STARTS)
-    # One after the other is cheapest within one kernel, and slow where each operation is a kernel.
-    search, take, put = (
-        (_scan, _take_each, _put_each) if has_kernels() else (_search, _take, _scatter)
-    )
-    find: Callable[..., jax.Array] = partial(search, count=count)
+    find: Callable[..., jax.Array] = partial(_scan, count=count)
+    take, put = _take, _put
     if not is_in_kernel():
         find, take, put = one_kernel(find), one_kernel(take), one_kernel(put)
 
@@ -117,21 +117,11 @@ def _reset_in_rounds(begin: Begin, steps: Ended, params: Any) -> Shown:
     return jax.lax.while_loop(lambda carry: carry[0][0] < num_envs, reset_some, start)[2]
 
 
-_take = partial(jnp.take, mode="clip")
-
-
-def _search(ended: jax.Array, count: int) -> jax.Array:
-    """Return the indices of the first ``count`` true elements of a vector, then its length."""
-    return jnp.nonzero(ended, size=count, fill_value=ended.shape[0])[0]
-
-
-def _scatter(olds: Any, news: Any, indices: jax.Array) -> Any:
-    """Return ``olds`` with the starts at their indices; those beyond the end are dropped."""
-    return jax.tree.map(lambda old, new: old.at[indices].set(new, mode="drop"), olds, news)
-
-
 def _scan(ended: jax.Array, count: int) -> jax.Array:
-    """Return what ``_search`` does, by scanning 32-bit words for their set bits."""
+    """Return the indices of the first ``count`` true elements of a vector, then its length.
+
+    It scans 32-bit words for their set bits.
+    """
     size = ended.shape[0]
     bits = jnp.pad(ended, (0, -size % WORD_BITS)).reshape(-1, WORD_BITS).astype(jnp.uint32)
     words, half = bits << jnp.arange(WORD_BITS, dtype=jnp.uint32), WORD_BITS // 2
@@ -165,8 +155,8 @@ def _at(values: jax.Array, index: Any) -> jax.Array:
     return jax.lax.dynamic_index_in_dim(values, index, keepdims=False)
 
 
-def _take_each(values: jax.Array, indices: jax.Array) -> jax.Array:
-    """Return what ``_take`` does, in a loop over the indices."""
+def _take(values: jax.Array, indices: jax.Array) -> jax.Array:
+    """Return the values at indices; those beyond the end take the last value."""
 
     def take(number: Any, taken: jax.Array) -> jax.Array:
         value = _at(values, jnp.minimum(_at(indices, number), values.shape[0] - 1))
@@ -175,8 +165,8 @@ def _take_each(values: jax.Array, indices: jax.Array) -> jax.Array:
     return jax.lax.fori_loop(0, indices.shape[0], take, jnp.zeros(indices.shape, values.dtype))
 
 
-def _put_each(olds: Any, news: Any, indices: jax.Array) -> Any:
-    """Return what ``_scatter`` does, in a loop; indices beyond the end come last."""
+def _put(olds: Any, news: Any, indices: jax.Array) -> Any:
+    """Return ``olds`` with the starts at their indices; those beyond the end come last, unused."""
     size, last = len(olds[0]), len(indices) - 1
 
     def put(carry: Any) -> Any:

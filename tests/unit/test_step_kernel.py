@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import gymnax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +15,7 @@ from flytrack_env.auto_reset import Ended, reset_if_ended
 from flytrack_env.effects import EFFECTS
 from flytrack_env.fusion import ATTRIBUTES, SWITCH, compute_once, one_kernel
 from flytrack_env.motion import Motion
+from flytrack_env.registration import ENVIRONMENTS, RACES
 from tests.contract.test_effects import inside_ranges
 from tests.support.stepping import flight, inputs
 
@@ -53,6 +55,33 @@ def test_the_kernel_is_the_same_step_unless_switched_off(monkeypatch, name):
         # A bend is a second difference of forces, and rounds as they do.
         size = sizes[jax.tree_util.keystr(path).replace("force_bends_b", "forces_b")]
         assert_allclose(leaf, expected, rtol=1e-5, atol=1e-5 * size)
+
+
+IDS = [*ENVIRONMENTS, *RACES]
+ALL_WRAPPERS = ("FlyTrackRobust-v0", "FlyTrackDuel-v0")  # which hold the others
+
+
+@pytest.mark.parametrize(
+    "env_id",
+    [
+        pytest.param(env_id, marks=[] if env_id in ALL_WRAPPERS else pytest.mark.slow)
+        for env_id in IDS
+    ],
+)
+def test_a_step_on_a_gpu_has_no_loop_and_no_scatter(monkeypatch, env_id):
+    """Each would be a launch of its own, and a loop's condition a wait of the host."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    env, params = gymnax.make(env_id)
+    keys = jax.random.split(jax.random.key(0), 8)
+    _, states = jax.eval_shape(jax.vmap(env.reset, (0, None)), keys, params)
+    actions = jnp.zeros((8, *env.action_space(params).shape))
+    step = jax.jit(jax.vmap(env.step, (0, 0, 0, None))).trace(keys, states, actions, params)
+    text = step.lower(lowering_platforms=("cuda",)).as_text()
+    # A ghost reads its recording at the time of the race, which is a gather.
+    kernels = ("scatter", "while", "sort", *([] if env_id in RACES else ["gather"]))
+    counts = {name: text.count(f"stablehlo.{name}") for name in kernels}
+    assert not any(counts.values()), counts
+    assert text.count("stablehlo.select") > 10
 
 
 LEAVES = {
