@@ -168,6 +168,11 @@ class Config:
         return config
 
 
+# By device. A GPU takes about as long for many environments as for few, and for a large minibatch
+# as for a small one, so that there each update is of more environments and fewer of their steps.
+RECIPES = {"cpu": Config(), "gpu": Config(num_envs=4096, num_steps=16, num_minibatches=32)}
+
+
 def read_config(where: str, values: Any) -> Config:
     """Read a configuration from a TOML or JSON object; fields that it lacks have their defaults.
 

@@ -5,8 +5,9 @@ import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
+import jax
 import tyro
 
 from baselines.purejaxrl_ppo.checkpoint import (
@@ -16,7 +17,13 @@ from baselines.purejaxrl_ppo.checkpoint import (
     newest_intact,
     rewards_of,
 )
-from baselines.purejaxrl_ppo.config import Config, OptionalPath, read_config_file
+from baselines.purejaxrl_ppo.config import (
+    OPTIONAL,
+    RECIPES,
+    Config,
+    OptionalPath,
+    read_config_file,
+)
 from baselines.purejaxrl_ppo.training import (
     DEFAULT_OPTIONS,
     DivergedError,
@@ -48,6 +55,12 @@ def parse_rewards(words: Sequence[str]) -> dict[str, float]:
 class Sources:
     """What decides the defaults of all other settings, and is read before them."""
 
+    device: Annotated[
+        Literal["cpu", "gpu"] | None,
+        tyro.conf.arg(metavar="cpu|gpu", help_behavior_hint=OPTIONAL),
+    ] = None
+    """Train on it, and with the hyperparameters for it unless --resume has others; by default on
+    what JAX prefers, with those for a CPU."""
     config: OptionalPath = None
     """TOML file of hyperparameters; flags override it."""
     resume: OptionalPath = None
@@ -79,10 +92,21 @@ class Settings(Sources):
     """Of PPO."""
 
 
+def choose_device(device: str | None) -> None:
+    """Have JAX compute on a device; raises ValueError where there is no such device."""
+    if device == "cpu":
+        jax.config.update("jax_platforms", "cpu")
+    backend = jax.default_backend()
+    if device is not None and (backend == "cpu") != (device == "cpu"):
+        how = "choose before JAX computes" if device == "cpu" else "pip install 'jax[cuda13]'"
+        raise ValueError(f"--device: found JAX on the {backend}, expected {device}: {how}")
+
+
 def parse(words: Sequence[str]) -> tuple[Settings, Checkpoint | None]:
     """Return the settings of a command line, and the checkpoint that it resumes."""
     sources, _ = tyro.cli(Sources, args=words, prog=PROG, add_help=False, return_unknown_args=True)
-    defaults, start = Settings(), None
+    choose_device(sources.device)
+    defaults, start = Settings(hyperparameters=RECIPES[sources.device or "cpu"]), None
     if sources.resume is not None:
         start = newest_intact(sources.resume)
         defaults = Settings(

@@ -322,11 +322,11 @@ class Run:
         A run that is killed before it stores repeats the updates, and loses no evaluation.
         """
         config, options, started_s = self.config, self.options, time.perf_counter()
-        first, num_before = self.steps, len(self.history)
+        first, updates = self.steps, list[Any]()
         is_recorded = is_last = False
         while not (is_recorded or is_last):
             self.runner, metrics = self.trainer.update(self.runner)
-            self.history.append(jax.device_get(metrics))
+            updates.append(metrics)  # read later: a GPU would wait for it after every update
             self.update += 1
             is_last = self.update == config.num_updates
             is_stored, is_evaluated, is_recorded = (
@@ -334,8 +334,10 @@ class Run:
                 for every in (options.checkpoint_every, options.evaluate_every, RECORD_EVERY)
             )
             is_recorded = is_recorded or is_stored or is_evaluated
+        updates = jax.device_get(updates)
+        self.history += updates
         rate = (self.steps - first) / (time.perf_counter() - started_s)
-        rows = stack(self.history[num_before:])
+        rows = stack(updates)
         values, written = {**summarize_updates(rows), "steps_per_second": rate}, list[Path]()
         params = self.runner.train_state.params
         not_finite = find_not_finite(rows, params)
