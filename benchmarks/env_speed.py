@@ -43,13 +43,21 @@ class Contestant(NamedTuple):
 
 
 def jax_contestant(
-    name: str, env_id: str, num_envs: int, length: int, is_batch: bool, model: Any = None
+    name: str,
+    env_id: str,
+    num_envs: int,
+    length: int,
+    is_batch: bool,
+    model: Any = None,
+    unroll: int = 1,
 ) -> Contestant:
     """Return a scan of ``length`` steps of a gymnax environment, all outputs in the carry.
 
-    model: that the environment simulates; None for its default.
-
     Of a race of two, all drones' actions are given.
+
+    Args:
+        model: that the environment simulates; None for its default.
+        unroll: steps in the body of the scan's loop.
     """
     import gymnax
     import jax
@@ -76,7 +84,9 @@ def jax_contestant(
             return step(key, outputs[1], action, params), None
 
         first = step(keys[0], state, actions[0], params)
-        return jax.lax.scan(step_once, first, (keys, actions))[0]
+        return jax.lax.scan(step_once, first, (keys, actions), unroll=unroll)[0]
+
+    params = jax.device_put(params)  # once: a GPU would be sent every number in every call
 
     def run() -> None:
         nonlocal state

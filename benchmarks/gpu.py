@@ -1,41 +1,91 @@
-"""FlyTrack on an accelerator: ``python -m benchmarks.gpu [--most 20]``.
+"""FlyTrack on an accelerator: ``python -m benchmarks.gpu``.
 
-The same actions and the same policy in 256 flights on the accelerator and on the CPU; environment
-steps with random actions, observations and resets included, compilation excluded, from 2^10 to 2^20
-environments, beside gymnax's Pendulum; seeds that train side by side, and a training until 95 % of
-256 starts finish. Times are wall times. Without an accelerator the page says so and nothing else;
-``--cpu`` measures small sizes without a page.
+Environment steps with random actions, observations and resets included, beside gymnax's Pendulum
+and, where ``mujoco-mjx`` is installed, a rigid body with four motors in MJX; PPO with the recipe
+for a GPU, alone and many seeds side by side; a training until 95 % of 256 starts finish; and the
+same flights on the accelerator and on the CPU. Times are wall times without compilation. Without an
+accelerator the page says so and nothing else; ``--cpu`` measures small sizes without a page.
 """
 
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
+import gymnax
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import flytrack_env
 from baselines.purejaxrl_ppo import Config, load_checkpoint
+from baselines.purejaxrl_ppo.config import RECIPES
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.training import Trainer
 from benchmarks import report
 from benchmarks.champion import CHAMPION, MODEL
 from benchmarks.env_speed import Contestant, jax_contestant, measure
-from benchmarks.learning_curve import held_from, train
+from benchmarks.learning_curve import evaluate, held_from, train
 
-IDS = ("FlyTrack-v0", "FlyTrackRobust-v0", "Pendulum-v1")
-SEEDS = (1, 4, 16)
+PLAIN, ROBUST, PENDULUM = "FlyTrack-v0", "FlyTrackRobust-v0", "Pendulum-v1"
+MJX = "rigid body in MJX"
+# Environments, as powers of 2, by contestant; of some fewer, because each size is a compilation.
+POWERS = {PLAIN: (8, 10, 16, 20, 21), ROBUST: (10, 20), PENDULUM: (10, 16, 20), MJX: (16,)}
+UNROLL = 4
+TRAININGS = (("cpu", 1), ("gpu", 1), ("gpu", 16))  # recipe, seeds side by side
+STEPS, EVERY = 40_000_000, 1_000_000  # environment steps: of the training, between evaluations
 NUM_FLIGHTS = 256
 REPEATS, LENGTH = 5, 64  # calls, and steps of each
+CALLS = 200  # of one step each
 PAGE = report.RESULTS / "gpu.md"
 WHAT = (
-    "256 flights on the accelerator and on the CPU; rates with random actions, observations and "
-    "resets included, compilation excluded, wall time; training by PPO as shipped. Both devices "
-    "run the same equations: their agreement says something of rounding, not of physics."
+    "Rates with random actions, observations and resets included, 64 steps a call; "
+    "compilation excluded, wall time."
 )
+# A quadcopter's size and nothing else: no battery, lags, gates, observations or resets.
+RIGID_BODY = """
+<mujoco>
+  <option timestep="0.01"/>
+  <worldbody>
+    <body pos="0 0 1">
+      <freejoint/>
+      <inertial pos="0 0 0" mass="0.85" diaginertia="0.0025 0.0025 0.004"/>
+      <site name="a" pos="0.1 0.1 0"/> <site name="b" pos="-0.1 0.1 0"/>
+      <site name="c" pos="-0.1 -0.1 0"/> <site name="d" pos="0.1 -0.1 0"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor site="a" gear="0 0 1 0 0 0.01"/> <motor site="b" gear="0 0 1 0 0 -0.01"/>
+    <motor site="c" gear="0 0 1 0 0 0.01"/> <motor site="d" gear="0 0 1 0 0 -0.01"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def mjx_contestant(num_envs: int) -> Contestant:
+    """Return a scan of ``LENGTH`` steps of 0.01 s of a rigid body with four motors in MJX."""
+    import mujoco
+    from mujoco import mjx
+
+    model = mjx.put_model(mujoco.MjModel.from_xml_string(RIGID_BODY))
+    rates = jax.random.normal(jax.random.key(0), (num_envs, 6))
+    state = jax.vmap(lambda rate: mjx.make_data(model).replace(qvel=rate))(rates)
+    controls = jax.random.uniform(jax.random.key(1), (LENGTH, num_envs, 4), maxval=4.0)
+
+    @jax.jit
+    def fly(state: Any, controls: jax.Array) -> Any:
+        def step_once(state: Any, controls: jax.Array) -> tuple[Any, None]:
+            step = jax.vmap(lambda data, control: mjx.step(model, data.replace(ctrl=control)))
+            return step(state, controls), None
+
+        return jax.lax.scan(step_once, state, controls)[0]
+
+    return Contestant(
+        MJX, LENGTH * num_envs / 1e6, lambda: jax.block_until_ready(fly(state, controls))
+    )
 
 
 def rate_of(entry: Contestant) -> float:
@@ -82,20 +132,54 @@ def agreement() -> str:
     )
 
 
-def environments(most: int) -> str:
-    """Return a table of rates by number of environments; simulated seconds are those of 100 Hz.
+def contestant(name: str, power: int, unroll: int = 1) -> Contestant:
+    """Return a contestant of 2^power environments."""
+    if name == MJX:
+        return mjx_contestant(2**power)
+    return jax_contestant(name, name, 2**power, LENGTH, is_batch=False, unroll=unroll)
 
-    A step has its observation and, where it ended, its reset.
-    """
-    rows = []
-    for power in report.progress(range(10, most + 1, 2), "size"):
-        rates = [
-            1e6 * rate_of(jax_contestant(name, name, 2**power, LENGTH, is_batch=False))
-            for name in IDS
-        ]
-        rows.append([f"2^{power}", *(f"{rate:.3g}" for rate in rates), f"{0.01 * rates[0]:.3g}"])
-    return report.table(
-        ["environments", *(f"{name}, decisions/s" for name in IDS), "simulated s/s"], rows
+
+def environments(powers: dict[str, tuple[int, ...]]) -> str:
+    """Return a table of decisions a second by number of environments, and smaller ones apart."""
+    names = [name for name in powers if name != MJX or find_spec("mujoco.mjx")]
+    rates = {
+        (name, power): f"{1e6 * rate_of(contestant(name, power)):.3g}"
+        for name in names
+        for power in report.progress(powers[name], name)
+    }
+    rows = [
+        [f"2^{power}", *(rates.get((name, power), "") for name in names)]
+        for power in sorted({power for _, power in rates})
+    ]
+    header = ["environments", *(f"{name}, decisions/s" for name in names)]
+    unrolled = ", ".join(
+        f"{name} {1e6 * rate_of(contestant(name, 10, UNROLL)):.3g}" for name in (PLAIN, PENDULUM)
+    )
+    return report.table(header, rows) + (
+        f"\n\nWith 2^10 environments and {UNROLL} steps in the body of the loop "
+        f"(`unroll={UNROLL}` of `jax.lax.scan`), decisions/s: {unrolled}."
+    )
+
+
+def single_steps() -> str:
+    """Return how long a call of one step takes, with parameters of either place."""
+    env, params = gymnax.make(PLAIN)
+    keys = jax.random.split(jax.random.key(0), 2**10)
+    actions = jax.random.uniform(jax.random.key(1), (2**10, 4), minval=-1.0)
+    step = jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
+    times = []
+    for params_of_call in (params, jax.device_put(params)):
+        _, state = jax.vmap(env.reset, in_axes=(0, None))(keys, params)
+        jax.block_until_ready(step(keys, state, actions, params_of_call))
+        started_s = time.perf_counter()
+        for _ in range(CALLS):
+            _, state, *_ = step(keys, state, actions, params_of_call)
+        jax.block_until_ready(state)
+        times.append(1e3 * (time.perf_counter() - started_s) / CALLS)
+    return (
+        f"A call of one step of 2^10 environments takes {times[1]:.2g} ms, and {times[0]:.2g} ms "
+        "where the parameters are Python's numbers: put them on the device once, "
+        "`params = jax.device_put(params)`."
     )
 
 
@@ -104,49 +188,64 @@ def run_and_wait(run: Callable[[], Any]) -> None:
     jax.block_until_ready(run())
 
 
-def trainings(config: Config) -> str:
-    """Return a table of training steps a second by number of seeds side by side."""
-    trainer, rows = Trainer(config), []
-    for number in SEEDS:
+def trainings(recipes: dict[str, Config]) -> str:
+    """Return a table of training steps a second by recipe and number of seeds side by side."""
+    rows = []
+    for recipe, number in TRAININGS:
+        config = recipes[recipe]
+        trainer = Trainer(config)
         runners = [trainer.start(jax.random.key(seed)) for seed in range(number)]
         together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *runners)
         update = partial(jax.jit(jax.vmap(trainer.update)), together)
         entry = Contestant("", number * config.batch_size, partial(run_and_wait, update))
-        rows.append([number, f"{rate_of(entry):.3g}"])
-    return report.table("seeds side by side | training steps/s, all together", rows)
+        sizes = f"{config.num_envs} x {config.num_steps}, {config.num_minibatches} minibatches"
+        rows.append([recipe, sizes, number, f"{rate_of(entry):.3g}"])
+    header = "recipe (`--device`) | an update | seeds side by side | steps/s, all together"
+    return report.table(header, rows)
 
 
 def race(config: Config) -> str:
-    """Return when a training's policy races, and how long that took."""
-    started, held = time.perf_counter(), held_from(train(Trainer(config), 0))
-    since = "never" if held is None else f"from {held.steps / 1e6:.2f} M steps on"
-    spent = f"{time.perf_counter() - started:.0f} s with evaluations and compilation"
+    """Return when a training's policy races, and how fast in the end."""
+    trainer = Trainer(config)
+    evaluate(trainer, trainer.start(jax.random.key(0)).train_state.params, 0, 0.0)  # compiles
+    points = train(trainer, 0, EVERY, time.perf_counter)
+    held, last = held_from(points), points[-1]
+    since = (
+        "never"
+        if held is None
+        else f"from {held.steps / 1e6:.2f} M steps, {held.spent_s:.2g} s of training, on"
+    )
     return (
-        f"Seed 0, {config.total_timesteps / 1e6:g} M steps: 95 % of 256 starts finish {since}; "
-        f"{spent}."
+        f"Seed 0, recipe `gpu`: 95 % of 256 starts finish three laps {since}; after "
+        f"{last.steps / 1e6:.0f} M steps, {last.spent_s:.2g} s, {last.success:.1%} do, with a mean "
+        f"flying lap of {last.flying_lap_s:.3f} s. Evaluations every {EVERY / 1e6:g} M steps and "
+        "compilation are not counted."
     )
 
 
-def main(most: int = 20, steps: int = 8_000_000, cpu: bool = False) -> None:
+def main(cpu: bool = False) -> None:
     """Measure, and write the page where there is an accelerator.
 
-    most: environments, as a power of 2. steps: of the training. cpu: print what a CPU does, write
-    nothing.
+    cpu: measure a CPU with small sizes, write nothing.
     """
     path, parts = (None if cpu else PAGE), ["Not measured."]
     if cpu or jax.default_backend() != "cpu":
-        config, parts = Config(total_timesteps=steps), []
+        small = replace(Config(), num_envs=64, num_steps=8, num_minibatches=4)
+        recipes, powers = (
+            ({"cpu": small, "gpu": small}, {PLAIN: (4,)}) if cpu else (RECIPES, POWERS)
+        )
+        steps, parts = (4096 if cpu else STEPS), []
         for part in (
+            partial(environments, powers),
+            partial(trainings, recipes),
+            partial(race, replace(recipes["gpu"], total_timesteps=steps)),
+            single_steps,
             agreement,
-            partial(environments, most),
-            partial(trainings, config),
-            partial(race, config),
         ):
             parts.append(part())
             print(parts[-1], end="\n\n", flush=True)
-        parts.append(
-            f"{jax.devices()[0].device_kind}. {report.provenance_line(report.provenance())}"
-        )
+        device = jax.devices()[0].device_kind
+        parts.append(f"{device}. {report.provenance_line(report.provenance())}")
     report.write_page(path, report.page("On a GPU", f"{report.command_line()}: {WHAT}", *parts))
 
 

@@ -7,6 +7,7 @@ without compilation and evaluations. Writes a page and a chart.
 """
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,40 +35,45 @@ HEADER = (
 
 
 class Point(NamedTuple):
-    """One evaluation: environment steps and CPU seconds of training so far, and how it flies."""
+    """One evaluation: environment steps and seconds of training so far, and how it flies."""
 
     steps: int
-    cpu_s: float
+    spent_s: float
     success: float
     first_lap_s: float
     flying_lap_s: float
 
 
-def evaluate(trainer: Trainer, policy_params: object, steps: int, cpu_s: float) -> Point:
+def evaluate(trainer: Trainer, policy_params: object, steps: int, spent_s: float) -> Point:
     """Return how a policy flies noisy starts."""
     keys = start_keys(EVALUATION_SEED, NUM_EPISODES)
     policy = Policy(trainer.network, policy_params)
     result = score(race_many(trainer.env, policy, keys, NUM_STEPS, NUM_LAPS))
-    return Point(steps, cpu_s, result.success, result.first_lap_s, result.flying_lap_s)
+    return Point(steps, spent_s, result.success, result.first_lap_s, result.flying_lap_s)
 
 
-def train(trainer: Trainer, seed: int) -> list[Point]:
-    """Train one seed; return its evaluations."""
+def train(
+    trainer: Trainer,
+    seed: int,
+    every: int = EVERY,
+    clock: Callable[[], float] = time.process_time,
+) -> list[Point]:
+    """Train one seed; return its evaluations, one every so many environment steps.
+
+    clock: of the seconds of training, without compilation and evaluations.
+    """
     config = trainer.config
     runner = trainer.start(jax.random.key(seed))
     jax.block_until_ready(trainer.update(runner))  # compiles
-    points, cpu_s = [], 0.0
+    points, spent_s, started_s = [], 0.0, clock()
     for update in report.progress(range(1, config.num_updates + 1), "update"):
-        started_s = time.process_time()
-        runner, _ = jax.block_until_ready(trainer.update(runner))
-        cpu_s += time.process_time() - started_s
-        if (
-            is_due(update * config.batch_size, EVERY, config.batch_size)
-            or update == config.num_updates
-        ):
-            points.append(
-                evaluate(trainer, runner.train_state.params, update * config.batch_size, cpu_s)
-            )
+        runner, _ = trainer.update(runner)
+        steps = update * config.batch_size
+        if is_due(steps, every, config.batch_size) or update == config.num_updates:
+            jax.block_until_ready(runner)
+            spent_s += clock() - started_s
+            points.append(evaluate(trainer, runner.train_state.params, steps, spent_s))
+            started_s = clock()
     return points
 
 
@@ -81,9 +87,9 @@ def held_from(points: list[Point]) -> Point | None:
 def row_of(seed: int, points: list[Point]) -> list[str]:
     """Return a seed's row of the table."""
     held, last = held_from(points), points[-1]
-    since = ("never", "") if held is None else (f"{held.steps / 1e6:.2f}", f"{held.cpu_s:.1f}")
+    since = ("never", "") if held is None else (f"{held.steps / 1e6:.2f}", f"{held.spent_s:.1f}")
     laps = (f"{last.first_lap_s:.3f}", f"{last.flying_lap_s:.3f}")
-    return [str(seed), *since, f"{last.cpu_s:.1f}", f"{last.success:.1%}", *laps]
+    return [str(seed), *since, f"{last.spent_s:.1f}", f"{last.success:.1%}", *laps]
 
 
 def draw(path: Path, curves: dict[int, list[Point]]) -> None:
