@@ -1,11 +1,13 @@
 """The command of the training: its flags, what it resumes, what it refuses, and how it ends."""
 
 import signal
+from dataclasses import replace
 
 import pytest
 
 from baselines.purejaxrl_ppo import Config, load_checkpoint, train_ppo
 from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
+from baselines.purejaxrl_ppo.config import RECIPES
 from baselines.purejaxrl_ppo.train_ppo import make_trainer, parse
 from baselines.purejaxrl_ppo.training import DEFAULT_OPTIONS, DivergedError, Stopped, Trainer
 from tests.support.ppo_runs import CONFIG, ENV_ID, SEED
@@ -37,6 +39,16 @@ def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
     settings, _ = read("--total-timesteps", "4e6", "--hidden-sizes", 8, 8, "--reward", "progress=2")
     assert settings.hyperparameters == Config(4_000_000, hidden_sizes=(8, 8))
     assert train_ppo.parse_rewards(settings.reward) == {"progress": 2.0}
+
+
+def test_a_device_chooses_the_recipe_and_must_be_there(monkeypatch, whole, capsys):
+    assert read("--device", "cpu")[0].hyperparameters == Config()
+    assert call("--device", "gpu") == 2
+    assert "--device: found JAX on the cpu, expected gpu" in capsys.readouterr().err
+    monkeypatch.setattr(train_ppo.jax, "default_backend", lambda: "gpu")
+    settings, _ = read("--device", "gpu", "--num-minibatches", 64)
+    assert settings.hyperparameters == replace(RECIPES["gpu"], num_minibatches=64)
+    assert read("--device", "gpu", "--resume", whole[0])[0].hyperparameters == CONFIG
 
 
 @pytest.mark.parametrize(
