@@ -23,7 +23,7 @@ from jax.experimental.custom_partitioning import (
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters.partial_eval import dce_jaxpr, dce_rules
-from jax.sharding import NamedSharding, PartitionSpec
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from jaxlib.mlir import ir
 
 Tree = TypeVar("Tree")
@@ -175,8 +175,12 @@ def is_in_kernel() -> bool:
 
 
 def has_kernels() -> bool:
-    """Return whether what is compiled now can be one kernel: on the CPU, unless switched off."""
-    return os.environ.get(SWITCH, "1") != "0" and jax.default_backend() == "cpu"
+    """Return whether what is compiled now can be one kernel: on the CPU, unless switched off.
+
+    Not where the types of arrays say how they are divided among devices: a kernel is of one.
+    """
+    is_explicit = AxisType.Explicit in jax.sharding.get_abstract_mesh().axis_types
+    return os.environ.get(SWITCH, "1") != "0" and jax.default_backend() == "cpu" and not is_explicit
 
 
 def is_simple(jaxpr: Any) -> bool:

@@ -71,8 +71,8 @@ def test_a_flight_has_no_nan(env_id):
 SHARDED = (PLAIN, "sharding")
 DIVIDED = (
     SHARDED,
-    (PLAIN, "shard_map", "pmap"),
-    (EVERY_WRAPPER, "sharding"),
+    (PLAIN, "explicit", "shard_map", "pmap"),
+    (EVERY_WRAPPER, "sharding", "explicit"),
     (SEVERAL_DRONES, "sharding"),
 )
 

@@ -5,13 +5,14 @@
 """
 
 import sys
+from functools import partial
 
 import chex
 import gymnax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 import flytrack_env  # noqa: F401, registers the ids
 
@@ -36,10 +37,10 @@ def short_episodes(env):
 def flight(env):
     """Return a function of keys (n,), actions (n, ...) and parameters: a reset, then steps.
 
-    Episodes that end are reset.
+    Episodes that end are reset. ``place`` puts what the reset returns on its devices.
     """
 
-    def fly(keys, actions, params):
+    def fly(keys, actions, params, place=lambda begun: begun):
         step = jax.vmap(env.step, in_axes=(0, 0, 0, None))
 
         def advance(begun, _):
@@ -48,7 +49,7 @@ def flight(env):
             )
             return (observation, state), (reward, terminated, truncated)
 
-        begun = jax.vmap(env.reset, in_axes=(0, None))(keys, params)
+        begun = place(jax.vmap(env.reset, in_axes=(0, None))(keys, params))
         return jax.lax.scan(advance, begun, None, length=NUM_STEPS)
 
     return fly
@@ -73,6 +74,16 @@ def _by_named_sharding(fly, keys, actions, params, mesh):
     return flown
 
 
+def _by_explicit_axes(fly, keys, actions, params, mesh):
+    mesh = jax.make_mesh(mesh.devices.shape, mesh.axis_names, axis_types=(AxisType.Explicit,))
+    batch = NamedSharding(mesh, PartitionSpec("batch"))
+    placed = jax.device_put((keys, actions), batch)
+    # What a reset returns the same for every key is not divided, which vmap of a step asks for.
+    fly = partial(fly, place=lambda begun: jax.sharding.reshard(begun, batch))
+    with jax.set_mesh(mesh):
+        return jax.jit(fly)(*placed, params)
+
+
 def _by_shard_map(fly, keys, actions, params, mesh):
     batch, steps = PartitionSpec("batch"), PartitionSpec(None, "batch")
     specs = {"in_specs": (batch, batch, PartitionSpec()), "out_specs": (batch, steps)}
@@ -86,7 +97,12 @@ def _by_pmap(fly, keys, actions, params, mesh):
     return begun, jax.tree.map(lambda leaf: jnp.concatenate(list(leaf), axis=1), steps)
 
 
-WAYS = {"sharding": _by_named_sharding, "shard_map": _by_shard_map, "pmap": _by_pmap}
+WAYS = {
+    "sharding": _by_named_sharding,
+    "explicit": _by_explicit_axes,
+    "shard_map": _by_shard_map,
+    "pmap": _by_pmap,
+}
 
 
 def main(env_id, *ways):
