@@ -36,18 +36,18 @@ CLEARANCE_M = 2e-3  # kept from frames and bounds: float32 replays stray less
 # s per squared change of a command: prevents chatter, costs less than a millisecond
 SMOOTHING_S = 1e-6
 ACROSS_M_S = 0.1  # m/s, least speed through a gate in its direction of flight
-SHORTEST_SHARE, LONGEST_SHARE = 0.2, 5.0  # of a free step's length, of its first guess
+MIN_SHARE, MAX_SHARE = 0.2, 5.0  # of a free step's length, of its first guess
 LOOSE_UNIT = 1.1  # bound of a component of a unit quaternion, which the step itself normalises
 FRACTION_EDGE = 0.02  # of a step: rounding could put a node on a gate's plane on either side of it
 PATH_POINTS = 400  # per segment
 GRAVITY = np.array([0.0, 0.0, 9.80665])  # m/s^2, of first guesses, whatever the model's
 UPSIDE_DOWN = 1e-6  # norm of a quaternion below which there is no shortest turn
 COARSE_STEP_M = 0.6  # of the path, per step
-FEWEST_STEPS = 4  # of a coarse segment
+MIN_STEPS = 4  # of a coarse segment
 SPEEDS_M_S = (10.0, 16.0)  # of first guesses: gentle, and fast enough to turn upside down
 # Of first guesses, None along the path; quarter turns are nearly equivalent.
 HEADINGS_RAD = (None, 0.0, 0.25 * np.pi)
-MOST_SHIFTS = 8  # rounds in which gates move to an adjacent step
+MAX_SHIFTS = 8  # rounds in which gates move to an adjacent step
 NEAR_EDGE = 1e-3  # of a step: a gate this near to the end of its step's range is moved
 COARSE = {"ipopt.max_iter": 400, "ipopt.tol": 1e-5, "ipopt.acceptable_tol": 1e-4}
 FINE = {"ipopt.max_iter": 400, "ipopt.tol": 1e-7, "ipopt.acceptable_tol": 1e-6}
@@ -240,7 +240,7 @@ def solve(
         opti.set_initial(fractions, np.clip(guess.fractions, FRACTION_EDGE, 1.0 - FRACTION_EDGE))
     else:
         steps_s, fractions = opti.variable(len(counts)), casadi.DM.ones(len(counts))
-        shortest_s, longest_s = SHORTEST_SHARE * guess.steps_s, LONGEST_SHARE * guess.steps_s
+        shortest_s, longest_s = MIN_SHARE * guess.steps_s, MAX_SHARE * guess.steps_s
         opti.subject_to(opti.bounded(shortest_s, steps_s, longest_s))
         opti.set_initial(steps_s, guess.steps_s)
     opti.set_initial(states, guess.states.T)
@@ -398,7 +398,7 @@ class _Search:
     def coarse(self) -> tuple[Flight, list[float]]:
         """Return the best of all starts, and all times, s (NaN if failed)."""
         counts = np.round(segment_lengths(self.task) / COARSE_STEP_M).astype(int)
-        counts = np.maximum(counts, FEWEST_STEPS)
+        counts = np.maximum(counts, MIN_STEPS)
         guesses = [
             first_guess(self.task, counts, speed, heading)
             for speed, heading in product(SPEEDS_M_S, HEADINGS_RAD)
@@ -429,7 +429,7 @@ class _Search:
         guess = resample(flight, np.diff(nodes, prepend=0), np.full(len(nodes), self.dt_s))
         guess = guess._replace(fractions=steps - (nodes - 1))
         solutions: dict[tuple[int, ...], Solution] = {}
-        while tuple(nodes) not in solutions and len(solutions) < MOST_SHIFTS:
+        while tuple(nodes) not in solutions and len(solutions) < MAX_SHIFTS:
             solution = self.solve(guess, True, FINE | WARM)
             if not solution.is_solved:
                 break

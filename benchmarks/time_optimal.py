@@ -31,7 +31,7 @@ from flytrack_env.state import pack, unpack, unpack_action
 from flytrack_env.tracks import cross_gate
 
 NOMINAL, BLACK_BOX = "nominal", "black_box"
-LARGEST_ERROR_S = 1e-3  # s, of the replay's time
+MAX_ERROR_S = 1e-3  # s, of the replay's time
 TITLES = {"flying": "flying lap", "standing": "standing start"}
 MILLI = 1e3
 HEADER = (
@@ -176,7 +176,7 @@ def replay(reference: Reference, track: Track, plant: Plant | None = None) -> Re
 def is_verified(reference: Reference, flown: Replay) -> bool:
     """Return whether a replay passed every gate, touched no frame and took the expected time."""
     is_whole = flown.gates_passed == len(reference.gate_times_s) and not flown.ended_by
-    is_on_time = abs(flown.time_s - reference.time_s) <= LARGEST_ERROR_S
+    is_on_time = abs(flown.time_s - reference.time_s) <= MAX_ERROR_S
     return is_whole and flown.frames_touched == 0 and is_on_time
 
 

@@ -16,9 +16,9 @@ from flytrack_env.messages import error_text, quote_name, quote_value
 STEP_S = 125e-6  # of body.c
 MOTORS = ("rear right", "front right", "rear left", "front left")  # Betaflight's order
 STRONGEST_HEALTH = 1.5
-LARGEST_TILT_RAD = 0.3
-LARGEST_NUMBER = 1e6
-LARGEST_BYTES = 2**20  # of a body's file
+MAX_TILT_RAD = 0.3
+MAX_NUMBER = 1e6
+MAX_BYTES = 2**20  # of a body's file
 
 
 class FirmwareError(ValueError):
@@ -94,7 +94,7 @@ class Body:
             default: Any = field.default
             values, size = np.ravel(getattr(self, field.name)), np.size(default)
             is_number = values.dtype.kind in "fiu" and values.size == size
-            if not is_number or not np.all(np.abs(values) < LARGEST_NUMBER):
+            if not is_number or not np.all(np.abs(values) < MAX_NUMBER):
                 expected = "a finite number" if size == 1 else f"{size} finite numbers"
                 raise FirmwareError(
                     f"body: {field.name}: found {getattr(self, field.name)}, expected {expected}"
@@ -131,8 +131,8 @@ class Body:
             "arm_m": ("more than 0", min(self.arm_m) > 0),
             "center_of_mass_m": ("within the arms", inside),
             "thrust_tilt_rad": (
-                f"at most {LARGEST_TILT_RAD:g} either way",
-                max(map(abs, self.thrust_tilt_rad)) <= LARGEST_TILT_RAD,
+                f"at most {MAX_TILT_RAD:g} either way",
+                max(map(abs, self.thrust_tilt_rad)) <= MAX_TILT_RAD,
             ),
             "health": (
                 f"four from 0 to {STRONGEST_HEALTH:g}",
@@ -181,7 +181,7 @@ def read_body(path: Path) -> Body:
         and field. OSError: a file that cannot be read.
     """
     try:
-        values = json.loads(read_at_most(path, LARGEST_BYTES))
+        values = json.loads(read_at_most(path, MAX_BYTES))
     except ValueError as error:
         raise FirmwareError(f"{path}: found no JSON: {error_text(error)}") from error
     if not isinstance(values, dict):

@@ -50,7 +50,7 @@ STEP_US = 10_000
 ARM_US, SETTLE_US, LANDING_US = 100_000, 500_000, 1_500_000
 CENTER_US, STICK_US, SWITCH_US = 1500.0, 500.0, 1900.0
 LOWEST_PULSE_US, PULSE_RANGE_US = 1000.0, 1000.0
-FEWEST_LOG_STEPS = 50  # of a flight whose blackbox log is kept
+MIN_LOG_STEPS = 50  # of a flight whose blackbox log is kept
 BOX_NAMES = "LOG*.BF*"  # as the firmware names its logs
 NUM_SPARE = 16  # flights that are kept open beside those of the newest call
 
@@ -123,7 +123,7 @@ class _Flight:
         box: folder for its blackbox log, which the firmware ends after disarming.
         """
         try:
-            if box is not None and self.steps >= FEWEST_LOG_STEPS:
+            if box is not None and self.steps >= MIN_LOG_STEPS:
                 self.link.call(FLY, duration_us=LANDING_US, is_held=True)
                 for log in self.folder.glob(BOX_NAMES):
                     shutil.move(log, box / f"flight_{self.number:05d}.bbl")

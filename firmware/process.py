@@ -24,13 +24,13 @@ CLI, BODY, START, FLY, FORK = range(5)
 REQUEST = struct.Struct("=5I8f")
 REPLY = struct.Struct("=3I16x2f4x21d")  # without the motors' pulses
 START_STATE = struct.Struct("=14dQ")
-LARGEST_PID = 2**31 - 1  # a fork that failed has -1, unsigned
+MAX_PID = 2**31 - 1  # a fork that failed has -1, unsigned
 ARMED = 1  # of the firmware's armingFlags
 FRAME_US = 10_000  # between two frames of the receiver: one per step of FlyTrack
 LINE_US, BOOT_US = 15_000, 2_000_000
 READY_US = 6_000_000  # until it may be armed
 DUMP_US = 400_000
-LONGEST_ANSWER_S = 60.0  # of the clock, for at most 6 s of the firmware's, which take 0.1
+MAX_ANSWER_S = 60.0  # of the clock, for at most 6 s of the firmware's, which take 0.1
 AT_REST = (1500.0, 1500.0, 950.0, 1500.0, *[1000.0] * 4)  # us, AETR and switches; below min_check
 PROMPT = "# "
 
@@ -58,7 +58,7 @@ class Link:
 
     def __init__(self, end: socket.socket, name: str):
         self.end, self.name, self.pid = end, name, 0
-        end.settimeout(LONGEST_ANSWER_S)
+        end.settimeout(MAX_ANSWER_S)
 
     def ask(
         self,
@@ -112,7 +112,7 @@ class Link:
         if isinstance(error, TimeoutError):
             self.kill()
             return FirmwareError(
-                f"firmware: {self.name} did not answer within {LONGEST_ANSWER_S:g} s; it was ended"
+                f"firmware: {self.name} did not answer within {MAX_ANSWER_S:g} s; it was ended"
             )
         return FirmwareError(f"firmware: {self.name} has ended by itself")
 
@@ -163,7 +163,7 @@ class Firmware:
         finally:
             theirs.close()
         link = Link(ours, name)
-        if not 0 < pid <= LARGEST_PID:
+        if not 0 < pid <= MAX_PID:
             link.kill()
             raise FirmwareError(
                 "firmware: its process cannot be copied: no memory, or too many processes"

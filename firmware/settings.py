@@ -35,7 +35,7 @@ HARDWARE = frozenset(
     | {"signature", "timer", "vtx", "vtxtable"}
 )
 PROFILES, RATE_PROFILES = 4, 4
-MOST_NAMES = 12  # in a message
+MAX_NAMES = 12  # in a message
 
 
 class Setting(NamedTuple):
@@ -223,8 +223,8 @@ def check_read_back(settings: list[Setting], dump: str) -> None:
 
 def _complain(what: str, names: list[str]) -> None:
     if names:
-        more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-        listed = ", ".join(names[:MOST_NAMES])
+        more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
+        listed = ", ".join(names[:MAX_NAMES])
         raise FirmwareError(
             f"settings: the firmware {what} {listed}{more}; skip=[...] leaves names out"
         )

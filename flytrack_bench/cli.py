@@ -16,7 +16,7 @@ from flytrack_env.files import read_at_most, write_atomically
 from flytrack_env.messages import error_text
 from flytrack_env.progress import ProgressBar
 
-MOST_BYTES = 2**24
+MAX_BYTES = 2**24
 VERIFIED = 3  # tasks of a result that are flown again
 
 
@@ -74,7 +74,7 @@ def bench(flags: Flags) -> bool:
 def verify(flags: Flags) -> bool:
     """Fly some tasks of a result again, and say whether they confirm it."""
     assert flags.verify is not None
-    suite, content = load_suite(flags.suite), read_at_most(flags.verify, MOST_BYTES)
+    suite, content = load_suite(flags.suite), read_at_most(flags.verify, MAX_BYTES)
     try:
         found = json.loads(content)
         ids, digest = list(found["tasks"]), found["digest"]

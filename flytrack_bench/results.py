@@ -22,7 +22,7 @@ QUARTER = 0.25
 # By which a result may differ on another machine: share of starts, share of a lap time.
 SAME_SUCCESS, SAME_LAP = 0.02, 0.005
 NOISE = 1.0  # of common sensors
-LONGEST_S = 25.0  # of one flight
+MAX_S = 25.0  # of one flight
 Report = Callable[[int, int], None]
 
 
@@ -54,7 +54,7 @@ class Data:
         self._seed += 1
         env = policy.env(self.task.plant, self.task.track)
         step_s = float(env.default_params.dt)
-        steps = round(min(seconds, LONGEST_S) / step_s)
+        steps = round(min(seconds, MAX_S) / step_s)
         flights = fly_many(
             env, NetworkPolicy(policy.network, policy.params), self._seed, BATCH, steps, steps
         )

@@ -17,7 +17,7 @@ from flytrack_env.references import track_digest
 from flytrack_env.validation import Fields, Positive, Text, convert
 
 FOLDER = Path(__file__).parent / "suites"
-MOST_BYTES = 2**20
+MAX_BYTES = 2**20
 CRAFT_FIELDS = ("tau", "coeffs", "max_rate", "drain", "mass", "gravity", "effects")
 Count = Annotated[int, Meta(ge=0)]
 
@@ -92,7 +92,7 @@ def load_suite(name_or_path: str | Path) -> Suite:
             expected = f"one of {', '.join(known)}, or a .json file"
             raise SuiteError(f"suite: found {str(name_or_path)!r}, expected {expected}")
     try:
-        content = json.loads(read_at_most(path, MOST_BYTES))
+        content = json.loads(read_at_most(path, MAX_BYTES))
     except OSError as error:
         raise SuiteError(f"{path}: cannot be read: {error_text(error)}") from error
     except (ValueError, RecursionError) as error:

@@ -12,7 +12,7 @@ from flytrack_env.files import user_cache_folder
 
 SWITCH = "FLYTRACK_COMPILE_CACHE"  # environment variable: 0 keeps nothing
 MAX_BYTES = 2**30  # every change of a program leaves its predecessor behind
-FOLDER, LEAST_S = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
+FOLDER, MIN_S = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
 
 
 def keep_compiled_programs() -> None:
@@ -34,8 +34,8 @@ def keep_compiled_programs() -> None:
         return
     if os.access(folder.parent, os.W_OK):
         jax.config.update(FOLDER, str(folder))
-        if LEAST_S.upper() not in os.environ:
-            jax.config.update(LEAST_S, 0.3)
+        if MIN_S.upper() not in os.environ:
+            jax.config.update(MIN_S, 0.3)
 
 
 def _processor() -> str:

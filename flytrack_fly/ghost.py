@@ -19,7 +19,7 @@ from flytrack_env.state import POSITION, VELOCITY
 Kind = Literal["reference", "champion", "none"]
 CHAMPION = "champion/flytrack.safetensors"  # in baselines.purejaxrl_ppo
 CHAMPION_NEEDS = "expected 2 or more: fly on its own track, flytrack, without --model"
-MOST_STEPS, NUM_LAPS = 6000, 3  # of the champion's flight
+MAX_STEPS, NUM_LAPS = 6000, 3  # of the champion's flight
 STILL_START = ResetParams(0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # no noise, full, never on the course
 
 
@@ -124,8 +124,8 @@ def fly_champion(
     champion = baseline.load_checkpoint(Path(baseline.__file__).parent / CHAMPION)
     model = model or model_from_json(champion.meta["model"], "checkpoint: model")
     env = make(champion.env_id, track=track, model=model)
-    params = still_start(env.default_params, MOST_STEPS)
-    flown = fly_episode(env, champion.policy, jax.random.key(0), params, MOST_STEPS, NUM_LAPS)
+    params = still_start(env.default_params, MAX_STEPS)
+    flown = fly_episode(env, champion.policy, jax.random.key(0), params, MAX_STEPS, NUM_LAPS)
     count = int(np.sum(flown.is_flying))
     return np.asarray(flown.states, float)[:count], np.asarray(flown.actions)[:count], model
 

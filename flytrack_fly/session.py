@@ -20,7 +20,7 @@ from flytrack_env.tracks import cross_gate
 from flytrack_fly.ghost import Ghost, still_start
 from flytrack_fly.sticks import NAMES, command_of
 
-MOST_BEHIND_S = 0.1  # later than that, the flight is slowed down: it must not fall behind ever more
+MAX_LAG_S = 0.1  # later than that, the flight is slowed down: it must not fall behind ever more
 START_HINT = "W, or throttle up: start.  H: keys"
 ROUNDING = 1e-6  # of a number of steps
 GRID = RaceRules()
@@ -29,9 +29,9 @@ GRID = RaceRules()
 def steps_due(behind_s: float, frame_s: float, step_s: float) -> tuple[int, float]:
     """Return how many steps are due after a picture that took ``frame_s`` s, and the rest, s.
 
-    behind_s: left over before. No more than ``MOST_BEHIND_S`` are caught up on.
+    behind_s: left over before. No more than ``MAX_LAG_S`` are caught up on.
     """
-    due_s = min(behind_s + frame_s, MOST_BEHIND_S)
+    due_s = min(behind_s + frame_s, MAX_LAG_S)
     steps = math.floor(due_s / step_s + ROUNDING)
     return steps, due_s - steps * step_s
 

@@ -17,7 +17,7 @@ from flytrack_sysid import FlightLog, log_of_states, validate
 from flytrack_sysid.sensors import measure
 
 NUM_EPISODES, NUM_LAPS, NUM_STEPS = 256, 3, 2500
-FEWEST_ROWS = 50  # of a flight that is kept: half a second
+MIN_ROWS = 50  # of a flight that is kept: half a second
 BATCH = 16  # flights that are flown at once
 
 
@@ -120,12 +120,12 @@ def log_of_flights(
     for states, actions, flown in zip(flights.states, flights.actions, is_flying, strict=True):
         if sum(len(rows) for rows, _ in kept) * dt >= seconds:
             break
-        if flown.sum() >= FEWEST_ROWS:
+        if flown.sum() >= MIN_ROWS:
             kept.append((np.asarray(states)[flown], np.asarray(actions)[flown]))
     if not kept:
         raise ValueError(
             f"policy: found {len(is_flying)} flights of at most "
-            f"{is_flying.sum(axis=1).max()} steps, expected one of {FEWEST_ROWS} or more"
+            f"{is_flying.sum(axis=1).max()} steps, expected one of {MIN_ROWS} or more"
         )
     log = log_of_states(kept, dt, f"{len(kept)} flights of the policy")
     if noise > 0.0:

@@ -22,21 +22,21 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
-from flytrack_sysid.plausibility import GRAVITY, LEAST_CORRELATION, summed_turns
+from flytrack_sysid.plausibility import GRAVITY, MIN_CORRELATION, summed_turns
 from flytrack_sysid.resample import interpolate, interpolate_quaternions
 
-LARGEST_OFFSET_S = 0.25  # beyond it, loggers are broken rather than late
+MAX_OFFSET_S = 0.25  # beyond it, loggers are broken rather than late
 WINDOW_S = 0.1  # long against the noise of a sample, short against manoeuvres
 GRID_S = 0.01  # below it, the cost has one minimum: motion of a drone is slower
 ROUNDS = 5  # of Gauss-Newton; it converges in two
 BLOCK_S = 2.0  # errors further apart than this have little in common
-FEWEST_BLOCKS = 5
+MIN_BLOCKS = 5
 SPIKE = 12.0  # times the median deviation from both neighbours: eight standard deviations
 SIGNIFICANT = 3.0  # standard errors
 CORRECTED, LEFT = "corrected", "significant, left as asked"
 # Of a clock that a diagnosis corrects: standard errors, and s.
 LATE_ERRORS, LATE_S = 5.0, 0.005
-LEAST_STEPS = 0.1  # of the log's step: smaller offsets change less than the step itself does
+MIN_STEPS = 0.1  # of the log's step: smaller offsets change less than the step itself does
 
 
 class ClockOffset(NamedTuple):
@@ -128,9 +128,7 @@ def _stretches(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> list[_Str
     edges = np.flatnonzero(np.append(is_gap | log.is_start()[1:], True)) + 1
     for start, end in pairwise([0, *edges]):
         rows, time = slice(start, end), log.time[start:end]
-        is_start = (time - time[0] >= LARGEST_OFFSET_S) & (
-            time[-1] - time >= LARGEST_OFFSET_S + WINDOW_S
-        )
+        is_start = (time - time[0] >= MAX_OFFSET_S) & (time[-1] - time >= MAX_OFFSET_S + WINDOW_S)
         starts = time[is_start]
         if len(starts) < 2:
             continue
@@ -174,20 +172,20 @@ def offset_between(
     """Return offset, standard error and correlation, or why they are unknown (else empty)."""
     unknown = np.nan, np.nan, np.nan
     stretches = _stretches(log, sums, rates)
-    if sum(stretch.block[-1] - stretch.block[0] + 1 for stretch in stretches) < FEWEST_BLOCKS:
-        return *unknown, f"not compared: less than {FEWEST_BLOCKS * BLOCK_S:g} s without a gap"
+    if sum(stretch.block[-1] - stretch.block[0] + 1 for stretch in stretches) < MIN_BLOCKS:
+        return *unknown, f"not compared: less than {MIN_BLOCKS * BLOCK_S:g} s without a gap"
     if any(not np.ptp(values, axis=0).any() for values in (sums, rates)):
         # All offsets fit a constant signal equally well: rounding would choose between the reasons.
         return *unknown, "not compared: correlation 0.00: they do not show one motion clearly"
     # Windows keep the largest offset away from the ends of the data; the grid stays within it.
-    grid = np.arange(-LARGEST_OFFSET_S + GRID_S, LARGEST_OFFSET_S - GRID_S / 2, GRID_S)
+    grid = np.arange(-MAX_OFFSET_S + GRID_S, MAX_OFFSET_S - GRID_S / 2, GRID_S)
     best = int(np.argmin([_cost(stretches, offset) for offset in grid]))
     if best in (0, len(grid) - 1):
-        return *unknown, f"not compared: they agree at no offset within {LARGEST_OFFSET_S:g} s"
+        return *unknown, f"not compared: they agree at no offset within {MAX_OFFSET_S:g} s"
     offset = float(grid[best])
     for _ in range(ROUNDS):
         numerator, denominator, correlation = _sums(stretches, offset)
-        if denominator.sum() == 0.0 or correlation < LEAST_CORRELATION:
+        if denominator.sum() == 0.0 or correlation < MIN_CORRELATION:
             reason = f"correlation {correlation:.2f}: they do not show one motion clearly"
             return *unknown, f"not compared: {reason}"
         offset = float(np.clip(offset + numerator.sum() / denominator.sum(), grid[0], grid[-1]))
@@ -233,9 +231,7 @@ def align_clocks(log: FlightLog, correct: bool = True) -> tuple[FlightLog, tuple
             continue
         offset, sigma, correlation, verdict = offset_between(aligned, sums(aligned), rates(aligned))
         step = float(np.median(usual_step(aligned)))
-        if not verdict and (
-            abs(offset) <= SIGNIFICANT * sigma or abs(offset) <= LEAST_STEPS * step
-        ):
+        if not verdict and (abs(offset) <= SIGNIFICANT * sigma or abs(offset) <= MIN_STEPS * step):
             verdict = "not significant, left"
         elif not verdict:
             shifted, is_known = read_later(aligned, (channel,), offset)

@@ -20,7 +20,7 @@ from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.plants import Plant
 from flytrack_env.state import ACCELERATION, STATE_SIZE, pack, unpack, unpack_action
 from flytrack_sysid import excitation
-from flytrack_sysid.excitation import DT_S, FEWEST_STEPS, MIDDLE_V, VOLTAGES
+from flytrack_sysid.excitation import DT_S, MIDDLE_V, MIN_STEPS, VOLTAGES
 from flytrack_sysid.log import FlightLog, log_of_states
 from flytrack_sysid.script_file import Script, check_script, script_of
 from flytrack_sysid.sensors import LOST_ROWS, measure
@@ -30,7 +30,7 @@ Fly = Callable[[np.ndarray, np.ndarray], np.ndarray]
 Report = Callable[[int, int], None]
 
 SECONDS_PER_FLIGHT = excitation.FLIGHT_STEPS * DT_S
-FEWEST_MINUTES = excitation.FLIGHTS_PER_KIND * len(excitation.KINDS) * SECONDS_PER_FLIGHT / 60.0
+MIN_MINUTES = excitation.FLIGHTS_PER_KIND * len(excitation.KINDS) * SECONDS_PER_FLIGHT / 60.0
 
 
 class CollectError(ValueError):
@@ -139,8 +139,8 @@ def collect(
     Raises: CollectError, ScriptError: arguments out of range, or a plant or script that cannot be
         flown.
     """
-    if not FEWEST_MINUTES <= minutes < np.inf:
-        raise CollectError(f"minutes: found {minutes}, expected at least {FEWEST_MINUTES:g}")
+    if not MIN_MINUTES <= minutes < np.inf:
+        raise CollectError(f"minutes: found {minutes}, expected at least {MIN_MINUTES:g}")
     if not 0.0 <= noise < 1.0 / LOST_ROWS:
         raise CollectError(f"noise: found {noise}, expected 0 or more, below {1.0 / LOST_ROWS:g}")
     if seed < 0:
@@ -190,9 +190,7 @@ def _cut(
     inside = excitation.is_inside(states, heights, voltages)
     lengths = np.where(inside.all(axis=1), states.shape[1], np.argmin(inside, axis=1))
     kept = [
-        (x[:n], u[:n])
-        for x, u, n in zip(states, commands, lengths, strict=True)
-        if n >= FEWEST_STEPS
+        (x[:n], u[:n]) for x, u, n in zip(states, commands, lengths, strict=True) if n >= MIN_STEPS
     ]
     if not kept:
         raise CollectError("plant: no flight stayed within the envelope for more than a step")

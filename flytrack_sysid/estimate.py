@@ -39,7 +39,7 @@ from flytrack_sysid.record import is_applied_certain, make_record
 TURNS, FORCES, BATTERY = AXES
 # Noise that the first round assumes, (NUM_AXES, 2), in the channels' units: that of common sensors.
 FIRST_NOISE = np.array([[0.1, 0.01]] * 3 + [[1.5, 0.05]] * 3 + [[1.0, 0.02]])
-LEAST_NOISE = 1e-12
+MIN_NOISE = 1e-12
 LAST_STEPS = (
     0,
     0,
@@ -179,7 +179,7 @@ class Channels(Problem):
                 2 if self.has_position and axes is FORCES else 1
             )
         squares = np.square(self.residuals(vector[None])[0]).sum(axis=(0, 1))
-        return np.maximum(np.sqrt(squares / np.maximum(number, 1)), LEAST_NOISE)
+        return np.maximum(np.sqrt(squares / np.maximum(number, 1)), MIN_NOISE)
 
     def by_channel(self, values: np.ndarray) -> dict[str, np.ndarray]:
         """Return (NUM_AXES, 2) by the names of the channels that count."""

@@ -14,13 +14,13 @@ from scipy.spatial.transform import Rotation
 from flytrack_env import state as layout
 
 # The envelope of collected flights.
-LARGEST_SPEED = 20.0  # m/s
+MAX_SPEED = 20.0  # m/s
 HEIGHTS = (10.0, 110.0)  # m
 SCRIPT_HEIGHTS = (0.1, 110.0)  # m, of a script, which may want flights close to the ground
 VOLTAGES = (layout.BATTERY_EMPTY_V, layout.BATTERY_FULL_V)
 ANY_VOLTAGE = (0.0, np.inf)  # of other craft
 MIDDLE_V = 0.5 * (layout.BATTERY_EMPTY_V + layout.BATTERY_FULL_V)
-FEWEST_STEPS = 2  # of a flight; a shorter one shows no step
+MIN_STEPS = 2  # of a flight; a shorter one shows no step
 
 DT_S = 0.01
 SLOT_STEPS = 125
@@ -52,7 +52,7 @@ def is_inside(
     heights: in m. voltages: in V.
     """
     height, battery_v = states[..., layout.POSITION][..., 2], states[..., layout.BATTERY]
-    is_slow = np.linalg.norm(states[..., layout.VELOCITY], axis=-1) <= LARGEST_SPEED
+    is_slow = np.linalg.norm(states[..., layout.VELOCITY], axis=-1) <= MAX_SPEED
     is_charged = (battery_v >= voltages[0]) & (battery_v <= voltages[1])
     return is_slow & is_charged & (height >= heights[0]) & (height <= heights[1])
 

@@ -46,7 +46,7 @@ UNCERTAIN_TAU, UNCERTAIN_THRUST = 0.2, 0.02
 BOX_ACTIONS, BOX_VOLTAGES = 41, 9
 NEVER_MOVED = 1e-3  # of a stick's travel from -1 to 1
 # correlation of a rate with its lagged command; chance gives less in a minute of noise
-LEAST_RESPONSE = 0.1
+MIN_RESPONSE = 0.1
 AT_BOUND = 1.01
 AT_END = 1e-3  # of the range of an effect's parameter
 
@@ -350,7 +350,7 @@ def _check_response(log: FlightLog, start: ModelParameters) -> None:
         expected = signal.lfilter([1.0 - keep], [1.0, -keep], log["u"][:, axis])
         if np.ptp(expected) > NEVER_MOVED and np.ptp(log["w"][:, axis]) > 0.0:
             answers.append(abs(np.corrcoef(expected, log["w"][:, axis])[0, 1]))
-    if answers and max(answers) < LEAST_RESPONSE:
+    if answers and max(answers) < MIN_RESPONSE:
         raise FitError(
             f"{log.source}: w: found no body rate that follows its command (correlation at most "
             f"{max(answers):.2g}), expected a drone in flight; is it motionless?"

@@ -30,15 +30,15 @@ from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_s
 from flytrack_sysid.log_table import Table, check_names, columns_of, log_of_table, stated_columns
 
 SUFFIXES = (".npz", ".csv")
-LARGEST_BYTES = 512 * 2**20
-PACKED_BYTES, LARGEST_RATIO = (
+MAX_BYTES = 512 * 2**20
+PACKED_BYTES, MAX_RATIO = (
     2**24,
     32,
 )  # characters in a compressed file: that, or as many times its bytes
-LARGEST_VALUES = (
+MAX_VALUES = (
     56 * 2**20
 )  # all columns at 1 kHz for half an hour; twice as many float64 are below 1 GiB
-LONGEST_ROW = 2**16  # characters: thousands of columns
+MAX_ROW_LENGTH = 2**16  # characters: thousands of columns
 
 
 def load_log(path: str | Path) -> FlightLog:
@@ -138,7 +138,7 @@ def _ranges(log: FlightLog) -> list[str]:
 def _read_npz(path: Path) -> Table:
     """Return the arrays of an .npz file as columns."""
     try:
-        arrays = load_npz(path, LARGEST_BYTES)
+        arrays = load_npz(path, MAX_BYTES)
     except NpzError as error:
         raise LogError(f"{path}: {error}") from error
     check_names(str(path), list(arrays))
@@ -172,13 +172,11 @@ def open_csv(path: Path, delimiter: str = ",") -> Iterator[Any]:
     """
     rows = None
     try:
-        with open_file(path, LARGEST_BYTES) as file:
+        with open_file(path, MAX_BYTES) as file:
             stream: Any = file
-            most_characters = LARGEST_BYTES
+            most_characters = MAX_BYTES
             if path.suffix == ".gz":
-                most_characters = min(
-                    LARGEST_BYTES, max(PACKED_BYTES, LARGEST_RATIO * path.stat().st_size)
-                )
+                most_characters = min(MAX_BYTES, max(PACKED_BYTES, MAX_RATIO * path.stat().st_size))
                 stream = gzip.GzipFile(fileobj=file)
             with io.TextIOWrapper(stream, encoding="utf-8-sig", newline="") as text:
                 rows = csv.reader(_lines(text, most_characters), delimiter=delimiter, strict=True)
@@ -193,10 +191,10 @@ def open_csv(path: Path, delimiter: str = ",") -> Iterator[Any]:
 def _lines(text: io.TextIOWrapper, most_characters: int) -> Iterator[str]:
     """Yield the lines of a file; no row has several, so that ``csv`` never reads much at once."""
     num_characters = 0
-    while line := text.readline(LONGEST_ROW):
+    while line := text.readline(MAX_ROW_LENGTH):
         num_characters += len(line)
-        if len(line) == LONGEST_ROW:
-            raise csv.Error(f"found a row of {LONGEST_ROW} characters or more, expected fewer")
+        if len(line) == MAX_ROW_LENGTH:
+            raise csv.Error(f"found a row of {MAX_ROW_LENGTH} characters or more, expected fewer")
         if num_characters > most_characters:
             raise csv.Error(f"found more than {most_characters} characters, expected at most that")
         if line.count('"') % 2:
@@ -210,7 +208,7 @@ def read_columns(path: Path, rows: Any, header: list[str], wanted: Iterable[str]
     header: has each of the wanted columns.
 
     Raises: LogError: a row of another length, a cell that is no finite number, more than
-        LARGEST_VALUES numbers.
+        MAX_VALUES numbers.
     """
     places = {name: header.index(name) for name in wanted}
     values, lines = array("d"), array("q")
@@ -222,10 +220,8 @@ def read_columns(path: Path, rows: Any, header: list[str], wanted: Iterable[str]
             )
         values.extend(_number(where, name, cells[place]) for name, place in places.items())
         lines.append(rows.line_num)
-        if len(values) > LARGEST_VALUES:
-            raise LogError(
-                f"{path}: found more than {LARGEST_VALUES} numbers, expected at most that"
-            )
+        if len(values) > MAX_VALUES:
+            raise LogError(f"{path}: found more than {MAX_VALUES} numbers, expected at most that")
     columns = np.asarray(values).reshape(-1, len(places)).T
     return Table(str(path), dict(zip(places, columns, strict=True)), np.asarray(lines))
 

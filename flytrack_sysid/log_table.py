@@ -20,11 +20,11 @@ from flytrack_sysid.log import (
     Origin,
 )
 
-LARGEST_NORM_ERROR = 1e-2  # of quaternions: estimators drift a little; more is no unit quaternion
-SMALLEST_NORM_ERROR = 1e-12  # below it a norm is 1 up to rounding, and the values stay as they are
+MAX_NORM_ERROR = 1e-2  # of quaternions: estimators drift a little; more is no unit quaternion
+MIN_NORM_ERROR = 1e-12  # below it a norm is 1 up to rounding, and the values stay as they are
 COMMAND_MARGIN = 1e-6  # beyond [-1, 1]: rounding by the program that wrote the log
-LONGEST_NAME = max(map(len, COLUMNS)) + 3  # longer names are similar to none
-LARGEST_SEGMENT = 2**53  # float64 is exact for whole numbers below it
+MAX_NAME_LENGTH = max(map(len, COLUMNS)) + 3  # longer names are similar to none
+MAX_SEGMENT = 2**53  # float64 is exact for whole numbers below it
 
 
 class Table(NamedTuple):
@@ -74,7 +74,7 @@ def check_names(source: str, names: Sequence[str]) -> None:
     """
     for name in names:
         if name not in COLUMNS:
-            near = difflib.get_close_matches(name[:LONGEST_NAME].lower(), COLUMNS, n=1)
+            near = difflib.get_close_matches(name[:MAX_NAME_LENGTH].lower(), COLUMNS, n=1)
             hint = f"; did you mean {near[0]}?" if near else ""
             raise LogError(
                 f"{source}: column {quote_value(name)}: unknown{hint} (known: {', '.join(COLUMNS)})"
@@ -150,9 +150,9 @@ def log_of_table(table: Table) -> FlightLog:
     if "q" in channels:
         norm = np.linalg.norm(channels["q"], axis=1)
         error = np.abs(norm - 1.0)
-        expected = f"a quaternion of norm 1 within {LARGEST_NORM_ERROR:g}"
-        table.check(error <= LARGEST_NORM_ERROR, ", ".join(CHANNELS["q"]), expected, norm)
-        channels["q"] *= np.where(error > SMALLEST_NORM_ERROR, 1.0 / norm, 1.0)[:, None]
+        expected = f"a quaternion of norm 1 within {MAX_NORM_ERROR:g}"
+        table.check(error <= MAX_NORM_ERROR, ", ".join(CHANNELS["q"]), expected, norm)
+        channels["q"] *= np.where(error > MIN_NORM_ERROR, 1.0 / norm, 1.0)[:, None]
     return FlightLog(table.columns["t"], channels, segment, table.source, origin, stated_voltage_v)
 
 
@@ -194,7 +194,7 @@ def _stated_voltages(table: Table) -> tuple[float, float] | None:
 def _segments(table: Table) -> np.ndarray:
     """Return the segment of each row, (num_rows,) int."""
     values = table.columns.get("segment", np.zeros(len(table.columns["t"])))
-    is_whole = (values == np.round(values)) & (np.abs(values) < LARGEST_SEGMENT)
+    is_whole = (values == np.round(values)) & (np.abs(values) < MAX_SEGMENT)
     table.check(is_whole, "segment", "a whole number below 2^53")
     segment = values.astype(np.int64)
     starts = np.flatnonzero(np.concatenate([[True], segment[1:] != segment[:-1]]))

@@ -16,29 +16,29 @@ from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid.log import CHANNELS, FlightLog, LogError
 
 WINDOWS_S = (0.1, 0.3, 1.0)  # long against the noise of a sample; short ones for fast manoeuvres
-FEWEST_WINDOWS = 10
-LEAST_CORRELATION = 0.9  # with less in common, the slope may be that of noise
+MIN_WINDOWS = 10
+MIN_CORRELATION = 0.9  # with less in common, the slope may be that of noise
 # Channels of one motion correlate by more unless they contradict each other; and then they must
-# correlate by LEAST_CORRELATION if read otherwise. Right logs: 0.97 or more where they move,
+# correlate by MIN_CORRELATION if read otherwise. Right logs: 0.97 or more where they move,
 # anything where they do not.
 CONTRADICTION = 0.5
 STILL = 1e-6  # in any unit: what changes by less does not change
 GRAVITY = float(nominal_parameters().g)  # m/s^2
 TOLERANCE = 0.15  # of a known wrong factor: scale errors of sensors stay well below it
-FEWEST_ROWS = 100
-FEWEST_UPRIGHT_ROWS = 20
-SHORTEST_S = 2.0
-LONGEST_STEP_S = 0.5  # no log of a drone is as slow as 2 Hz
+MIN_ROWS = 100
+MIN_UPRIGHT_ROWS = 20
+MIN_S = 2.0
+MAX_STEP_S = 0.5  # no log of a drone is as slow as 2 Hz
 PER_S = {"ms": 1e3, "us": 1e6, "ns": 1e9}
-LEAST_TURN = 0.3  # rad within a second: more than the bias of a gyroscope at rest integrates to
+MIN_TURN = 0.3  # rad within a second: more than the bias of a gyroscope at rest integrates to
 FAST_PERCENTILE = 99.0  # of the rates: a lone spike is no unit
 FASTEST_RATE = float(np.deg2rad(4000.0))  # rad/s, the widest range among common gyroscopes
 HIGHEST_BATTERY_V = 100.0  # drones' batteries end at about 60 V
 LIKELY_BATTERY_V = (2.5, 70.0)  # an empty cell; more than a full pack of 14 in series
-LARGEST_FORCE_G = 3.0  # median specific force of a flight, in g; racing is below it
-LARGEST_BIAS = 2.5  # m/s^2, of an accelerometer in flight, vibration included
+MAX_FORCE_G = 3.0  # median specific force of a flight, in g; racing is below it
+MAX_BIAS = 2.5  # m/s^2, of an accelerometer in flight, vibration included
 LONG_FALL_S = 5.0  # no drone falls for longer
-LEAST_FORCE_DOWN = 0.5 * GRAVITY  # m/s^2 along -z of the body; drag in a fast climb is less
+MIN_FORCE_DOWN = 0.5 * GRAVITY  # m/s^2 along -z of the body; drag in a fast climb is less
 UPRIGHT = float(np.cos(np.deg2rad(45.0)))  # cosine of the tilt
 
 BATTERY_UNITS = {1000.0: "mV", 100.0: "hundredths of V", 10.0: "tenths of V"}
@@ -95,7 +95,7 @@ def agreement(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> tuple[flo
     best, slope = np.nan, np.nan
     for length_s in WINDOWS_S:
         windows = windows_of(log, length_s)
-        if len(windows.starts) < FEWEST_WINDOWS:
+        if len(windows.starts) < MIN_WINDOWS:
             continue
         grown = windows.change_of(change) / windows.durations[:, None]
         summed = windows.mean_of(log, rate)
@@ -111,7 +111,7 @@ def agreement(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> tuple[flo
 def slope_of(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> float:
     """Return the ratio of the integral of a rate to a change; NaN if none is clear."""
     correlation, slope = agreement(log, change, rate)
-    return slope if correlation >= LEAST_CORRELATION else np.nan
+    return slope if correlation >= MIN_CORRELATION else np.nan
 
 
 def _is_about(value: float, factor: float) -> bool:
@@ -127,18 +127,18 @@ def _with_time_in_s(log: FlightLog) -> tuple[FlightLog, list[str]]:
     """Return the log with its time in s, and the problem if it was not."""
     steps = np.diff(log.time)[~log.is_start()[1:]]
     step = np.median(steps) if len(steps) else 0.0
-    if step < LONGEST_STEP_S:
+    if step < MAX_STEP_S:
         return log, []
-    likely = (unit for unit, per_second in PER_S.items() if step < LONGEST_STEP_S * per_second)
+    likely = (unit for unit, per_second in PER_S.items() if step < MAX_STEP_S * per_second)
     unit = next(likely, "ns")
-    problem = f"t: found a median step of {step:.4g}, expected less than {LONGEST_STEP_S:g} s"
+    problem = f"t: found a median step of {step:.4g}, expected less than {MAX_STEP_S:g} s"
     return replace(log, time=log.time / PER_S[unit]), [f"{problem}: this looks like {unit}"]
 
 
 def _length(log: FlightLog) -> Iterator[str]:
     duration = np.diff(log.time)[~log.is_start()[1:]].sum()
-    if len(log) < FEWEST_ROWS or duration < SHORTEST_S:
-        expected = f"expected at least {FEWEST_ROWS} rows and {SHORTEST_S:g} s"
+    if len(log) < MIN_ROWS or duration < MIN_S:
+        expected = f"expected at least {MIN_ROWS} rows and {MIN_S:g} s"
         yield (
             f"t: found {len(log)} rows and {duration:.3g} s, {expected}: too short to tell "
             "anything from"
@@ -174,7 +174,7 @@ def _attitude(log: FlightLog) -> Iterator[str]:
         return
     windows = windows_of(log, WINDOWS_S[-1])
     turn = np.linalg.norm(windows.mean_of(log, log["w"]), axis=1) * windows.durations
-    if np.ptp(log["q"], axis=0).max() <= STILL and len(turn) and turn.max() > LEAST_TURN:
+    if np.ptp(log["q"], axis=0).max() <= STILL and len(turn) and turn.max() > MIN_TURN:
         found = (
             f"found the same in every row while {_columns('w')} turn by {turn.max():.2g} rad in a "
             "second"
@@ -286,12 +286,10 @@ def _conventions(log: FlightLog) -> Iterator[str]:
         cured = [
             name
             for name in before
-            if before[name] < CONTRADICTION and after[name] >= LEAST_CORRELATION
+            if before[name] < CONTRADICTION and after[name] >= MIN_CORRELATION
         ]
         is_harmed = any(
-            after[name] < min(before[name], LEAST_CORRELATION)
-            for name in before
-            if name not in cured
+            after[name] < min(before[name], MIN_CORRELATION) for name in before if name not in cured
         )
         if cured and not is_harmed:
             resolved.setdefault(", ".join(cured), []).append(f"{channel} {text}")
@@ -338,7 +336,7 @@ def _acceleration(log: FlightLog) -> Iterator[str]:
         return
     changes = windows.change_of(log["v"]) / windows.durations[:, None]
     offset = float(np.median((windows.mean_of(log, log["a"]) - changes)[:, 2]))
-    if abs(offset - GRAVITY) <= LARGEST_BIAS:
+    if abs(offset - GRAVITY) <= MAX_BIAS:
         found = f"found {offset:.3g} m/s^2 more than v_z changes by, expected 0 in hover"
         yield f"a_z: {found}: gravity looks left in, as an accelerometer measures it"
 
@@ -352,10 +350,10 @@ def _force(log: FlightLog) -> Iterator[str]:
 def _force_unit(log: FlightLog) -> Iterator[str]:
     """Compare the size of specific force with that by velocity, or with what keeps a drone up."""
     windows = windows_of(log, WINDOWS_S[0])
-    if len(windows.starts) < FEWEST_WINDOWS:
+    if len(windows.starts) < MIN_WINDOWS:
         return
     found = float(np.median(np.linalg.norm(windows.mean_of(log, log["f"]), axis=1)))
-    if found > LARGEST_FORCE_G:
+    if found > MAX_FORCE_G:
         return
     problem = f"{_columns('f')}: found a median size of {found:.3g}"
     if "v" in log:
@@ -377,7 +375,7 @@ def _force_sign(log: FlightLog) -> Iterator[str]:
     if "q" in log:
         body_z_w = Rotation.from_quat(log["q"], scalar_first=True).apply([0.0, 0.0, 1.0])
         force_z = force_z[body_z_w[:, 2] >= UPRIGHT]
-    if len(force_z) >= FEWEST_UPRIGHT_ROWS and np.median(force_z) <= -LEAST_FORCE_DOWN:
+    if len(force_z) >= MIN_UPRIGHT_ROWS and np.median(force_z) <= -MIN_FORCE_DOWN:
         found = f"found a median of {np.median(force_z):.3g} m/s^2 where upright"
         yield f"f_z: {found}, expected about {GRAVITY:.3g}: z looks as if it pointed down"
 

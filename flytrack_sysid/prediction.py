@@ -19,7 +19,7 @@ from flytrack_sysid.replay import Step, replay, start_replay
 SETTLING_S = 0.5
 # Free flights at once: bounds the memory that they need, and compiles one size.
 BATCH = 128
-LONGEST_S = 2.0  # of free flight: shorter ones share its program
+MAX_S = 2.0  # of free flight: shorter ones share its program
 FLOWN = ("p", "v", "q", "w")  # channels of a free flight
 
 
@@ -166,7 +166,7 @@ def free_flights(
     (num_starts, num_seen, size), units of the log; beyond the log's end the last command is held.
     """
     after = seen - starts[:, None] - 1
-    num_steps = max(int(np.ceil(LONGEST_S / prediction.step_s)), 1 + after.max(initial=0))
+    num_steps = max(int(np.ceil(MAX_S / prediction.step_s)), 1 + after.max(initial=0))
     found = {name: np.empty((*seen.shape, len(CHANNELS[name]))) for name in FLOWN}
     for begin in range(0, len(starts), BATCH):
         filled = np.resize(starts[begin : begin + BATCH], BATCH)

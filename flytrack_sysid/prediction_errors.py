@@ -9,7 +9,7 @@ from scipy.stats import binned_statistic_2d
 from flytrack_env.battery import Battery
 from flytrack_sysid.log import CHANNELS
 from flytrack_sysid.prediction import (
-    LONGEST_S,
+    MAX_S,
     Prediction,
     columns,
     free_flights,
@@ -28,7 +28,7 @@ NRMSE_MEANING = {
     BY_SPREAD: "rmse over the standard deviation of the measured channel: 1 is as good as its mean",
 }
 # Free flight.
-HORIZONS_S = (0.1, 0.5, 1.0, LONGEST_S)
+HORIZONS_S = (0.1, 0.5, 1.0, MAX_S)
 START_EVERY_S = 0.25
 # Channel of each error, and its unit.
 QUANTITIES = {
@@ -42,7 +42,7 @@ HIGH_PERCENTILE = 95.0
 NUM_ACTION_BINS = 10
 NUM_VOLTAGE_BINS = 4
 # V; a pack that never changes its voltage still gets a bin.
-LEAST_VOLTAGE_RANGE = 0.1
+MIN_VOLTAGE_RANGE = 0.1
 
 
 class ChannelError(NamedTuple):
@@ -253,7 +253,7 @@ def _voltage_range(battery_v: np.ndarray, battery: Battery) -> tuple[float, floa
     empty_v, full_v = float(battery.empty_v), float(battery.full_v)
     if low >= empty_v and high <= full_v:
         return empty_v, full_v
-    return low, max(high, low + LEAST_VOLTAGE_RANGE)
+    return low, max(high, low + MIN_VOLTAGE_RANGE)
 
 
 def thrust_error(prediction: Prediction, rows: np.ndarray) -> ThrustError | None:

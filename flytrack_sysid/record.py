@@ -18,14 +18,14 @@ from flytrack_sysid.log_voltage import assumed_voltage
 from flytrack_sysid.resample import interpolate, interpolate_quaternions
 from flytrack_sysid.split import blocks_of, cut_evenly
 
-LONGEST_FILLED_S = 0.1  # after a longer gap a new flight begins
+MAX_FILLED_S = 0.1  # after a longer gap a new flight begins
 # Without voltage thrust is off by another share in each flight, and the velocity runs away with it.
 WINDOW_WITHOUT_VOLTAGE_S = 1.25
 WINDOW_S = 2.5  # over which increments of velocity and attitude are followed
 PADDED_TO = 1024  # rows: logs of about the same length share one compiled program
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 # An applied action known worse than this counts for nothing: half a gyro's noise at full stick.
-LARGEST_DOUBT = 0.005
+MAX_DOUBT = 0.005
 APPLIED_UNKNOWN = 1.0  # standard deviation of an applied action that nothing is known of
 
 
@@ -60,7 +60,7 @@ def _new_times(log: FlightLog, usual: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Return times with gaps filled, the log's row at or before each, and where a flight begins."""
     steps = np.diff(log.time, append=log.time[-1])
     ends = np.append(log.segment[1:] != log.segment[:-1], True)
-    is_long = ~ends & (steps > LONGEST_FILLED_S)
+    is_long = ~ends & (steps > MAX_FILLED_S)
     is_gap = ~ends & ~is_long & (steps > GAP_STEPS * usual)
     pieces = np.where(is_gap, np.round(steps / usual).astype(int), 1)
     pieces = np.maximum(pieces, 1)
@@ -201,7 +201,7 @@ def is_applied_certain(record: Record, tau: np.ndarray) -> np.ndarray:
             variance = np.full(ACTION_SIZE, unknown[row])
         variances[row] = variance
         variance = keep[row] ** 2 * variance + enters[row]
-    return np.sqrt(variances) < LARGEST_DOUBT
+    return np.sqrt(variances) < MAX_DOUBT
 
 
 def measured_channels(log: FlightLog, record: Record, gravity: float) -> dict[str, np.ndarray]:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 SLOW_STEP_S = 0.025  # 40 Hz: the lags of a rate loop are 10 to 50 ms
-LONGEST_BRIDGE_STEPS = 3.0  # of a channel's usual step: longer gaps are not interpolated
+MAX_BRIDGE_STEPS = 3.0  # of a channel's usual step: longer gaps are not interpolated
 SETPOINTS = ("attitude_command", "torque_command", "reference_rates", "thrust_command")
 HELD = ("u", *SETPOINTS, "own_attitude", "motors")
 
@@ -27,7 +27,7 @@ def _brackets(times: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray
     after = np.clip(np.searchsorted(times, at, side="left"), 1, max(len(times) - 1, 1))
     if len(times) < 2:
         return np.zeros(len(at), int), np.zeros(len(at), int), np.zeros(len(at), bool)
-    longest = LONGEST_BRIDGE_STEPS * np.median(np.diff(times))
+    longest = MAX_BRIDGE_STEPS * np.median(np.diff(times))
     is_exact = (times[after] == at) | (times[after - 1] == at)
     is_inside = (times[0] <= at) & (at <= times[-1])
     return after - 1, after, is_inside & (is_exact | (times[after] - times[after - 1] <= longest))
@@ -65,7 +65,7 @@ def hold(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> tuple[np.ndar
     Known: not older than three usual steps of the channel. Returns (num_at, n), (num_at,) bool.
     """
     last = np.searchsorted(times, at, side="right") - 1
-    longest = LONGEST_BRIDGE_STEPS * (np.median(np.diff(times)) if len(times) > 1 else np.inf)
+    longest = MAX_BRIDGE_STEPS * (np.median(np.diff(times)) if len(times) > 1 else np.inf)
     is_known = (last >= 0) & (at - times[np.maximum(last, 0)] <= longest)
     return values[np.maximum(last, 0)], is_known
 

@@ -14,8 +14,8 @@ from flytrack_sysid import excitation
 from flytrack_sysid.manoeuvres import MANOEUVRES
 
 SUFFIX = ".npz"
-LARGEST_BYTES = 64 * 2**20  # in the file, and as float64: thousands of flights of 2.5 s
-LARGEST_NORM_ERROR = 1e-3  # of a start's quaternion
+MAX_BYTES = 64 * 2**20  # in the file, and as float64: thousands of flights of 2.5 s
+MAX_NORM_ERROR = 1e-3  # of a start's quaternion
 ROUNDING = 1e-6  # of numbers that were float32
 
 
@@ -49,21 +49,21 @@ def check_script(script: Script, source: str = "script") -> None:
         number == 0
         or not is_shaped
         or commands.ndim != 3
-        or commands.shape[1] < excitation.FEWEST_STEPS
+        or commands.shape[1] < excitation.MIN_STEPS
     ):
         found = (
             f"{number} kinds, starts of shape {starts.shape}, commands of shape {commands.shape}"
         )
-        fewest = f"{excitation.FEWEST_STEPS} or more"
+        fewest = f"{excitation.MIN_STEPS} or more"
         expected = f"(N,), (N, {STATE_SIZE}) and (N, {fewest}, {ACTION_SIZE}), N >= 1"
         raise ScriptError(f"{source}: found {found}, expected {expected}")
     norm_error = np.abs(np.linalg.norm(starts[:, QUATERNION], axis=1) - 1.0)
-    envelope = f"at most {excitation.LARGEST_SPEED:g} m/s, {low:g} to {high:g} m, and a voltage"
+    envelope = f"at most {excitation.MAX_SPEED:g} m/s, {low:g} to {high:g} m, and a voltage"
     checks = {
         f"kinds: expected one of {', '.join(MANOEUVRES)}": np.isin(kinds, list(MANOEUVRES)),
         "starts: expected finite numbers": np.isfinite(starts).all(axis=1),
         "starts: expected an applied action within [-1, 1]": _are_sticks(starts[:, APPLIED_ACTION]),
-        "starts: expected a quaternion of norm 1": norm_error <= LARGEST_NORM_ERROR,
+        "starts: expected a quaternion of norm 1": norm_error <= MAX_NORM_ERROR,
         f"starts: expected a state within the envelope: {envelope}": excitation.is_inside(
             starts, excitation.SCRIPT_HEIGHTS, excitation.ANY_VOLTAGE
         ),
@@ -99,7 +99,7 @@ def load_script(path: str | Path) -> Script:
     """Return the script in an ``.npz`` file, or raise ScriptError. Nothing is unpickled."""
     check_name(path)
     try:
-        arrays = load_npz(Path(path), LARGEST_BYTES)
+        arrays = load_npz(Path(path), MAX_BYTES)
     except (OSError, NpzError) as error:
         raise ScriptError(f"{path}: not a script, or damaged: {error_text(error)}") from error
     for name in Script._fields:

@@ -5,8 +5,8 @@ import numpy as np
 from flytrack_sysid.log import FlightLog
 
 HELD_OUT_EVERY = 4
-LONGEST_BLOCK_S = 5.0
-FEWEST_BLOCKS = 8
+MAX_BLOCK_S = 5.0
+MIN_BLOCKS = 8
 
 
 def blocks_of(log: FlightLog) -> np.ndarray:
@@ -17,7 +17,7 @@ def blocks_of(log: FlightLog) -> np.ndarray:
     """
     starts = np.flatnonzero(log.is_start())
     durations = log.time[np.append(starts[1:], len(log)) - 1] - log.time[starts]
-    longest_s = min(LONGEST_BLOCK_S, durations.sum() / FEWEST_BLOCKS)
+    longest_s = min(MAX_BLOCK_S, durations.sum() / MIN_BLOCKS)
     return cut_evenly(log.time, log.is_start(), max(longest_s, np.finfo(float).tiny))
 
 

@@ -7,13 +7,13 @@ import numpy as np
 from flytrack_sysid.prediction import Prediction, free_flights, runs_of
 
 AXES = ("roll", "pitch", "yaw")
-LEAST_JUMP = 0.2
+MIN_JUMP = 0.2
 HELD_BEFORE_S = 0.08
 HELD_AFTER_S = 0.15
 CONSTANT_WITHIN = 1e-3  # of a stick in [-1, 1]: finer than a receiver's steps
 SHOWN_BEFORE_S = 0.1
 SHOWN_AFTER_S = 0.4
-MOST_PER_AXIS = 3
+MAX_PER_AXIS = 3
 TIME_ROUNDING_S = 1e-6
 
 
@@ -45,7 +45,7 @@ def _steps_in(time: np.ndarray, command: np.ndarray) -> np.ndarray:
     times = time[np.concatenate([[0], changes])]
     held_before = np.diff(times)
     held_after = np.append(times[2:], time[-1])[: len(changes)] - time[changes]
-    is_step = np.abs(command[changes] - command[changes - 1]) >= LEAST_JUMP
+    is_step = np.abs(command[changes] - command[changes - 1]) >= MIN_JUMP
     is_step &= held_before >= HELD_BEFORE_S - TIME_ROUNDING_S
     is_step &= held_after >= HELD_AFTER_S - TIME_ROUNDING_S
     return changes[is_step]
@@ -67,7 +67,7 @@ def _largest_steps(
             if is_whole and prediction.is_settled[start + first]:
                 found.append((start + first, start + step, start + last))
     found.sort(key=lambda rows: -abs(command[rows[1]] - command[rows[1] - 1]))
-    return found[:MOST_PER_AXIS]
+    return found[:MAX_PER_AXIS]
 
 
 def step_responses(prediction: Prediction, rows: np.ndarray) -> tuple[StepResponse, ...]:

@@ -21,7 +21,7 @@ from flytrack_sysid.log import IN_STATE, FlightLog, time_in_line
 from flytrack_sysid.parameters import with_neutral_effects
 from flytrack_sysid.prediction import (
     FLOWN,
-    LONGEST_S,
+    MAX_S,
     Prediction,
     free_flights,
     inputs_that_lack,
@@ -34,7 +34,7 @@ RESTART_S = 1.0  # of free flight: the horizon of the report's first sentence
 AWAY_M = 10.0  # from the measured path: a model that is farther off has diverged
 # Of one flight: 1 min at 100 Hz. Its path is most of a recording, and grows with the power 1.5 of
 # its rows.
-MOST_ROWS = 6000
+MAX_ROWS = 6000
 
 
 class RecordingError(ValueError):
@@ -68,7 +68,7 @@ def trajectories_of(
         )
     positions, remark = position_of(log)
     placed = replace(log, channels={**log.channels, "p": positions})
-    timed = _Timed(placed, time_in_line(log), -(-len(log) // MOST_ROWS))
+    timed = _Timed(placed, time_in_line(log), -(-len(log) // MAX_ROWS))
     if residuals is None and models:
         residuals = traces(log, models, like=next(iter(models)))
     forces_w = (
@@ -177,7 +177,7 @@ def _free_flight(timed: _Timed, name: str, model: ModelParameters) -> Trajectory
     starts, ends = _starts_and_ends(prediction)
     if not len(starts):
         return None
-    steps = np.arange(1 + int(np.ceil(LONGEST_S / prediction.step_s)))
+    steps = np.arange(1 + int(np.ceil(MAX_S / prediction.step_s)))
     rows = starts[:, None] + steps
     flown = free_flights(prediction, starts, rows[:, 1:])
     begun = {channel: log[channel][starts[:, None]] for channel in FLOWN if channel in log}

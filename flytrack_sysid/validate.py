@@ -14,7 +14,7 @@ from flytrack_sysid.record import fill_gaps
 from flytrack_sysid.steps import (
     HELD_AFTER_S,
     HELD_BEFORE_S,
-    LEAST_JUMP,
+    MIN_JUMP,
     StepResponse,
     step_responses,
 )
@@ -141,7 +141,7 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
     steps = step_responses(prediction, rows)
     if not steps:
         notes.append(
-            f"step responses: no judged command of roll, pitch or yaw jumps by {LEAST_JUMP:g} "
+            f"step responses: no judged command of roll, pitch or yaw jumps by {MIN_JUMP:g} "
             f"between {HELD_BEFORE_S:g} s and {HELD_AFTER_S:g} s of constant command, with body "
             "rates measured"
         )

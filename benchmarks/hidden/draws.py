@@ -146,7 +146,7 @@ DRAGS = ("linear_drag", "quadratic_drag", "rotor_drag")
 # What a prop strike, a lost part or a broken motor brings about in flight.
 SUDDEN = ("motor_imbalance", "thrust_scale", "linear_drag", "rate_scale", "thrust_tilt")
 ONSET_SHARE = (0.25, 0.75)  # of the log
-MOST_LATE_S = 0.04  # of motion capture
+MAX_LATE_S = 0.04  # of motion capture
 AIR_PER_PUSH = 6.0  # m/s of wind per m/s^2 of its size, where there is drag
 # Base parameters, log-uniform or uniform. The thrust curve is given at REFERENCE_V.
 TAU_S = (0.015, 0.07)
@@ -233,4 +233,4 @@ def draw_onset(rng: Rng, seconds: float) -> Truth:
 
 def draw_late(rng: Rng) -> Truth:
     """Return a plant without effects whose motion capture is logged up to 40 ms late."""
-    return replace(draw_base(rng), mocap_late_s=float(rng.uniform(0.0, MOST_LATE_S)))
+    return replace(draw_base(rng), mocap_late_s=float(rng.uniform(0.0, MAX_LATE_S)))

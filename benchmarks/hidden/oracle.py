@@ -18,7 +18,7 @@ from flytrack_bench.hidden import Truth
 from flytrack_bench.hidden.drone import SECONDS_PER_MINUTE
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis.lanes import NUM_AXES, lanes_of
-from flytrack_sysid.diagnosis.model_selection import MOST_RIVALS, ablate_all
+from flytrack_sysid.diagnosis.model_selection import MAX_RIVALS, ablate_all
 from flytrack_sysid.diagnosis.noise import fit_noise
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import CANDIDATES
@@ -118,7 +118,7 @@ def _scale_known(state: SearchState, model: FittedModel) -> Known:
         if score.candidate.effect != "thrust_scale"
     ]
     gains = {}
-    for score in scores[:MOST_RIVALS]:
+    for score in scores[:MAX_RIVALS]:
         extended = add_effect(state, linearization, nominal, score)
         gains[score.candidate.effect] = extended.cost - model.cost
     return _known(nominal.cost - model.cost, gains)

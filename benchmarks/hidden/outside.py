@@ -38,7 +38,7 @@ AXES = ("x", "y", "z")
 STICK_AXES = 4
 YAW, DOWN = {"x": 0.0, "y": 0.0, "z": 1.0}, {"x": -0.0, "y": -0.0, "z": -1.0}
 # Ranges of shape parameters.
-MOST_LEAN, WAVE = math.radians(40.0), (0.3, 1.0)  # rad; shares of waves in the heading
+MAX_LEAN, WAVE = math.radians(40.0), (0.3, 1.0)  # rad; shares of waves in the heading
 RADIUS_M, MIDDLE_SHARE = (4.0, 12.0), (0.25, 0.75)
 STEP_WIDTH_SHARE, HUMP_WIDTH_SHARE = (0.005, 0.05), (0.05, 0.15)
 SPEED_MS, SPEED_WIDTH_MS = (4.0, 11.0), (0.7, 1.5)
@@ -50,7 +50,7 @@ WARMING_S, STRING_M = (10.0, 30.0), (0.3, 1.0)
 def _draw_position(rng: Rng) -> ChannelAndShape:
     # Mostly up or down, as thermals go.
     up = float(rng.choice([-1.0, 1.0]))
-    side, lean = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, MOST_LEAN)
+    side, lean = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, MAX_LEAN)
     way = (math.sin(lean) * math.cos(side), math.sin(lean) * math.sin(side), up * math.cos(lean))
     shape = dict(zip(AXES, way, strict=True))
     return "force", shape | {

@@ -37,7 +37,7 @@ JUMP_S, JUMP_STICK, FLIP_S, FLIP_STICK = 0.2, 0.6, (0.45, 0.62), (-0.6, -0.1)
 STEPS_UP, STEPS_DOWN, HELD_DOWN_S = (0.1, 1.0), (-1.0, -0.4), 0.3
 HELD_UP_S, SHORTER_S, UNEVEN = 0.45, 0.3, (0.8, 1.2)  # the middle one per unit of stick
 HOMEWARD_M, HOMEWARD_SPREAD = 30.0, 0.4  # from the origin, where legs lead back; rad
-SPEEDING_UP, MOST_NOSE_RATE = 7.0, 1.0  # m/s^2, rad/s
+SPEEDING_UP, MAX_NOSE_RATE = 7.0, 1.0  # m/s^2, rad/s
 HIGH_M = (16.0, 24.0)  # where manoeuvres on one stick are flown
 HIGH_SPEEDS, HIGH_HOLD_S, HIGH_TURNING = (2.0, 18.0), (0.4, 1.2), 0.5  # m/s, s, rad/s
 LOW_SPEEDS, LOW_HOLD_S, LOW_TURNING = (0.5, 12.0), (0.5, 1.2), 0.3
@@ -51,11 +51,11 @@ HIGHER_M = 1.5  # of the start, per repeated attempt
 ATTITUDE_PER_LAG, VELOCITY_PER_ATTITUDE = 0.4, 0.3
 POSITION_PER_VELOCITY, LEARN_PER_VELOCITY = 0.35, 0.3
 QUICKEST_ATTITUDE, QUICKEST_HEIGHT = 12.0, 5.0  # 1/s
-YAW_GAIN, MOST_YAW_RATE = 2.5, 1.6  # 1/s, rad/s
-MOST_TILTED = math.radians(65.0)  # of the commanded thrust
-MOST_UP, MOST_DOWN = 14.0, 6.0  # m/s^2
-MOST_LESSON = 2.0  # m/s, limit of the speed error in the integrator
-MOST_SPEED, MOST_CORRECTION, MOST_LEARNT = 18.0, 4.0, 5.0  # m/s, m/s, m/s^2
+YAW_GAIN, MAX_YAW_RATE = 2.5, 1.6  # 1/s, rad/s
+MAX_TILTED = math.radians(65.0)  # of the commanded thrust
+MAX_UP, MAX_DOWN = 14.0, 6.0  # m/s^2
+MAX_INTEGRATED_ERROR = 2.0  # m/s, limit of the speed error in the integrator
+MAX_SPEED, MAX_CORRECTION, MAX_LEARNT = 18.0, 4.0, 5.0  # m/s, m/s, m/s^2
 UPRIGHT = 0.3  # cosine of the tilt beyond which the heading is undefined
 TINY, MIN_SLOPE = 1e-9, 1.0  # m/s^2; N per stick
 TREMBLE, TREMBLE_S = 0.01, 0.1  # of sticks that are held still, and its time constant, s
@@ -167,7 +167,7 @@ def leg(sketch: Sketch, speed: float, hold_s: float, turning: float) -> None:
     if math.hypot(x, y) > HOMEWARD_M:
         way = math.atan2(-y, -x) + rng.normal(0.0, HOMEWARD_SPREAD)
     sketch.turn_to(sketch.heading + rng.uniform(-1.0, 1.0) * math.pi * rng.integers(2))
-    nose = rng.uniform(-1.0, 1.0) * MOST_NOSE_RATE
+    nose = rng.uniform(-1.0, 1.0) * MAX_NOSE_RATE
     ramp = max(1, steps_of(speed / SPEEDING_UP))
     shares = np.concatenate(
         [np.linspace(0, 1, ramp), np.ones(steps_of(hold_s)), np.linspace(1, 0, ramp)]
@@ -341,18 +341,20 @@ class Pilot:
         """Return the wanted specific force, world, m/s^2."""
         gains = self._gains
         away = POSITION_PER_VELOCITY * gains * (moment.pos_w - drone.pos_w)
-        wanted = clip_length(away, MOST_CORRECTION) + moment.vel_w
-        error = clip_length(wanted, MOST_SPEED) - drone.vel_w
+        wanted = clip_length(away, MAX_CORRECTION) + moment.vel_w
+        error = clip_length(wanted, MAX_SPEED) - drone.vel_w
         acc = moment.acc_w + gains * error + self._learnt_w
         if is_free:
-            lesson = DT_S * LEARN_PER_VELOCITY * gains * gains * clip_length(error, MOST_LESSON)
-            self._learnt_w = clip_length(self._learnt_w + lesson, MOST_LEARNT)
+            lesson = (
+                DT_S * LEARN_PER_VELOCITY * gains * gains * clip_length(error, MAX_INTEGRATED_ERROR)
+            )
+            self._learnt_w = clip_length(self._learnt_w + lesson, MAX_LEARNT)
         ahead = drone.pos_w[2] + LOOK_AHEAD_S * drone.vel_w[2]
         if ahead < FLOOR_M:
             acc[2] += FLOOR_GAIN * self._upright * (FLOOR_M - ahead)
-        up = self._truth.gravity + max(-MOST_DOWN, min(MOST_UP, float(acc[2])))
+        up = self._truth.gravity + max(-MAX_DOWN, min(MAX_UP, float(acc[2])))
         acc[2] = 0.0
-        side = clip_length(acc, up * math.tan(MOST_TILTED)).tolist()
+        side = clip_length(acc, up * math.tan(MAX_TILTED)).tolist()
         return (side[0], side[1], up)
 
     def _sticks(self, drone: HiddenDrone, force_w: Vector, heading: float) -> Sticks:
@@ -364,7 +366,7 @@ class Pilot:
         yaw = 0.0
         if rows[2][2] > UPRIGHT:
             error = wrap_angle(heading - math.atan2(rows[1][0], rows[0][0]))
-            yaw = max(-MOST_YAW_RATE, min(MOST_YAW_RATE, YAW_GAIN * error))
+            yaw = max(-MAX_YAW_RATE, min(MAX_YAW_RATE, YAW_GAIN * error))
         rates = (-angle * y, angle * x, yaw)
         sticks = tuple(rate / full for rate, full in zip(rates, self._full_rates, strict=True))
         return (*sticks, self._thrust_stick(max(z, 0.0) * self._truth.mass, drone.battery_v))

@@ -23,7 +23,7 @@ POLICIES = {
 # The hidden effects matter where the minimal model's policy is worse than this.
 MATTERS_BELOW, MATTERS_ABOVE_PERCENT = 0.80, 3.0
 TARGET_SUCCESS, TARGET_GAP_PERCENT, TARGET_SHARE = 0.95, 1.0, 0.9
-LARGEST_GAP_PERCENT = 10.0  # larger gaps, and policies without a lap, are drawn here
+MAX_GAP_PERCENT = 10.0  # larger gaps, and policies without a lap, are drawn here
 SPREAD = 0.12  # between the marks of a column
 DPI = 130
 # Kind, key and format of the errors of a model.
@@ -121,11 +121,11 @@ def draw_chart(by_job: dict[str, Stages]) -> bytes:
         stages = [stages[name] for stages in by_job.values()]
         columns = np.arange(len(stages)) + SPREAD * (number - 2)
         success = [100.0 * stage["plant"]["success"] for stage in stages]
-        gap = np.minimum([gap_percent(stage) for stage in stages], LARGEST_GAP_PERCENT)
+        gap = np.minimum([gap_percent(stage) for stage in stages], MAX_GAP_PERCENT)
         for axes, values in ((upper, success), (lower, gap)):
             axes.plot(columns, values, marker, color=colour, label=label, markersize=7)
     upper.set(ylabel="finish 3 laps on the plant (%)", ylim=(None, 101.0))
-    lower.set(xlabel="plant", ylabel=f"|lap gap| (%), {LARGEST_GAP_PERCENT:g}: more, or no lap")
+    lower.set(xlabel="plant", ylabel=f"|lap gap| (%), {MAX_GAP_PERCENT:g}: more, or no lap")
     lower.set_xticks(range(len(by_job)), [*by_job])
     for axes, target in ((upper, 95.0), (lower, 1.0)):
         axes.axhline(target, color="0.7", linewidth=1.0)

@@ -188,7 +188,7 @@ def fit_policies(
         target = refinement.Target(problem, windows, scale, np.ones(scale.shape, bool))
         fields = [name for name in problem.names if name.partition(".")[0] in structure]
         fitted = problem.index([*TAUS, *THRUST_COEFFS, *fields])
-        fit = target.fitted(vector, fitted, refinement.MOST_ROUNDS)
+        fit = target.fitted(vector, fitted, refinement.MAX_ROUNDS)
         half_s = half_responses(fit.vector[None], problem.like, SMALL_STEP)[0]
         times = dict(zip(STICKS, half_s.tolist(), strict=True))
         result.append(

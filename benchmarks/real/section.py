@@ -35,7 +35,7 @@ STYLES: dict[str, dict[str, Any]] = {
     "arx": {"color": "black", "linestyle": "-."},
     "network": {"color": "black", "linestyle": "--"},
 }
-MOST_VALUES = 3  # of a cause, in a sentence
+MAX_VALUES = 3  # of a cause, in a sentence
 SPOKEN = (("attitude_rad", "0.25"), ("rates_rad_per_s", "0.25"), ("position_m", "1"))
 WIDTH_IN, HEIGHT_IN = 2.6, 3.2
 
@@ -110,7 +110,7 @@ def _describe_values(causes: list[Record]) -> str:
         parameters = cause["parameters"]
         if "mean_factor" in parameters:
             parameters = {"mean_factor": parameters["mean_factor"]}
-        if len(parameters) <= MOST_VALUES:
+        if len(parameters) <= MAX_VALUES:
             values = ", ".join(
                 f"{name.replace('_', ' ')} {format_number(one['value'], one['unit'])}"
                 for name, one in parameters.items()

@@ -55,7 +55,7 @@ SECONDS_PER_MINUTE = 60.0
 TINY, LARGE = 1e-3, 1e3  # between which the bend of a saturation is searched
 LIFT_SPEED = 8.0  # m/s, airspeed at which translational lift has 1 - 1/e of its gain
 AIR_VELOCITY = ("v_x", "v_y", "v_z")  # of wind, m/s
-LONGEST_PART_S = 0.001
+MAX_SUBSTEP_S = 0.001
 SAME_S = 1e-9  # instants nearer than this are one
 
 
@@ -426,7 +426,7 @@ class HiddenDrone:
         for end in sorted({arrives_s, felt_s, tracked_s, step_s}):
             if end - begin < SAME_S:
                 continue
-            count = math.ceil((end - begin) / LONGEST_PART_S - SAME_S)
+            count = math.ceil((end - begin) / MAX_SUBSTEP_S - SAME_S)
             is_felt, is_tracked = (abs(end - instant) < SAME_S for instant in (felt_s, tracked_s))
             plain = Part((end - begin) / count, begin > arrives_s - SAME_S, False, False)
             parts += [plain] * (count - 1) + [

@@ -46,7 +46,7 @@ from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_motion import check_same_origin
 from flytrack_sysid.parameters import THRUST_COEFFS
 
-MOST_EFFECTS = 4
+MAX_EFFECTS = 4
 # Sticks that are farther from where they were lately, in sum; the time constant of lately, and for
 # how long what follows does not count.
 JUMP, JUMP_S, AFTERMATH_S = 0.5, 0.05, 0.2
@@ -141,7 +141,7 @@ def diagnose_change(
         earlier = Estimate.of(calm(split(before, model, None, parts.moves.motion)))
         alike: dict[str, tuple[str, ...]] = {}
         report(1, 3)
-        while len(later.model.candidates) < MOST_EFFECTS:
+        while len(later.model.candidates) < MAX_EFFECTS:
             change = next_change(later, earlier)
             if change is None:
                 break
@@ -222,7 +222,7 @@ def next_change(later: Estimate, earlier: Estimate) -> tuple[Refit, tuple[str, .
         (one for one in promise if promise[one] > 0.0), key=lambda one: -promise[one]
     ):
         ways.setdefault(one.fields, one)
-    refitted = [(one, later.with_effect(one)) for one in [*ways.values()][: search.MOST_REFITTED]]
+    refitted = [(one, later.with_effect(one)) for one in [*ways.values()][: search.MAX_REFITTED]]
     worth = {
         one: later.model.cost - more.model.cost - search.PER_PARAMETER * len(one.fields)
         for one, more in refitted

@@ -18,19 +18,16 @@ from flytrack_sysid.parameters import names_of, to_vector, with_values
 from flytrack_sysid.plots import BLUE, GREY, ORANGE, say
 
 WIDTH_IN, ROW_IN, LEGEND_IN = 8.0, 2.5, 0.9
-MOST_COLUMNS = 3
+MAX_COLUMNS = 3
 EXTENDED = "extended"  # its name in traces
-FEWEST_SHOWN = 50  # rows
+MIN_SHOWN = 50  # rows
 NO_DATA = "not in the log, or too little of it"
 NUM_BINS = 15
 SHOWN_PERCENTILES = (0.5, 99.5)  # of the regressor: single rows far out would squeeze all others
-FEWEST_ROWS, FEWEST_PIECES, LEAST_ROWS = (
-    20,
-    5,
-    2,
-)  # of a bin: wanted, and without which there is no scatter
+# Of a bin: wanted, and without which there is no scatter.
+WANTED_ROWS, WANTED_PIECES, MIN_ROWS = 20, 5, 2
 BLOCK_S = 1.0  # rows further apart than this count as independent
-FEWEST_BLOCKS = 10  # fewer say too little of their own scatter
+MIN_BLOCKS = 10  # fewer say too little of their own scatter
 TWO_SIDED_95 = 1.959964  # standard deviations
 # Attitude and velocity are noisy in each row: their change over a piece is known as well as over a
 # step.
@@ -112,7 +109,7 @@ class Binned(NamedTuple):
     ends95: np.ndarray
 
 
-def bin_edges(regressor: np.ndarray, fewest: int = FEWEST_ROWS) -> np.ndarray:
+def bin_edges(regressor: np.ndarray, fewest: int = WANTED_ROWS) -> np.ndarray:
     """Return the edges of bins over a regressor, (at most NUM_BINS + 1,).
 
     Evenly wide, but joined with the next ones where they have fewer than ``fewest`` rows.
@@ -153,8 +150,8 @@ def binned_means(
     sums = np.bincount(cell, off, minlength=cells).reshape(num_bins, -1)
     used = (np.bincount(cell, minlength=cells).reshape(num_bins, -1) > 0).sum(axis=1)
     by_block = (sums**2).sum(axis=1)
-    variance = np.where(used >= FEWEST_BLOCKS, by_block, np.maximum(by_block, by_row))
-    kept = rows >= LEAST_ROWS
+    variance = np.where(used >= MIN_BLOCKS, by_block, np.maximum(by_block, by_row))
+    kept = rows >= MIN_ROWS
     return Binned(at[kept], means[kept], (TWO_SIDED_95 * np.sqrt(variance) / some)[kept])
 
 
@@ -200,10 +197,10 @@ def _draw_panel(axes: Any, traces: Traces, panel: Panel, without: str) -> None:
         values[counts]
         for values in (factor * traces.regressors[panel.regressor], scale * left, scale * rest)
     ]
-    block, fewest = _blocks(traces, BLOCK_S)[counts], FEWEST_ROWS
+    block, fewest = _blocks(traces, BLOCK_S)[counts], WANTED_ROWS
     if channel in ("attitude", "velocity"):
         piece = np.unique(_blocks(traces, PIECE_S)[counts], return_inverse=True)[1]
-        rows, fewest = np.bincount(piece), FEWEST_PIECES
+        rows, fewest = np.bincount(piece), WANTED_PIECES
         *columns, block = [np.bincount(piece, values) / rows for values in (*columns, block)]
     regressor, left, rest = columns
     edges = bin_edges(regressor, fewest=fewest)
@@ -242,7 +239,7 @@ def draw_cause(
         dict.fromkeys(panel._replace(residual=traces.used(panel.residual)) for panel in panels)
     )
     columns = (
-        min(len(panels), MOST_COLUMNS) if len(panels) % MOST_COLUMNS != 1 else min(len(panels), 2)
+        min(len(panels), MAX_COLUMNS) if len(panels) % MAX_COLUMNS != 1 else min(len(panels), 2)
     )
     rows = -(-len(panels) // columns)
     figure = new_figure(WIDTH_IN, LEGEND_IN + ROW_IN * rows)
@@ -253,7 +250,7 @@ def draw_cause(
     for axes, panel in zip(grid.flat, panels, strict=True):
         plain(axes).tick_params(labelsize="small")
         label = _label(panel.residual)
-        if traces.column(EXTENDED, panel.residual)[1].sum() < FEWEST_SHOWN:
+        if traces.column(EXTENDED, panel.residual)[1].sum() < MIN_SHOWN:
             say(axes, f"{label}:\n{NO_DATA}")
             continue
         _draw_panel(axes, traces, panel, without)

@@ -19,7 +19,7 @@ from flytrack_sysid.record import Record, is_applied_certain, make_record, measu
 
 LEAD_IN_S, LANE_S = 1, 5
 PIECES = LEAD_IN_S + LANE_S  # of a second each, the lead-in first
-FEWEST_ROWS_PER_S = 20
+MIN_ROWS_PER_S = 20
 # A rate loop takes 10 to 50 ms. Chosen for cost: what a lower rate hides was not measured.
 MAX_RATE_HZ = 250.0
 # replayed without lead-ins: all of their slopes are in memory at once, some 50 kB a row
@@ -120,7 +120,7 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
     num_rows = 1 + int(np.flatnonzero(record.source_row >= 0)[-1])
     rate = 1.0 / float(np.median(record.step_s[record.source_row >= 0]))
     # A round number of rows a second, so that programs are shared.
-    index = _index(exists[:num_rows], max(FEWEST_ROWS_PER_S, int(float(f"{rate:.2g}"))))
+    index = _index(exists[:num_rows], max(MIN_ROWS_PER_S, int(float(f"{rate:.2g}"))))
     is_real = (index >= 0) & (np.arange(len(index)) >= lead_in_of(len(index)))[:, None]
     found = measured_channels(log, record, gravity)
     nowhere = np.zeros(len(exists), bool)

@@ -36,19 +36,20 @@ from flytrack_sysid.diagnosis.unexplained import (
 )
 from flytrack_sysid.parameters import MAX_RATES, from_vector
 
-CHANCE, CHANCE_OF_MORE = 1e-7, 1e-4  # of a term where nothing is left; of a second and third one
+FALSE_POSITIVE_RATE = 1e-7  # of a term where nothing is left
+FURTHER_FALSE_POSITIVE_RATE = 1e-4  # of a second and third term
 PER_COEFFICIENT, PER_NUMBER = 4.0, 8.0  # of chi2: what each has to gain to be preferred to fewer
-MOST_TRIED_AGAIN = 100  # terms, beside the first one found
-MOST_REFINED, REFINEMENTS = 5, 60  # terms a round whose shapes are refined, and evaluations of each
-MOST_TERMS = 3  # of one side
-MOST_STARTS = 3  # first terms from which a law is searched
-LEAST_SHARE = 0.04  # of what the terms before gain: the least of one more
+MAX_RETRIED_TERMS = 100  # terms, beside the first one found
+MAX_REFINED, REFINEMENTS = 5, 60  # terms a round whose shapes are refined, and evaluations of each
+MAX_TERMS = 3  # of one side
+MAX_STARTS = 3  # first terms from which a law is searched
+MIN_GAIN_FRACTION = 0.04  # of what the terms before gain: the least of one more
 # of a column's information: what is not within the reach of the model's free numbers
-LEAST_OWN = 0.01
+MIN_INDEPENDENT_FRACTION = 0.01
 TINY = 1e-3  # of numbers that are positive
-LEAST_SIGMAS = 3.0  # of a coefficient that stays
+MIN_SIGMAS = 3.0  # of a coefficient that stays
 HELD_OUT_SHARE = 0.6  # of the gain on held-out rows that a law would have there if it were right
-LEAST_EXPECTED = 10.0  # of that gain: with less, held-out rows say nothing of a law
+MIN_EXPECTED_GAIN = 10.0  # of that gain: with less, held-out rows say nothing of a law
 
 
 def moment_of_flight(problem: Problem, vector: np.ndarray, flight: Flown) -> Moment:
@@ -245,7 +246,7 @@ def score_term(side: Side, test: SideTest, term: Term) -> Trial:
     columns = side.columns(term)
     if not np.isfinite(columns).all() or not np.abs(columns).max() > 0.0:
         return Trial(term, -np.inf, 0.0)
-    gain = test.fit(columns, LEAST_OWN).gain
+    gain = test.fit(columns, MIN_INDEPENDENT_FRACTION).gain
     return Trial(term, gain - price_of(term), gain)
 
 
@@ -329,9 +330,9 @@ def fit_terms(side: Side, terms: Sequence[Term]) -> tuple[tuple[Term, ...], Side
     joined = np.concatenate(columns, axis=1)
     kept = np.ones(joined.shape[1], bool)
     while True:
-        fit = side.test.fit(joined[:, kept], LEAST_OWN)
+        fit = side.test.fit(joined[:, kept], MIN_INDEPENDENT_FRACTION)
         sigmas = np.abs(fit.step) / np.maximum(fit.errors, 1e-300)
-        if sigmas.min() >= LEAST_SIGMAS or kept.sum() == 1:
+        if sigmas.min() >= MIN_SIGMAS or kept.sum() == 1:
             break
         kept[np.flatnonzero(kept)[int(np.argmin(sigmas))]] = False
     numbers = np.zeros((2, len(kept)))
@@ -369,7 +370,11 @@ def cross_validate(side: Side, terms: Sequence[Term]) -> tuple[float, float]:
     half = np.indices((LANE_S, len(columns) // LANE_S)).sum(axis=0).ravel() % 2
     gain = expected = 0.0
     for one in range(2):
-        step = side.test.of_blocks(half == one).fit(columns[half == one], LEAST_OWN).step
+        step = (
+            side.test.of_blocks(half == one)
+            .fit(columns[half == one], MIN_INDEPENDENT_FRACTION)
+            .step
+        )
         _, information, score, _ = side.test.of_blocks(half != one).projected(columns[half != one])
         expected += float(step @ information @ step)
         gain += float(2.0 * step @ score - step @ information @ step)
@@ -392,7 +397,7 @@ def is_confirmed(side: Side, law: Found) -> bool:
     Where the law hardly acts in them, cross-validation on the other rows decides.
     """
     gain, expected = law.held_out_gain, law.expected
-    if expected < LEAST_EXPECTED:
+    if expected < MIN_EXPECTED_GAIN:
         gain, expected = cross_validate(side, law.terms)
     return gain >= HELD_OUT_SHARE * expected
 
@@ -408,7 +413,9 @@ def drop_weak_terms(side: Side, held: Side, law: Found, number: int) -> Found | 
         others = [[one for one in terms if one is not term] for term in terms]
         total = fit_terms(side, terms)[1].chi2
         losses = [total - fit_terms(side, rest)[1].chi2 if rest else total for rest in others]
-        least = stats.chi2.isf(CHANCE_OF_MORE / number, [num_numbers(term) for term in terms])
+        least = stats.chi2.isf(
+            FURTHER_FALSE_POSITIVE_RATE / number, [num_numbers(term) for term in terms]
+        )
         weakest = int(np.argmin(losses - least))
         if len(terms) == 1 or losses[weakest] >= least[weakest]:
             break
@@ -428,13 +435,15 @@ def find_law(side: Side, held: Side) -> Found | None:
     """
     pool = [bare_term(side, *one) for one in factors_of(side)]
     firsts, ranked = best_of(side, side.test, pool)
-    limit = stats.chi2.isf(CHANCE / len(pool), [num_numbers(one.term) for one in firsts])
+    limit = stats.chi2.isf(
+        FALSE_POSITIVE_RATE / len(pool), [num_numbers(one.term) for one in firsts]
+    )
     clear = [one for one, least in zip(firsts, limit, strict=True) if one.gain >= least]
     rivals = tuple(_kind(one.term) for one in firsts[1:] if one.merit > firsts[0].merit - 10.0)
     by_quantity: dict[str, Trial] = {}
     for one in clear:
         by_quantity.setdefault(one.term.factors[-1].quantity, one)
-    starts = list(by_quantity.values())[:MOST_STARTS]
+    starts = list(by_quantity.values())[:MAX_STARTS]
     grown = [grow_law(side, held, one, ranked, len(pool)) for one in starts]
     laws = [drop_weak_terms(side, held, one, len(pool)) for one in grown if one is not None]
     found = [one._replace(rivals=rivals) for one in laws if one is not None]
@@ -446,7 +455,7 @@ def find_law(side: Side, held: Side) -> Found | None:
 def best_of(side: Side, test: SideTest, pool: Sequence[Term]) -> tuple[list[Trial], list[Term]]:
     """Return the best terms of different kinds, refined, and the whole pool, each best first."""
     trials = sorted((score_term(side, test, term) for term in pool), key=lambda one: -one.merit)
-    best = [refine_shapes(side, test, one) for one in _of_different_kinds(trials)[:MOST_REFINED]]
+    best = [refine_shapes(side, test, one) for one in _of_different_kinds(trials)[:MAX_REFINED]]
     return sorted(best, key=lambda one: -one.merit), [one.term for one in trials]
 
 
@@ -465,11 +474,11 @@ def grow_law(
 
     # What happens once would pass for the remainder of another law: all terms look at the time, or
     # none.
-    pool = [term for term in pool if uses_time(term) == uses_time(first.term)][:MOST_TRIED_AGAIN]
+    pool = [term for term in pool if uses_time(term) == uses_time(first.term)][:MAX_RETRIED_TERMS]
     while True:
         now, fit = fit_terms(side, refine_jointly(side, [*terms, first.term], range(len(terms))))
         if len(now) <= len(terms) or (
-            best is not None and fit.chi2 < (1.0 + LEAST_SHARE) * best.gain
+            best is not None and fit.chi2 < (1.0 + MIN_GAIN_FRACTION) * best.gain
         ):
             break
         one = judge_law(side, held, now, fit)
@@ -479,11 +488,13 @@ def grow_law(
         if is_confirmed(side, one):
             best = one
         terms = list(now)
-        if len(terms) == MOST_TERMS:
+        if len(terms) == MAX_TERMS:
             break
         test = side.test.given_also(*(side.columns(term) for term in terms))
         (first, *_), _ = best_of(side, test, pool)
-        if first.gain < stats.chi2.isf(CHANCE_OF_MORE / number, num_numbers(first.term)):
+        if first.gain < stats.chi2.isf(
+            FURTHER_FALSE_POSITIVE_RATE / number, num_numbers(first.term)
+        ):
             break
     return best
 

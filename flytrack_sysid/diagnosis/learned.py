@@ -10,7 +10,7 @@ import numpy as np
 from flytrack_env.effects.grammar import Law
 from flytrack_sysid.diagnosis.beyond import Learned
 from flytrack_sysid.diagnosis.lanes import thinned
-from flytrack_sysid.diagnosis.law_search import LEAST_EXPECTED, Found, Side, find_law
+from flytrack_sysid.diagnosis.law_search import MIN_EXPECTED_GAIN, Found, Side, find_law
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import (
     LIKELY,
@@ -28,10 +28,10 @@ from flytrack_sysid.diagnosis.unexplained import (
     waves_of,
 )
 
-MOST_ROWS = 12_000  # with their lead-ins: two minutes at 100 Hz
-LEAST_SHARE = 0.08  # of the sensor's noise, rms: less is not learnt
+MAX_ROWS = 12_000  # with their lead-ins: two minutes at 100 Hz
+MIN_RMS_RATIO = 0.08  # of the sensor's noise, rms: less is not learnt
 # of squared errors of held-out flights, over all horizons: what takes less off is nothing
-LEAST_OFF = 0.02
+MIN_ERROR_REDUCTION = 0.02
 LAW_SHARE = 0.75  # of what smooth functions of everything explain: the least that a law explains
 
 
@@ -51,13 +51,13 @@ def find_learned(
     wandering = [] if dependences else list(stochastic_shares(problem, model))
     for name in dict.fromkeys([*(one.side for one in dependences), *wandering]):
         on_side = [one for one in dependences if one.side == name]
-        if on_side and max(one.share for one in on_side) < LEAST_SHARE:
+        if on_side and max(one.share for one in on_side) < MIN_RMS_RATIO:
             continue
         law = find_law(Side.of(name, problem, model), Side.of(name, test, model))
         if law is None or law.gain < LAW_SHARE * sum(one.gain for one in on_side):
             continue
         more = _with_side(learned, name, law)
-        acts_there = law.expected >= LEAST_EXPECTED
+        acts_there = law.expected >= MIN_EXPECTED_GAIN
         if _predicts(problem, judge, (learned, model.vector), (more, law.vector), acts_there):
             learned, model = more, model._replace(vector=law.vector)
     return learned, model.vector
@@ -79,7 +79,7 @@ def thinned_problem(problem: Problem) -> Problem:
 
     Hundreds of terms are tried.
     """
-    lanes = thinned(problem.lanes, max(MOST_ROWS // len(problem.lanes.row), 2))
+    lanes = thinned(problem.lanes, max(MAX_ROWS // len(problem.lanes.row), 2))
     if lanes is problem.lanes or problem.late is not None:
         return problem
     return problem.with_lanes(lanes)
@@ -119,7 +119,7 @@ def improves_flights(ratio: np.ndarray, lost: np.ndarray, acts_there: bool) -> b
     ratio: of errors with what was learnt over those without, by horizon and quantity. lost: by how
     many standard errors each is larger.
     """
-    is_better = float(np.mean(ratio**2)) < 1.0 - LEAST_OFF
+    is_better = float(np.mean(ratio**2)) < 1.0 - MIN_ERROR_REDUCTION
     # What makes flights in all no better has to be as good at every horizon.
     worst = WORSE_ANYWHERE if is_better else LIKELY
     is_worse = (ratio > LIKELY_WORSE) & (lost > worst)

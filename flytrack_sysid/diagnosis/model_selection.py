@@ -20,7 +20,7 @@ from flytrack_sysid.diagnosis.score_test import (
     threshold,
 )
 from flytrack_sysid.diagnosis.search import (
-    MOST_REFITTED,
+    MAX_REFITTED,
     PER_PARAMETER,
     FittedModel,
     Held,
@@ -33,7 +33,7 @@ from flytrack_sysid.parameters import TAUS, THRUST_COEFFS
 EQUIVALENT = 10.0  # of chi2: a rival that explains so nearly as much cannot be told apart
 # of chi2: where less than EQUIVALENT is expected, it hardly ever is as much
 EQUIVALENT_BY_CHANCE = 30.0
-MOST_RIVALS = 3
+MAX_RIVALS = 3
 # Rivals are refitted where first order says that they come within so much chi2, or within a share
 # of the gain: first order is less exact for large changes, and least for effects that are looked
 # for at probes.
@@ -134,7 +134,7 @@ def _with_rivals(
         rival = one.candidate.effect
         rivals[rival] = gain - one.gain.chi2
         share = PROBE_SHARE if one.candidate.probes else NEAR_SHARE
-        if number < MOST_RIVALS and rivals[rival] < max(NEARLY, share * gain):
+        if number < MAX_RIVALS and rivals[rival] < max(NEARLY, share * gain):
             swaps[rival] = add_effect(state, nearby, less, one, limit)
             rivals[rival] = swaps[rival].cost - model.cost
     # Without the effect the rest may have moved so far that slopes say nothing of a rival like it.
@@ -397,7 +397,7 @@ def _best_instead(
     state, nearby = state.linearized(less.vector)
     limit = model.cost + PER_PARAMETER * len(fields)
     best = less if less.cost < limit else None
-    for one in score_candidates(state, nearby, less)[:MOST_REFITTED]:
+    for one in score_candidates(state, nearby, less)[:MAX_REFITTED]:
         hopeless = limit + less.cost * HOPELESS
         if less.cost - one.gain.chi2 > hopeless and not one.candidate.probes:
             continue

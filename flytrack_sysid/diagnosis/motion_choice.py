@@ -42,12 +42,12 @@ CLEAR = 10.0  # of minus twice the log likelihood, by which a simulator's step h
 LATE = 60.0
 NEAR = 300.0  # of it: within so much of the best, lateness is fitted before one is chosen
 UNDECIDED = 60.0  # of it: while the second best is so near, more of the log is asked
-MOST_LANES = 4  # at a time, evenly spread: twenty seconds decide mostly
+MAX_LANES = 4  # at a time, evenly spread: twenty seconds decide mostly
 # What a correlation has to say: smaller offsets are within its bias, or its standard errors up to a
 # bound.
 ON_TIME_S, STANDARD_ERRORS, UNCERTAIN_S = 0.7e-3, 3.0, 1.5e-3
-LEAST_S = 0.5e-3  # of a fitted lateness: a smaller one changes nothing
-DIFFERENCE_S, LONGEST_STEP_S = 2e-4, 3e-3  # for slopes; of a step of the fit
+MIN_LATENCY_S = 0.5e-3  # of a fitted lateness: a smaller one changes nothing
+DIFFERENCE_S, MAX_STEP_S = 2e-4, 3e-3  # for slopes; of a step of the fit
 ROUNDS = 2
 IMU_LATENCY = "imu_latency.latency_s"
 LOOK_ALIKES: tuple[Effect, ...] = tuple(
@@ -122,7 +122,7 @@ class Seen(NamedTuple):
     def lanes(self, log: FlightLog) -> Lanes:
         """Return the lanes of this part; in ``log`` poses may be at other times."""
         lanes = lanes_of(log, self.judged, self.model)
-        return lanes.selected(np.arange(self.part, lanes.row.shape[1], self.num_parts)[:MOST_LANES])
+        return lanes.selected(np.arange(self.part, lanes.row.shape[1], self.num_parts)[:MAX_LANES])
 
     def problem(self, moves: Moves) -> Problem:
         """Return the problem of a log that moves so."""
@@ -174,7 +174,7 @@ def _with_later_poses(seen: Seen, trial: Trial) -> Moves:
     score = -float(np.sum(own * blocks_of(linearization.white * root))) - float(
         share @ linearization.score
     )
-    step_s = np.clip(score / information, -LONGEST_STEP_S, LONGEST_STEP_S)
+    step_s = np.clip(score / information, -MAX_STEP_S, MAX_STEP_S)
     return Moves(moves.motion, moves.late_s + float(step_s), information**-0.5)
 
 
@@ -235,16 +235,16 @@ def how_it_moves(
     ]:
         return Moves(Motion.CONTINUOUS)
     seen = Seen(log, judged & _known_around(log, list(late.values())), model)
-    num_parts = max(lanes_of(log, seen.judged, model).row.shape[1] // MOST_LANES, 1)
+    num_parts = max(lanes_of(log, seen.judged, model).row.shape[1] // MAX_LANES, 1)
     found = _chosen(seen._replace(num_parts=num_parts), list(late.values()))
-    is_late = found.late_s > max(LEAST_S, STANDARD_ERRORS * found.sigma_s)
+    is_late = found.late_s > max(MIN_LATENCY_S, STANDARD_ERRORS * found.sigma_s)
     found = found if is_late else Moves(found.motion)
     return found._replace(is_sure=motion is not None)
 
 
 def _known_around(log: FlightLog, moves: Sequence[Moves]) -> np.ndarray:
     """Return the rows at which poses are known for each lateness and a few fit steps around it."""
-    room = ROUNDS * LONGEST_STEP_S + DIFFERENCE_S
+    room = ROUNDS * MAX_STEP_S + DIFFERENCE_S
     late_s = [one.late_s for one in moves if one.late_s > 0.0]
     ends = (min(0.0, min(late_s) - room), max(late_s) + room) if late_s else (0.0,)
     return np.logical_and.reduce([read_poses(log, end_s)[1] for end_s in ends])

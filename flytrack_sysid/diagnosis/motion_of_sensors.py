@@ -21,8 +21,8 @@ from flytrack_sysid.plausibility import GRAVITY
 # share. How many standard errors the sensors' share is off all but one of these, and may be off
 # that one, where they are sure; and what it is known to at best, without any noise.
 ATTITUDE_SHARE = {Motion.HANDOUT: 0.0, Motion.CONTINUOUS: 0.5, Motion.SEMI_IMPLICIT: 1.0}
-SURE_ERRORS, NEAR_ERRORS, LEAST_ERROR = 5.0, 4.0, 0.02
-PIECE_S, SHORTEST_PIECE_S, FEWEST_PIECES = 0.5, 0.2, 20  # of flight, over which force is summed up
+SURE_ERRORS, NEAR_ERRORS, MIN_ERROR = 5.0, 4.0, 0.02
+PIECE_S, MIN_PIECE_S, MIN_PIECES = 0.5, 0.2, 20  # of flight, over which force is summed up
 
 
 def apparent_lateness(log: FlightLog) -> tuple[float, float] | None:
@@ -93,7 +93,7 @@ def _share_of(log: FlightLog, late_rows: int) -> tuple[float, tuple[float, float
         gram.append(np.einsum("ric,rid->cd", own, own))
         scores.append(np.einsum("ric,ri->c", own, rest))
         squares += float(np.sum(rest**2))
-    if len(gram) < FEWEST_PIECES:
+    if len(gram) < MIN_PIECES:
         return None
     information, score = np.sum(gram, axis=0), np.sum(scores, axis=0)
     found = solve(information, score)
@@ -105,7 +105,7 @@ def _share_of(log: FlightLog, late_rows: int) -> tuple[float, tuple[float, float
 def _pieces(is_whole: np.ndarray, step_s: float) -> list[tuple[int, int]]:
     """Return the pieces of whole steps in a row, (num_steps,) bool, as first and last + 1."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_whole, [False]]).astype(int)))
-    long, short = round(PIECE_S / step_s), round(SHORTEST_PIECE_S / step_s)
+    long, short = round(PIECE_S / step_s), round(MIN_PIECE_S / step_s)
     cuts = (
         (start, min(start + long, last))
         for first, last in edges.reshape(-1, 2)
@@ -120,7 +120,7 @@ def motion_of_sensors(log: FlightLog) -> Motion | None:
     found = attitude_share(log, 0.0 if apparent is None else apparent[0])
     if found is None:
         return None
-    share, sigma = found[0], max(found[1], LEAST_ERROR)
+    share, sigma = found[0], max(found[1], MIN_ERROR)
     off = {motion: abs(share - own) for motion, own in ATTITUDE_SHARE.items()}
     nearest, second = sorted(off, key=lambda motion: off[motion])[:2]
     is_sure = off[nearest] < NEAR_ERRORS * sigma and off[second] > SURE_ERRORS * sigma

@@ -31,11 +31,13 @@ UNKNOWN_START = 1e8
 # Least noise, by sensors and float32: direct rad/s, m/s^2; level rad, m/s, V.
 FLOORS = np.array([[1e-4] * 3 + [1e-3] * 3 + [1.0], [1e-5] * 3 + [1e-4] * 3 + [1e-4]])
 UNIFORM = 12.0**-0.5  # standard deviation of rounding, over the last digit
-LEAST_SHARE = 1e-3  # of a disturbance and of a wander, over the noise: smaller ones are neglected
+MIN_DISTURBANCE_RATIO = (
+    1e-3  # of a disturbance and of a wander, over the noise: smaller ones are neglected
+)
 TAU_RANGE_S = (0.02, 5.0)
 # Levenberg damping: at first, its growth after a bad step, its decrease after a good one.
 FIRST_DAMPING, MORE, LESS = 1e-2, 10.0, 0.2
-MOST_ROUNDS = 12
+MAX_ROUNDS = 12
 ENOUGH = 1.0  # of minus twice the log likelihood: the error of one parameter
 # Sizes of the compiled programs: rows of lanes, and models, at a time.
 NUM_ROWS, NUM_LANES, NUM_MODELS = 200, 8, 8
@@ -361,7 +363,7 @@ def first_guess(lanes: Lanes, left: np.ndarray) -> np.ndarray:
 def disturbance_gain(lanes: Lanes, left: np.ndarray, log_noise: np.ndarray) -> np.ndarray:
     """Return how much a disturbance lowers minus twice the log likelihood, by axis."""
     still = log_noise.copy()
-    still[3] = np.log(LEAST_SHARE)
+    still[3] = np.log(MIN_DISTURBANCE_RATIO)
     likelihood = Likelihood(lanes, left)
     return likelihood.misfit(still)[0] - likelihood.misfit(log_noise)[0]
 
@@ -380,7 +382,7 @@ def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -
     best = np.clip(first_guess(lanes, left) if start is None else start, low, high)
     misfit, slopes, curvature = likelihood.misfit(best)
     damping = np.full(NUM_AXES, FIRST_DAMPING)
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         scaled = curvature + 1e-9 * np.eye(6)
         scaled = scaled + damping[:, None, None] * np.eye(6) * np.maximum(
             np.diagonal(curvature, axis1=1, axis2=2)[:, :, None], 1.0
@@ -407,7 +409,12 @@ def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -
 
 def _bounds(lanes: Lanes) -> tuple[np.ndarray, np.ndarray]:
     """Return the bounds of the search, (6, NUM_AXES) and (6, 1), as logarithms and a logit."""
-    low = [np.log(LEAST_SHARE), np.log(LEAST_SHARE), np.log(TAU_RANGE_S[0]), -5.0]
+    low = [
+        np.log(MIN_DISTURBANCE_RATIO),
+        np.log(MIN_DISTURBANCE_RATIO),
+        np.log(TAU_RANGE_S[0]),
+        -5.0,
+    ]
     high = [np.log(1e3)] * 4 + [np.log(TAU_RANGE_S[1]), 5.0]
     lowest = np.concatenate(
         [np.log(floors_of(lanes)), np.repeat(low, NUM_AXES).reshape(-1, NUM_AXES)]

@@ -39,15 +39,15 @@ from flytrack_sysid.diagnosis.search import (
 from flytrack_sysid.diagnosis.vetoes import Selection, select
 from flytrack_sysid.log import FlightLog
 
-CHANCE = 1e-5  # of a change for each effect, where nothing changes
-LEAST_S = 2.0  # of the log on each side of a change
-LEAST_SHARE = 0.04  # of the log there
-NEAR, MOST_NEAR = (
+FALSE_POSITIVE_RATE = 1e-5  # of a change for each effect, where nothing changes
+MIN_SIDE_S = 2.0  # of the log on each side of a change
+MIN_SIDE_FRACTION = 0.04  # of the log there
+NEAR, MAX_NEAR = (
     0.3,
     5,
 )  # of the largest gain: the search chooses among effects that come so near to it
 CLEAR = 10.0  # of minus twice the log likelihood, by which an end has to be likelier than an onset
-MOST_CHANGES = 3
+MAX_CHANGES = 3
 ALWAYS, NEVER = Window("").start, Window("").end
 RIDGE = 1e-7  # of a column's own information
 # Of the likelihood ratio of a time of change: its distribution is that of the maximum of a Brownian
@@ -57,7 +57,9 @@ DROP_95 = -2.0 * float(np.log(1.0 - np.sqrt(0.95)))
 PROFILES = ((8.0, 0.5), (1.0, 0.05), (0.1, 0.01))
 
 
-def threshold(num_parameters: int, trimmed: float = LEAST_SHARE, chance: float = CHANCE) -> float:
+def threshold(
+    num_parameters: int, trimmed: float = MIN_SIDE_FRACTION, chance: float = FALSE_POSITIVE_RATE
+) -> float:
     """Return the sup-LM gain of chi2 that is exceeded with probability ``chance``.
 
     Source: Andrews 1993, section 5.
@@ -129,7 +131,7 @@ def seconds_of(lanes: Lanes) -> tuple[np.ndarray, np.ndarray]:
     rows = lanes.row[lead_in_of(len(lanes.row)) :]
     start = rows[:: len(rows) // LANE_S].ravel()
     known = np.sort(start[start >= 0])
-    least = int(np.ceil(max(LEAST_S, LEAST_SHARE * len(known))))
+    least = int(np.ceil(max(MIN_SIDE_S, MIN_SIDE_FRACTION * len(known))))
     return start, known[least : len(known) - least + 1]
 
 
@@ -355,7 +357,7 @@ def with_changes(selection: Selection, test: Problem, log: FlightLog) -> Selecti
 
     test: rows held out. A selection whose effects are constant is returned as it is.
     """
-    for _ in range(MOST_CHANGES if is_one_flight(log) else 0):
+    for _ in range(MAX_CHANGES if is_one_flight(log) else 0):
         later = _with_change(selection, test)
         if later is None:
             break
@@ -374,7 +376,7 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
         [one for one in found if one.way != "drift" and one.gain > NEAR * found[0].gain],
     )
     state, model = _likeliest_side(
-        selection, first, [one.candidate.effect for one in near[:MOST_NEAR]]
+        selection, first, [one.candidate.effect for one in near[:MAX_NEAR]]
     )
     state, model = with_noise_of(_at_best_row(state, test, model, first.row), model)
     state, base, model = extended(state, state.fitted((), selection.base.vector), model)

@@ -15,9 +15,9 @@ from flytrack_sysid.diagnosis.noise import OUTLIER
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import CHANNELS, Outliers
 
-LONGEST_RUN = 3  # rows: the filter that whitens takes in part of an outlier and gives it back
-CHANCE = 1e-6  # of so many, were the noise normal
-LEAST_SHARE = 1e-3  # of rows: fewer change nothing
+MAX_RUN_LENGTH = 3  # rows: the filter that whitens takes in part of an outlier and gives it back
+FALSE_POSITIVE_RATE = 1e-6  # of so many, were the noise normal
+MIN_ROW_FRACTION = 1e-3  # of rows: fewer change nothing
 
 
 def outliers_of(problems: Sequence[Problem], vector: np.ndarray) -> dict[str, Outliers]:
@@ -36,17 +36,20 @@ def outliers_of(problems: Sequence[Problem], vector: np.ndarray) -> dict[str, Ou
             far = [np.abs(white[:, :, axes, side]).max(axis=-1) > OUTLIER for white, _ in parts]
             alone = sum(_short_runs(each) for each in far)
             by_chance = number * (axes.stop - axes.start) * 2.0 * stats.norm.sf(OUTLIER)
-            if alone > LEAST_SHARE * number and stats.poisson.sf(alone - 1, by_chance) < CHANCE:
+            if (
+                alone > MIN_ROW_FRACTION * number
+                and stats.poisson.sf(alone - 1, by_chance) < FALSE_POSITIVE_RATE
+            ):
                 found[name] = Outliers(alone, number)
     return found
 
 
 def _short_runs(is_far: np.ndarray) -> int:
-    """Return how many rows, (rows, lanes) bool, lie in runs of at most ``LONGEST_RUN``."""
+    """Return how many rows, (rows, lanes) bool, lie in runs of at most ``MAX_RUN_LENGTH``."""
     edges = np.diff(np.pad(is_far, ((1, 1), (0, 0))).astype(int), axis=0)
     starts, ends = (np.argwhere(sign == edges.T)[:, 1] for sign in (1, -1))
     lengths = ends - starts
-    return int(lengths[lengths <= LONGEST_RUN].sum())
+    return int(lengths[lengths <= MAX_RUN_LENGTH].sum())
 
 
 def outlier_notes(outliers: Mapping[str, Outliers]) -> list[str]:

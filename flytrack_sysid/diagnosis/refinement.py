@@ -50,12 +50,12 @@ from flytrack_sysid.trace_cache import keep_trace
 BATCH = 8  # models at once
 SPACING_S, SHORT_SPACING_S = 0.25, 0.05
 # To fit and to judge by. Windows overlap: fewer say nearly as much, and a fit flies them often.
-MOST_FITTED, MOST_JUDGED = CHUNK, 3 * CHUNK
-FEWEST_WINDOWS, FEWEST_BLOCKS = 12, 3  # fewer say nothing of a cell
+MAX_FITTED_WINDOWS, MAX_SCORED_WINDOWS = CHUNK, 3 * CHUNK
+MIN_WINDOWS, MIN_BLOCKS = 12, 3  # fewer say nothing of a cell
 RIDGE = 0.05  # of the placebo, in units of its regressors' variance
 ALWAYS_FITTED_S = 0.25  # horizons up to this are fitted even where the placebo is as good
 OUTLIER = 3.0  # errors beyond so many of the base's rms count by their size, not its square
-MOST_ROUNDS, REFIT_ROUNDS, LEAST_GAIN = (
+MAX_ROUNDS, REFIT_ROUNDS, MIN_GAIN = (
     10,
     2,
     1e-3,
@@ -244,7 +244,7 @@ class Target(NamedTuple):
             costs = self.cost(self.residuals(ways), ways)
             cost = self.cost(left[:1], vector[None])[0]
             best = int(np.argmin(costs))
-            if costs[best] > cost * (1.0 - LEAST_GAIN):
+            if costs[best] > cost * (1.0 - MIN_GAIN):
                 break
             vector = ways[best]
         return Fit(vector, tuple(places), self._covariance(information, scores))
@@ -302,7 +302,7 @@ class Judge(NamedTuple):
         """Where held-out windows are enough to judge by, (horizons, quantities)."""
         counts = self.windows.counts
         blocks = self.windows.sums_by_block(counts.swapaxes(0, 1).astype(int))
-        return (counts.sum(axis=1) >= FEWEST_WINDOWS) & ((blocks > 0).sum(axis=0) >= FEWEST_BLOCKS)
+        return (counts.sum(axis=1) >= MIN_WINDOWS) & ((blocks > 0).sum(axis=0) >= MIN_BLOCKS)
 
     def tested(self, *vectors: np.ndarray) -> Tested:
         """Return the errors of models on the held-out windows."""
@@ -394,7 +394,7 @@ class Refined(NamedTuple):
         return next((found[key] for key in keys if key in found), {})
 
 
-def windows_of(log: FlightLog, rows: np.ndarray, most: int = MOST_JUDGED) -> Windows | None:
+def windows_of(log: FlightLog, rows: np.ndarray, most: int = MAX_SCORED_WINDOWS) -> Windows | None:
     """Return windows over some rows of a log; None where there are none."""
     found = make_windows(log, rows, SPACING_S, most)
     if len(found.start) < CHUNK:  # a chunk costs the same, full or not
@@ -447,7 +447,7 @@ def refine(
     residuals leave noise only; the model is then the most likely one already, and stands as long as
     it predicts no horizon worse than the base.
     """
-    learnt, judged = windows_of(log, ~held_out, MOST_FITTED), windows_of(log, held_out)
+    learnt, judged = windows_of(log, ~held_out, MAX_FITTED_WINDOWS), windows_of(log, held_out)
     problem, candidates, extended = state.problem, model.candidates, model.vector
     as_found = Refined(candidates, None, None, (), {}, problem, None)
     if learnt is None or judged is None:
@@ -498,19 +498,19 @@ class _Refinement(NamedTuple):
         problem, candidates = as_found.problem, as_found.kept
         target = self.target(problem)
         places = self.places(problem, candidates)
-        fit = target.fitted(extended, places, MOST_ROUNDS)
+        fit = target.fitted(extended, places, MAX_ROUNDS)
         probed = _probed(problem, fit.vector, candidates)
         if np.any(probed != fit.vector):  # single steps left a parameter where it has no slope
-            other = target.fitted(probed, places, MOST_ROUNDS)
+            other = target.fitted(probed, places, MAX_ROUNDS)
             both = np.stack([fit.vector, other.vector])
             fit = (fit, other)[int(np.argmin(target.cost(target.residuals(both), both)))]
         stuck = at_bounds(problem, fit.vector, self.fields_of(candidates))
         if stuck:
             problem = widened(problem, stuck)
             target = target._replace(problem=problem)
-            fit = target.fitted(fit.vector, fit.places, MOST_ROUNDS)
+            fit = target.fitted(fit.vector, fit.places, MAX_ROUNDS)
         judge = self.judge.seeing(fit.vector)
-        base = target.fitted(self.base, self.places(problem, ()), MOST_ROUNDS).vector
+        base = target.fitted(self.base, self.places(problem, ()), MAX_ROUNDS).vector
         found = as_found._replace(fit=fit, base=base, problem=problem, judge=judge)
         return self._eliminate(found, target)
 
@@ -541,7 +541,7 @@ class _Refinement(NamedTuple):
             kept.remove(tried[weakest])
             removed.append(tried[weakest].effect)
             places = self.places(target.problem, kept)
-            fit = target.fitted(fits[weakest].vector, places, MOST_ROUNDS)
+            fit = target.fitted(fits[weakest].vector, places, MAX_ROUNDS)
         if not any(
             one.effect in self.acting for one in kept
         ):  # the base as single steps have it stands

@@ -36,16 +36,19 @@ from flytrack_sysid.page import Bullets, Part, Picture, Section, Table, Text, Ve
 from flytrack_sysid.plots import WIDTH_IN, png_of
 
 JSON_NAME, MODEL_NAME, REPORT_NAME = "diagnosis.json", "extended_model.json", "report.html"
-MOST_PICTURED = 6  # causes, those with the largest gain: more pictures nobody reads
+MAX_PICTURED = 6  # causes, those with the largest gain: more pictures nobody reads
 BARS_HEIGHT_IN = 2.6
-MOST_LISTED = 3  # names in one cell
+MAX_LISTED = 3  # names in one cell
 LIMITED_S = 1e-3  # by which a step to full stick takes longer where a limit acts
 NO_BREAK = "\u00a0"  # a space at which lines do not break
-AS_CLOSE, LEAST_SHARE = "no closer", 0.5  # % of an error: what changes by less has not changed
+AS_CLOSE, MIN_CHANGE_PERCENT = (
+    "no closer",
+    0.5,
+)  # % of an error: what changes by less has not changed
 HEADLINE_HORIZON = "1"  # s of free flight, whose error the first sentence gives
 WRONG = "has the wrong value of"
 LOG_BARS = 20.0  # times the smallest error: from there on bars would vanish on an even scale
-MOST_LIMITS = 8  # rows of the text's table of what a log could not show
+MAX_LIMITS = 8  # rows of the text's table of what a log could not show
 CHANNEL_WORDS = {"rates": "body rates", "force": "specific force"}
 DIFFERENCES = (
     "The log lacks a gyro or an accelerometer; attitude or velocity replace them, by their change "
@@ -102,7 +105,7 @@ def when_of(cause: Cause) -> str:
 
 def _confused(cause: Cause) -> str:
     if cause.equivalent:
-        return f"this log cannot tell it from: {list_words(cause.equivalent[:MOST_LISTED])}"
+        return f"this log cannot tell it from: {list_words(cause.equivalent[:MAX_LISTED])}"
     return f"no; the closest is: {words_of(cause.closest)}" if cause.closest else "not compared"
 
 
@@ -110,7 +113,7 @@ def _faults(diagnosis: Diagnosis) -> str:
     """Return a sentence on what the model lacks, has too much or too little of, or has wrong."""
     by_fault: dict[str, list[str]] = {}
     for cause in diagnosis.causes:
-        alike = () if cause.effect == "thrust_scale" else cause.equivalent[:MOST_LISTED]
+        alike = () if cause.effect == "thrust_scale" else cause.equivalent[:MAX_LISTED]
         others = f" (or {' or '.join(map(words_of, alike))})" if alike else ""
         name = words_of(cause.effect) + when_of(cause) + others
         by_fault.setdefault(fault_of(cause.effect, diagnosis), []).append(name)
@@ -169,7 +172,7 @@ def _gain(diagnosis: Diagnosis) -> str:
 def _closer(before: float, after: float) -> str:
     """Return by how much an error fell, "13 % closer"."""
     share = 100.0 * (1.0 - after / before)
-    if abs(share) < LEAST_SHARE:
+    if abs(share) < MIN_CHANGE_PERCENT:
         return AS_CLOSE
     return f"{abs(share):.0f} % {'closer' if share > 0.0 else 'farther off'}"
 
@@ -323,7 +326,7 @@ def _limits_part(diagnosis: Diagnosis) -> Part:
         [
             f"{words_of(one.effect)}\n({one.effect})",
             (_number(one.smallest) + _unit(one.unit)).replace(" ", NO_BREAK),
-            list_words(one.confused_with[:MOST_LISTED]) or "noise",
+            list_words(one.confused_with[:MAX_LISTED]) or "noise",
             one.fly.replace("_", " "),
         ]
         for one in diagnosis.not_identifiable
@@ -354,7 +357,7 @@ def _learned_parts(diagnosis: Diagnosis, found: Traces) -> list[Part]:
     learned = diagnosis.learned
     if learned is None:
         return []
-    panels = [Panel(*one) for one in learned.drawn()][:MOST_PICTURED]
+    panels = [Panel(*one) for one in learned.drawn()][:MAX_PICTURED]
     figure = draw_cause("what was learnt", panels, found, _LESS + LEARNT)
     return [Bullets(learned.text().splitlines()), Picture(png_of(figure), LEARNT_READING)]
 
@@ -392,7 +395,7 @@ def _evidence_parts(diagnosis: Diagnosis, found: Traces, start_s: float) -> list
     found: of ``traces_of``. start_s: the log's first time.
     """
     parts: list[Part] = []
-    for cause in sorted(diagnosis.causes, key=lambda cause: -cause.chi2_gain)[:MOST_PICTURED]:
+    for cause in sorted(diagnosis.causes, key=lambda cause: -cause.chi2_gain)[:MAX_PICTURED]:
         evidence = EVIDENCE[cause.effect]
         acting = while_acting(found, cause, start_s)
         figure = draw_cause(
@@ -501,15 +504,15 @@ def _limits_text(diagnosis: Diagnosis) -> list[str]:
     if not limits:
         return []
     rows = [("not shown by this log", "visible from", "looks like")]
-    for one in limits[:MOST_LIMITS]:
+    for one in limits[:MAX_LIMITS]:
         size = f"{one.smallest:.3g} {one.unit}" if np.isfinite(one.smallest) else "-"
-        rows.append((one.effect, size, ", ".join(one.confused_with[:MOST_LISTED]) or "noise"))
+        rows.append((one.effect, size, ", ".join(one.confused_with[:MAX_LISTED]) or "noise"))
     widths = [max(len(row[column]) for row in rows) for column in range(2)]
     lines = [
         f"{name:<{widths[0]}}  {size:<{widths[1]}}  {alike}".rstrip() for name, size, alike in rows
     ]
-    if len(limits) > MOST_LIMITS:
-        lines.append(f"and {len(limits) - MOST_LIMITS} more, in {REPORT_NAME}")
+    if len(limits) > MAX_LIMITS:
+        lines.append(f"and {len(limits) - MAX_LIMITS} more, in {REPORT_NAME}")
     flight, number = Counter(one.fly for one in limits).most_common(1)[0]
     to_do = flight if flight.startswith(TO_LOG) else f"fly {flight}"
     return [*lines, f"recommended: {to_do}, which settles {number} of {len(limits)}"]

@@ -23,9 +23,9 @@ from flytrack_sysid.diagnosis.problem import (
 )
 from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS, neutral_value, range_of
 
-CHANCE = 1e-4  # of a name where there is nothing, for each effect
+FALSE_POSITIVE_RATE = 1e-4  # of a name where there is nothing, for each effect
 # A direction of which the others leave less than this share cannot be told apart from them.
-LEAST_OWN_SHARE = 1e-7
+MIN_INDEPENDENT_FRACTION = 1e-7
 AT_BOUND = 1e-9
 # relative change of a parameter that is looked for at probes, within which its slope holds
 SAME_SLOPE = 0.1
@@ -140,7 +140,7 @@ def candidates_for(problem: Problem) -> list[Candidate]:
 
 def threshold(num_parameters: int) -> float:
     """Return the gain of chi2 from which so many parameters are named."""
-    return float(stats.chi2.isf(CHANCE, num_parameters))
+    return float(stats.chi2.isf(FALSE_POSITIVE_RATE, num_parameters))
 
 
 class Gain(NamedTuple):
@@ -342,7 +342,9 @@ class Linearization:
             own = self.total[column, column] - across @ solve(
                 self.total[np.ix_(others, others)], across
             )
-            least = max(LEAST_OWN_SHARE * self.total[column, column], 2.0 * self.prior[column])
+            least = max(
+                MIN_INDEPENDENT_FRACTION * self.total[column, column], 2.0 * self.prior[column]
+            )
             if own > least:
                 kept.append(column)
         return kept

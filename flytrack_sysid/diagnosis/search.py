@@ -21,18 +21,18 @@ from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import DRAIN, base_of
 
 PER_PARAMETER = 4.0  # of chi2: what one more parameter has to gain to be preferred to fewer
-MOST_EFFECTS = 6
+MAX_EFFECTS = 6
 # of the best gain: candidates that come so near to first order are refitted before one is chosen
 CLOSE = 0.6
-MOST_REFITTED = 4
-MOST_FAILED_ROUNDS = 3  # of refits before a search ends
+MAX_REFITTED = 4
+MAX_FAILED_ROUNDS = 3  # of refits before a search ends
 PROMISING = 0.7  # of the threshold, to first order
 SHARE_OF_WAY = (0.02, 1.5)  # to a probe, at which a fit starts
 KEPT_PROMISE = 0.6  # of a gain to first order: a fit that comes to less may have gone astray
 SATURATED_SHARES = np.array([0.0, 1.0, 0.5, 0.2])  # of the step to everything at once
 # Gauss-Newton: rounds, the least gain of a round, and after how much gain slopes are taken again;
 # gains in minus twice the log likelihood.
-MOST_ROUNDS, LEAST_GAIN, STALE = 30, 0.2, 30.0
+MAX_ROUNDS, MIN_GAIN, STALE = 30, 0.2, 30.0
 TRIAL_ROUNDS = 5  # after which a fit says whether it is worth carrying on
 # Of a step, tried one after the other until one gains a part of what first order promises.
 STEP_SHARES, PART_OF_PROMISE = np.array([1.0, 0.5, 0.2, 0.05]), 0.25
@@ -189,13 +189,13 @@ def refine(
     else:
         now = nearby.narrowed(places).moved(vector)
     since, is_fresh = now.cost, nearby is None
-    for number in range(MOST_ROUNDS):
+    for number in range(MAX_ROUNDS):
         if number == TRIAL_ROUNDS and now.cost > limit:
             break
         gained, later = _step(problem, now)
         if gained > 0.0:
             now, is_fresh = later, False
-        if gained < LEAST_GAIN:
+        if gained < MIN_GAIN:
             if is_fresh or since - now.cost < STALE:
                 break
             now = Linearization(problem, problem.slopes(now.vector, places))
@@ -307,8 +307,8 @@ def add_best(
         for one in score_candidates(state, linearization, model)
         if one.gain.robust > PROMISING * threshold(one.gain.num_parameters)
     ]
-    for _ in range(MOST_FAILED_ROUNDS):
-        near = [one for one in ranked[:MOST_REFITTED] if one.merit > CLOSE * ranked[0].merit]
+    for _ in range(MAX_FAILED_ROUNDS):
+        near = [one for one in ranked[:MAX_REFITTED] if one.merit > CLOSE * ranked[0].merit]
         best: tuple[float, FittedModel] | None = None
         for one in near:
             trial = add_effect(state, linearization, model, one, limit=-np.inf)
@@ -326,7 +326,7 @@ def add_best(
 
 def add_effects(state: SearchState, model: FittedModel) -> tuple[SearchState, FittedModel]:
     """Add effects while one explains enough, the best first; return the model, the same if none."""
-    while len(model.candidates) < MOST_EFFECTS:
+    while len(model.candidates) < MAX_EFFECTS:
         state, linearization = state.linearized(model.vector)
         more = add_best(state, linearization, model)
         if more is None:

@@ -17,7 +17,7 @@ from flytrack_sysid.diagnosis.result import Cause
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
 from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS
 
-LEAST_COST = 0.02  # of the error of free flight, held out
+MIN_ERROR_FRACTION = 0.02  # of the error of free flight, held out
 NOTABLE_LAG_S = 0.005  # as of the effects that delay
 NOTABLE_THRUST = 0.02  # of the weight, as of a scale of thrust
 NOTABLE_DRAIN_PER_MIN = 0.1  # of the battery, from full to empty: 0.2 V/min of the handout's
@@ -40,7 +40,7 @@ def split_by_size(
     negligible = []
     for cause in small:
         less = flight_error(without(cause))
-        if all(less[horizon] < (1.0 + LEAST_COST) * full[horizon] for horizon in full):
+        if all(less[horizon] < (1.0 + MIN_ERROR_FRACTION) * full[horizon] for horizon in full):
             negligible.append(cause)
     return tuple(cause for cause in causes if cause not in negligible), tuple(negligible)
 

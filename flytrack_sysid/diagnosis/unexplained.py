@@ -18,12 +18,12 @@ from flytrack_sysid.parameters import TAUS
 
 SIDES = {"rate": AXES[0], "force": AXES[1]}  # axes of a residual
 RIDGE = 1e-6  # of each column's own: features are nearly dependent where little was flown
-CHANCE = 1e-6  # of a flag where nothing is left, for each dependence
+FALSE_POSITIVE_RATE = 1e-6  # of a flag where nothing is left, for each dependence
 MATERIAL = 0.08  # of the sensor's noise, rms: less is left alone
 OF_NAMED = 0.15  # of what the named causes do, rms: laws of the list are not exact
 # of the wandering disturbance, rms: a dependence that explains less is a coincidence
 OF_WANDERING = 0.45
-MOST_DEPENDENCES = 3
+MAX_DEPENDENCES = 3
 PERIODIC_HZ = (0.3, 25.0)
 LINE = 28.0  # power of a line over that of its neighbourhood: e^-28 by chance
 NEIGHBOURS = 40  # frequencies on each side
@@ -450,14 +450,14 @@ def _greedy(
 ) -> list[Dependence]:
     """Return dependences one after the other, each besides those before."""
     result: list[Dependence] = []
-    while len(result) < MOST_DEPENDENCES:
+    while len(result) < MAX_DEPENDENCES:
         best: Dependence | None = None
         for one in (*smooth, *([] if places is None else [_best_bump(test, places)])):
             if any(one.name == earlier.name for earlier in result):
                 continue
             fit = test.fit(one.columns)
             number, size = one.columns.shape[1], _rms(one.features_w, fit.step, flight.is_counted)
-            if fit.gain < stats.chi2.isf(CHANCE / one.tries, number) or size < least:
+            if fit.gain < stats.chi2.isf(FALSE_POSITIVE_RATE / one.tries, number) or size < least:
                 continue
             gain = fit.gain - 2.0 * number
             if best is None or gain > best.gain:

@@ -12,7 +12,7 @@ from flytrack_sysid.importing.file_kinds import UNKNOWN, ZSTD, check_kind
 from flytrack_sysid.importing.flight import ImportedFlight
 from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.table_flight import (
-    LONGEST_LIST,
+    MAX_LIST_LENGTH,
     RECORDED,
     TIMESTAMP,
     flight_of_topics,
@@ -20,7 +20,7 @@ from flytrack_sysid.importing.table_flight import (
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import Table
 
-LARGEST_BYTES = 2**30
+MAX_BYTES = 2**30
 
 
 def read_bag(path: Path, mapping: Mapping) -> ImportedFlight:
@@ -42,10 +42,10 @@ def read_bag(path: Path, mapping: Mapping) -> ImportedFlight:
     if not path.exists():
         raise LogError(f"{path}: cannot be read: no such file or folder")
     if not (path.is_file() or path.is_dir()) or (
-        path.is_file() and path.stat().st_size > LARGEST_BYTES
+        path.is_file() and path.stat().st_size > MAX_BYTES
     ):
         raise LogError(
-            f"{path}: cannot be read: expected a folder, or a file of at most {LARGEST_BYTES} bytes"
+            f"{path}: cannot be read: expected a folder, or a file of at most {MAX_BYTES} bytes"
         )
     if path.is_file():
         check_kind(
@@ -58,7 +58,7 @@ def read_bag(path: Path, mapping: Mapping) -> ImportedFlight:
     names = [found["topic"] for found in notes["found"]]
     for topic in wanted:
         if topic not in names:
-            listed = ", ".join(map(quote_name, notes["topics"]))[:LONGEST_LIST] or "no topics"
+            listed = ", ".join(map(quote_name, notes["topics"]))[:MAX_LIST_LENGTH] or "no topics"
             raise LogError(f"{path}: topic {quote_name(topic)}: no messages; found {listed}")
     topics, said = [], []
     for found, rows in zip(notes["found"], arrays, strict=True):

@@ -28,7 +28,7 @@ from flytrack_sysid.log_table import Table, columns_of, log_of_table
 from flytrack_sysid.timestamps import number_segments, put_on_one_line, read_clock
 
 FIRMWARE = "Betaflight"
-LARGEST_BYTES = 2**29  # of a flash chip
+MAX_BYTES = 2**29  # of a flash chip
 FIRST_BYTES = b"H Product:Blackbox"
 END_OF_LOG = b"E\xffEnd of log\0"  # the event that a logger writes last
 STICKS = tuple(f"setpoint[{axis}]" for axis in range(4))
@@ -41,11 +41,11 @@ BATTERY = "vbatLatest"
 FULL_THROTTLE = 1000.0  # setpoint[3] at full throttle; 0 at none
 FINE = 10.0  # units in one deg/s where blackbox_high_resolution is set
 MICROSECOND = UNITS["time"]["us"]
-LARGEST_SETTING = 1e9
-LONGEST_LIST = 1000  # characters of names of fields in a message
+MAX_SETTING = 1e9
+MAX_LIST_LENGTH = 1000  # characters of names of fields in a message
 PERCENT = 100.0
 # past full stick: smoothing by a Butterworth filter overshoots a step by 4.3 %
-LARGEST_OVERSHOOT = 0.05
+MAX_OVERSHOOT = 0.05
 NUM_MOTORS = 4
 # Settings that stand between throttle, voltage and thrust: name, what is neutral, what the setting
 # does.
@@ -65,7 +65,7 @@ def read_betaflight(path: Path, mapping: Mapping) -> list[ImportedFlight]:
     says why. Raises LogError for what is no blackbox file of Betaflight 4, or has no log that can
     be used.
     """
-    content = read_log_file(path, LARGEST_BYTES, FIRST_BYTES, "a Betaflight blackbox log")
+    content = read_log_file(path, MAX_BYTES, FIRST_BYTES, "a Betaflight blackbox log")
     is_cut_off = [END_OF_LOG not in log for log in content.split(FIRST_BYTES)[1:]]
     numbers = _chosen_logs(path, len(is_cut_off), mapping)
     cut_off = [number for number in numbers if is_cut_off[number - 1]]
@@ -99,7 +99,7 @@ def _read_log(
         )
     for name in ("time", *STICKS, *GYRO):
         if name not in names:
-            listed = ", ".join(map(quote_name, names))[:LONGEST_LIST]
+            listed = ", ".join(map(quote_name, names))[:MAX_LIST_LENGTH]
             raise LogError(f"{source}: field {name}: missing; found {listed}")
     said = [f"{quote_name(revision)}, {len(frames)} frames"]
     if notes["num_bytes_left"]:
@@ -146,9 +146,7 @@ class _Headers:
         """Return the numbers of a setting, 0 or more, or the default of an absent one."""
         value: Any = self.values.get(name, default)
         found = value if isinstance(value, list) else [value]
-        is_valid = all(
-            isinstance(one, (int, float)) and 0 <= one < LARGEST_SETTING for one in found
-        )
+        is_valid = all(isinstance(one, (int, float)) and 0 <= one < MAX_SETTING for one in found)
         if len(found) != size or not is_valid:
             raise self.error(
                 name, f"found {quote_value(value)}, expected {size} numbers of at least 0"
@@ -229,7 +227,7 @@ def _commands(table: Table, headers: _Headers, full: np.ndarray) -> tuple[np.nda
     size = np.abs(commands)
     # Setpoints are whole numbers: half of one past full stick is rounding.
     is_past = size > 1.0 + units / 2 / full
-    is_overshoot = size <= np.maximum(1.0 + LARGEST_OVERSHOOT, 1.0 + units / 2 / full)
+    is_overshoot = size <= np.maximum(1.0 + MAX_OVERSHOOT, 1.0 + units / 2 / full)
     clipped = np.where(is_overshoot, np.clip(commands, -1.0, 1.0), commands)
     num_past = np.count_nonzero(is_past.any(axis=1))
     if not num_past:

@@ -15,7 +15,7 @@ STEEP_RC_RATE, STEEP_SLOPE = 2.0, 14.54  # above this RC rate, the curve gets st
 BETAFLIGHT_RATE_DEG_S = KISS_RATE_DEG_S = 200.0  # at RC rate 1
 TENS = 10.0  # deg/s in one unit of the other types' settings
 QUICK_RATE_DEG_S = 2.0  # per unit of RC rate
-LEAST_REMAINDER = 0.01  # of 1 less the super rate, as the firmware bounds it
+MIN_REMAINDER = 0.01  # of 1 less the super rate, as the firmware bounds it
 # What the effect of the loop has as it comes; a craft that differs is flown by another loop.
 ASSUMED = {
     "mixer_type": "LEGACY",
@@ -32,7 +32,7 @@ GENERIC = BetaflightLoop(20.0, 20.0, 2.0, 2.0, 0.02, 0.5)
 SETTINGS = BetaflightLoop._fields[
     BetaflightLoop._fields.index("p_roll") :
 ]  # before them: the craft
-LEAST_SMOOTHING_HZ, SMOOTHING, TENTHS = 15, 1.5, 10.0
+MIN_SMOOTHING_HZ, SMOOTHING, TENTHS = 15, 1.5, 10.0
 
 
 def full_stick_rate(
@@ -45,7 +45,7 @@ def full_stick_rate(
     rc_rate, super_rate, limit_deg_s: as in the log's headers ``rc_rates``, ``rates``,
     ``rate_limits``.
     """
-    remainder = max(1.0 - super_rate / PERCENT, LEAST_REMAINDER)
+    remainder = max(1.0 - super_rate / PERCENT, MIN_REMAINDER)
     rate = rc_rate / PERCENT
     steep = rate + STEEP_SLOPE * max(rate - STEEP_RC_RATE, 0.0)
     at_full_stick = {
@@ -82,7 +82,7 @@ def stick_curve(rates_type: str, axes: Sequence[Sequence[float]]) -> Any:
     elif rates_type == "QUICK":
         curve = QuickRates(*bends(QUICK_RATE_DEG_S), *shares)
     elif rates_type == "BETAFLIGHT":
-        most = 1.0 - LEAST_REMAINDER
+        most = 1.0 - MIN_REMAINDER
         curve = BetaflightRates(*(min(rate / PERCENT, most) for rate in super_rates), *shares)
     else:
         return None
@@ -117,4 +117,4 @@ def _smoothing(value: Callable[[str], str], channel: str, factor: str, frames_hz
         return 0.0
     cutoff_hz = float(value(f"rc_smoothing_{channel}_cutoff"))
     automatic = int(frames_hz * SMOOTHING / (1.0 + float(value(factor)) / TENTHS))
-    return cutoff_hz or float(max(automatic, LEAST_SMOOTHING_HZ))
+    return cutoff_hz or float(max(automatic, MIN_SMOOTHING_HZ))

@@ -17,15 +17,15 @@ from flytrack_sysid.importing.flight import saturation
 from flytrack_sysid.importing.units import PER_DEGREE
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import COMMAND_MARGIN
-from flytrack_sysid.plausibility import FEWEST_ROWS
+from flytrack_sysid.plausibility import MIN_ROWS
 from flytrack_sysid.timestamps import MAX_GAP_S
 
 AXES = ("roll", "pitch", "yaw")
 FLYING_THRUST = -0.9  # command: with less, it may stand on the ground, where rates do not follow
 # Of the rate loop, while an attitude gain is identified: lags and delays, s.
 LAGS_S, DELAYS_S = (0.0, 0.02, 0.04, 0.06, 0.1, 0.15), (0.0, 0.01, 0.02, 0.03, 0.04)
-LEAST_CORRELATION = 0.7  # of the rates with those of an identified attitude gain
-LEAST_EXPLAINED = 0.9  # of the variance of torques, which a controller computes without noise
+MIN_CORRELATION = 0.7  # of the rates with those of an identified attitude gain
+MIN_EXPLAINED = 0.9  # of the variance of torques, which a controller computes without noise
 
 
 class CommandRules(NamedTuple):
@@ -168,7 +168,7 @@ def _identified_attitude_gain(
     A note on the gains comes second.
     """
     _check_there(source, channels, "w")
-    if len(time) < FEWEST_ROWS:
+    if len(time) < MIN_ROWS:
         raise LogError(
             f"{source}: attitude_command.gain: found {len(time)} rows, too few for it; state it"
         )
@@ -191,10 +191,10 @@ def _identified_attitude_gain(
                 correlation = float(shown @ rates / size) if size else 0.0
                 if correlation > best:
                     best, gain = correlation, float(shown @ rates / (shown @ shown))
-        if not best >= LEAST_CORRELATION:
+        if not best >= MIN_CORRELATION:
             found = (
                 f"rates correlate with the attitude error by {best:.2f}, expected "
-                f"{LEAST_CORRELATION} or more"
+                f"{MIN_CORRELATION} or more"
             )
             raise LogError(
                 f"{source}: attitude_command.gain: cannot be identified for {name}: {found}; state "
@@ -236,10 +236,10 @@ def _rates_of_the_law(
             if np.ptp(torque)
             else 0.0
         )
-        if not share >= LEAST_EXPLAINED or weights[1] >= 0.0:
+        if not share >= MIN_EXPLAINED or weights[1] >= 0.0:
             found = (
                 f"attitude and rates explain {share:.0%} of the torque, expected "
-                f"{LEAST_EXPLAINED:.0%}"
+                f"{MIN_EXPLAINED:.0%}"
             )
             where = f"{source}: torque_command.rate_gain: cannot be identified for {name}"
             raise LogError(f"{where}: {found}; state it")

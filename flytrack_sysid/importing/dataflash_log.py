@@ -19,7 +19,7 @@ from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, v
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import Table
 
-LARGEST_BYTES = 2**29  # the decoder may take time and memory in proportion
+MAX_BYTES = 2**29  # the decoder may take time and memory in proportion
 FIRST_BYTES = b"\xa3\x95"
 VEHICLE = "ArduCopter"
 OTHER_VEHICLES = ("ArduPlane", "ArduRover", "ArduSub", "AntennaTracker", "Blimp", "Rover")
@@ -82,9 +82,7 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
     docs/real_logs.md says which messages the channels are of. Raises LogError for what is no such
     log, is not of a copter, or lacks rates and their setpoints.
     """
-    read_log_file(
-        path, LARGEST_BYTES, FIRST_BYTES, "an ArduPilot log (DataFlash)", len(FIRST_BYTES)
-    )
+    read_log_file(path, MAX_BYTES, FIRST_BYTES, "an ArduPilot log (DataFlash)", len(FIRST_BYTES))
     notes, arrays = decode(
         str(path), "dataflash", path, {name: [TIME, *names] for name, names in FIELDS.items()}
     )

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.plausibility import FEWEST_ROWS, GRAVITY, SHORTEST_S, summed_turns
+from flytrack_sysid.plausibility import GRAVITY, MIN_ROWS, MIN_S, summed_turns
 
 # Blocks of rows: an idle propeller turns tens of times in one, a drone in flight does not keep
 # still for one.
@@ -168,7 +168,7 @@ def _ground_rows(log: FlightLog, blocks: _Blocks, hover: float) -> np.ndarray:
     steps = np.diff(log.time, append=log.time[-1])
     flown_s = steps[~rows & (steps > 0.0) & (steps < BLOCK_S)].sum()
     never_moves = blocks.is_at_rest[~is_ground].all()
-    is_too_short = flown_s < SHORTEST_S or np.sum(~rows) < FEWEST_ROWS
+    is_too_short = flown_s < MIN_S or np.sum(~rows) < MIN_ROWS
     return np.ones(len(rows), bool) if never_moves or is_too_short else rows
 
 

@@ -37,8 +37,8 @@ READERS = {
 }
 FORMATS = tuple(READERS)
 FORMATS_OF_SEVERAL_LOGS = ("betaflight",)
-LARGEST_MANIFEST_BYTES = 2**24
-LEAST_THRUST = -0.9  # command: what flies uses more than a twentieth of its thrust at some time
+MAX_MANIFEST_BYTES = 2**24
+MIN_THRUST = -0.9  # command: what flies uses more than a twentieth of its thrust at some time
 
 
 class Imported(NamedTuple):
@@ -180,7 +180,7 @@ def _flights_in_the_air(
         elif num_ground == num_used:
             left_out.append(f"{source}: nothing flies: on the ground in all {num_used} rows")
             continue
-        elif log["u"][is_used, 3].max() < LEAST_THRUST:
+        elif log["u"][is_used, 3].max() < MIN_THRUST:
             left_out.append(
                 f"{source}: nothing flies: the thrust command never exceeds 5 % of its range"
             )
@@ -253,7 +253,7 @@ def _count_of(path: Path, wanted: Manifest) -> int:
     if manifest.name != wanted.file:
         raise LogError(f"{where}: expected the name of a file beside the log, not a path")
     try:
-        lines = read_at_most(manifest, LARGEST_MANIFEST_BYTES).decode("utf-8-sig").splitlines()
+        lines = read_at_most(manifest, MAX_MANIFEST_BYTES).decode("utf-8-sig").splitlines()
         rows = list(csv.DictReader(lines, strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise LogError(f"{where}: cannot be read as a manifest: {error_text(error)}") from error

@@ -30,7 +30,7 @@ from flytrack_sysid.importing.commands import CommandRules
 from flytrack_sysid.importing.flight import Craft
 from flytrack_sysid.importing.units import TURNED, UNITS, quaternion_from, vector_from
 from flytrack_sysid.log import LogError
-from flytrack_sysid.log_table import LARGEST_NORM_ERROR, Table
+from flytrack_sysid.log_table import MAX_NORM_ERROR, Table
 
 SHIPPED = Path(__file__).parent.parent / "mappings"
 NUM_AXES = 3
@@ -314,7 +314,7 @@ class Attitude(SignedFields):
 
 
 def _check_one(table: Table, columns: tuple[str, ...], what: str, sizes: np.ndarray) -> None:
-    for row in np.flatnonzero(np.abs(sizes - 1.0) > LARGEST_NORM_ERROR)[:1]:
+    for row in np.flatnonzero(np.abs(sizes - 1.0) > MAX_NORM_ERROR)[:1]:
         text = f"found a {what} {sizes[row]:.4g}, expected 1"
         raise table.error(row, ", ".join(map(quote_name, columns)), text)
 

@@ -17,7 +17,7 @@ from flytrack_sysid.log_table import Table, columns_of, log_of_table
 from flytrack_sysid.resample import Samples, on_one_base, slow_channels
 from flytrack_sysid.timestamps import MAX_LATENCY_S, number_segments, put_on_one_line, read_clock
 
-LONGEST_LIST = 1000  # characters of a header in a message
+MAX_LIST_LENGTH = 1000  # characters of a header in a message
 TIMESTAMP = "timestamp"  # column of a table's own times, s
 RECORDED = "recorded"  # column of the times of recording, s, by one clock for all tables
 BASES = ("w", "q", "p")  # the rows are those of the first that is there
@@ -48,7 +48,7 @@ def channels_in(
                 (c, n) for c, n in zip(channel.columns, count, strict=True) if n != 1
             )
             listed = ", ".join(map(quote_name, dict.fromkeys(itertools.chain(*names))))[
-                :LONGEST_LIST
+                :MAX_LIST_LENGTH
             ]
             where = f"{source}: column {quote_name(column)}: found {times} times among {listed}"
             raise LogError(f"{where}; expected once by {mapping.source}: {channel.table}")
@@ -108,7 +108,7 @@ def _read_files(folder: Path, mapping: Mapping) -> ImportedFlight:
         paths = sorted(folder.glob(file.file))
         if len(paths) != 1:
             listed = ", ".join(quote_name(path.name) for path in sorted(folder.iterdir()))[
-                :LONGEST_LIST
+                :MAX_LIST_LENGTH
             ]
             found = f"found {len(paths)} files of the name {quote_name(file.file)} among {listed}"
             raise LogError(f"{folder}: {found}; expected one by {mapping.source}: files.{name}")
@@ -122,7 +122,7 @@ def _read_file(path: Path, name: str, file: CsvFile, fields: list[str], mapping:
         header = [column.strip() for column in next(rows, [])]
         for column in (file.time, *fields):
             if header.count(column) != 1:
-                listed = ", ".join(map(quote_name, header))[:LONGEST_LIST]
+                listed = ", ".join(map(quote_name, header))[:MAX_LIST_LENGTH]
                 found = (
                     f"{path}: column {quote_name(column)}: found {header.count(column)} times "
                     f"among {listed}"

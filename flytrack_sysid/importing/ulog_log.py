@@ -18,7 +18,7 @@ from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, v
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import (
     COMMAND_MARGIN,
-    LARGEST_NORM_ERROR,
+    MAX_NORM_ERROR,
     Table,
     columns_of,
     log_of_table,
@@ -32,7 +32,7 @@ from flytrack_sysid.timestamps import (
     read_clock,
 )
 
-LARGEST_BYTES = 2**29  # the decoder may take time and memory in proportion
+MAX_BYTES = 2**29  # the decoder may take time and memory in proportion
 FIRST_BYTES = b"ULog\x01\x12\x35"
 MICROSECOND = UNITS["time"]["us"]
 # Full stick in acro mode, and the limit of other modes, deg/s; a setpoint stays below the larger
@@ -162,7 +162,7 @@ def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, Clock], dict[str,
     Returns: The samples by channel, on one time line; the clocks by channel; the log's parameters;
         and what was found wrong.
     """
-    read_log_file(path, LARGEST_BYTES, FIRST_BYTES, "a PX4 log (ULog)", len(FIRST_BYTES))
+    read_log_file(path, MAX_BYTES, FIRST_BYTES, "a PX4 log (ULog)", len(FIRST_BYTES))
     fields: dict[str, list[str]] = {}
     for topic, names in (source for sources in SOURCES.values() for source in sources):
         fields[topic] = [*fields.get(topic, TIMES), *names]
@@ -247,7 +247,7 @@ def _samples_of(
 def _attitude(path: Path, samples: Samples) -> Samples:
     """Return the attitude in our frames, without samples from before the estimator ran."""
     times, quat = samples
-    is_unit = abs(np.linalg.norm(quat, axis=1) - 1.0) <= LARGEST_NORM_ERROR
+    is_unit = abs(np.linalg.norm(quat, axis=1) - 1.0) <= MAX_NORM_ERROR
     if not is_unit.any():
         raise LogError(
             f"{path}: topic vehicle_attitude: q: found no unit quaternion, expected norm 1"

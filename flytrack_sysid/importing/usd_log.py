@@ -21,7 +21,7 @@ from flytrack_sysid.importing.table_flight import TIMESTAMP, flight_of_topics
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import Table
 
-LARGEST_BYTES = 2**27  # 40 min at 1 kHz with 50 bytes a record
+MAX_BYTES = 2**27  # 40 min at 1 kHz with 50 bytes a record
 FIRST_BYTE = b"\xbc"
 NUM_HEADER_BYTES, NUM_CRC_BYTES = 5, 4
 STAMPS = {1: ("<u4", 1e-3), 2: ("<u8", 1e-6)}  # of a version: type, s
@@ -40,7 +40,7 @@ def read_usd(path: Path, mapping: Mapping) -> ImportedFlight:
 
     Raises LogError for what is no such log, or lacks a variable that the mapping names.
     """
-    content = read_log_file(path, LARGEST_BYTES, FIRST_BYTE, "a Crazyflie uSD log")
+    content = read_log_file(path, MAX_BYTES, FIRST_BYTE, "a Crazyflie uSD log")
     try:
         stamp_s, events, end = _header(content)
     except (struct.error, ValueError) as error:

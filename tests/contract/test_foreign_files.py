@@ -38,7 +38,7 @@ from tests.support.foreign_logs import WRITERS, flying, write_csv
 from tests.support.slow import slow_but
 from tests.support.written_logs import read_mapping
 
-CPU_S, LONGEST_MESSAGE, NUM_FILES, NUM_SLOW_FILES = 10.0, 2000, 60, 3
+CPU_S, MAX_MESSAGE_LENGTH, NUM_FILES, NUM_SLOW_FILES = 10.0, 2000, 60, 3
 TOKENS = (
     b"nan",
     b"1e999",
@@ -246,7 +246,7 @@ def loaded_or_refused(kind, path):
         loaded = kind.load(path)
     except kind.error as error:
         text = str(error)
-        assert path.name in text and len(text) <= LONGEST_MESSAGE and text.isprintable(), text
+        assert path.name in text and len(text) <= MAX_MESSAGE_LENGTH and text.isprintable(), text
         return False
     finally:
         assert time.process_time() - started_s <= CPU_S

@@ -199,7 +199,7 @@ def test_environment_flies_it_and_goes_back_no_further_than_a_step(plant):
 
 
 def test_a_process_that_dies_or_hangs_is_one_sentence_and_nothing_is_left(monkeypatch):
-    monkeypatch.setattr("firmware.process.LONGEST_ANSWER_S", 2.0)
+    monkeypatch.setattr("firmware.process.MAX_ANSWER_S", 2.0)
     arguments = unpack_action(np.zeros(4)), 0.01, MODEL
     blows = {signal.SIGKILL: "has ended by itself", signal.SIGSTOP: "did not answer within 2 s"}
     for blow, said in blows.items():

@@ -202,7 +202,7 @@ def test_fine_motion_obeys_the_differential_equations(monkeypatch):
 
     found = errors()
     assert all(found[name] < bound for name, bound in FINE_ERRORS.items()), found
-    monkeypatch.setattr(drone, "LONGEST_PART_S", 0.5 * drone.LONGEST_PART_S)
+    monkeypatch.setattr(drone, "MAX_SUBSTEP_S", 0.5 * drone.MAX_SUBSTEP_S)
     halved = errors()
     assert all(found[name] > 3.0 * halved[name] for name in exact), (found, halved)
 

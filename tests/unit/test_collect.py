@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.plants import Simulator
 from flytrack_sysid import CollectError, collect, sensors
-from flytrack_sysid.excitation import HEIGHTS, KINDS, LARGEST_SPEED
+from flytrack_sysid.excitation import HEIGHTS, KINDS, MAX_SPEED
 from flytrack_sysid.split import blocks_of, held_out_rows
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 
@@ -36,7 +36,7 @@ def test_log_is_what_the_plant_did(plant):
 def test_envelope_cuts_a_plant_of_huge_thrust():
     strong = replace(HandoutPlant(), coeffs=(-24.0, -16.0, 14.0, 1.6, 3.2, 3.6))
     log = collect(strong, minutes=1.0)
-    assert np.linalg.norm(log["v"], axis=1).max() <= LARGEST_SPEED
+    assert np.linalg.norm(log["v"], axis=1).max() <= MAX_SPEED
     assert HEIGHTS[0] <= log["p"][:, 2].min() and log["p"][:, 2].max() <= HEIGHTS[1]
     assert log["v_bat"].min() >= 22.0
     lengths = np.unique(log.segment, return_counts=True)[1]

@@ -19,7 +19,7 @@ jax.monitoring.register_event_listener(listen)
 jax.jit(lambda x: jax.numpy.sin(x) + 1.0).lower(0.5).compile()
 print(len(hits))
 """
-MIN_COMPILE_TIME = compile_cache.LEAST_S.upper()
+MIN_COMPILE_TIME = compile_cache.MIN_S.upper()
 
 
 @pytest.fixture

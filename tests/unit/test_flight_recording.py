@@ -137,7 +137,7 @@ def test_position_is_integrated_where_it_was_not_measured(made):
 
 
 def test_of_a_long_log_rows_are_left_out_but_no_start(monkeypatch, made):
-    monkeypatch.setattr(trajectories, "MOST_ROWS", 150)
+    monkeypatch.setattr(trajectories, "MAX_ROWS", 150)
     (shown,) = trajectories.trajectories_of(made, {})
     kept = [*range(0, 300, 4), *range(300, 600, 4)]
     np.testing.assert_array_equal(shown.positions, made["p"][kept])

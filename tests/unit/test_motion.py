@@ -58,7 +58,7 @@ def reference(model):
     arrays = (tuple(map(float, values)) for values in (TAU, COEFFS, FULL_RATES))
     truth = Truth(*arrays, DRAIN, MASS, GRAVITY, laws, motion="fine", step_s=COMMAND_S)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(drone, "LONGEST_PART_S", 5e-5)
+        patched.setattr(drone, "MAX_SUBSTEP_S", 5e-5)
         flight = flown_in_floats(truth, held_commands(), LOW_START)
     return tuple(flight[name] for name in "pvqf")
 

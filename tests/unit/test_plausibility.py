@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flytrack_sysid.log import CHANNELS, LogError
-from flytrack_sysid.plausibility import FEWEST_ROWS, GRAVITY, check_plausible, find_problems
+from flytrack_sysid.plausibility import GRAVITY, MIN_ROWS, check_plausible, find_problems
 from flytrack_sysid.sensors import measure, specific_force_b
 from tests.support.handout_plant import HandoutPlant, excited
 from tests.support.made_flight import noisy
@@ -73,7 +73,7 @@ def test_too_little_is_no_log(logs, name):
     short = logs[name].select(logs[name].time < 0.06)
     for log, found in (
         (short, r"found \d+ rows and \d\.\d+ s, "),
-        (logs[name].select(slice(0, FEWEST_ROWS - 1)), "found 99 rows"),
+        (logs[name].select(slice(0, MIN_ROWS - 1)), "found 99 rows"),
     ):
         (problem,) = find_problems(log)
         assert re.search(f": t: {found}", problem)

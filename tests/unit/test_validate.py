@@ -14,10 +14,10 @@ from flytrack_env.state import STATE_SIZE, unpack
 from flytrack_sysid.log import log_of_states
 from flytrack_sysid.prediction import columns, predict
 from flytrack_sysid.prediction_errors import QUANTITIES
-from flytrack_sysid.record import LARGEST_DOUBT, fill_gaps
+from flytrack_sysid.record import MAX_DOUBT, fill_gaps
 from flytrack_sysid.sensors import specific_force_b
 from flytrack_sysid.split import held_out_rows
-from flytrack_sysid.steps import MOST_PER_AXIS
+from flytrack_sysid.steps import MAX_PER_AXIS
 from flytrack_sysid.validate import validate
 from flytrack_sysid.validation_report import text_of
 from tests.support.simulated_flights import fly as simulated
@@ -87,7 +87,7 @@ def test_the_largest_steps_are_found(exact):
     for segment, axis in enumerate(("roll", "pitch", "yaw")):
         steps = [step for step in exact.steps if step.axis == axis]
         first = steps[0]
-        assert len(steps) == MOST_PER_AXIS and first.segment == segment
+        assert len(steps) == MAX_PER_AXIS and first.segment == segment
         assert (first.command_before, first.command_after) == (0.4, -0.4)
         assert first.time_s == pytest.approx(1.0)
         assert first.since_step[[0, -1]] == pytest.approx([-0.09, 0.4])
@@ -146,11 +146,9 @@ def test_applied_action_is_recovered_from_commands(log):
     prediction = predict(TRUTH, fill_gaps(bare))
     applied = columns(prediction.before.applied)
     is_settled = prediction.is_settled
-    np.testing.assert_allclose(
-        applied[is_settled], log["uprev"][is_settled], atol=2 * LARGEST_DOUBT
-    )
+    np.testing.assert_allclose(applied[is_settled], log["uprev"][is_settled], atol=2 * MAX_DOUBT)
     # exp(-t / slowest lag) of what the applied action may have been is left.
-    longest = np.log(1 / LARGEST_DOUBT) * np.max(TRUTH.tau)
+    longest = np.log(1 / MAX_DOUBT) * np.max(TRUTH.tau)
     assert np.sum(~is_settled) == 5 * np.ceil(longest / DT)
     validation = validate(TRUTH, bare)
     assert validation.one_step.num_steps == np.sum(is_settled) - 5
