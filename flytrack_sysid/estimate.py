@@ -29,7 +29,7 @@ from threadpoolctl import threadpool_limits
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid import parameters
-from flytrack_sysid.diagnosis.lanes import AXES, DIRECT, Lanes, lead_in_of, make_lanes
+from flytrack_sysid.diagnosis.chunks import AXES, DIRECT, Chunks, lead_in_of, make_chunks
 from flytrack_sysid.diagnosis.problem import Problem, robust_weight
 from flytrack_sysid.diagnosis.score_test import Linearization, solve
 from flytrack_sysid.diagnosis.search import refine
@@ -67,7 +67,7 @@ class Estimate(NamedTuple):
 
 
 def _in_line(values: np.ndarray) -> np.ndarray:
-    """Return (rows, lanes, ...) without lead-ins as (all rows, ...), in the order of time."""
+    """Return (rows, chunks, ...) without lead-ins as (all rows, ...), in the order of time."""
     own = np.swapaxes(values[lead_in_of(len(values)) :], 0, 1)
     return own.reshape(-1, *own.shape[2:])
 
@@ -116,19 +116,19 @@ class Channels(Problem):
     has_position: bool = False
 
     @classmethod
-    def of_log(cls, log: FlightLog, judged: np.ndarray, model: ModelParameters) -> "Channels":
+    def of_log(cls, log: FlightLog, scored_rows: np.ndarray, model: ModelParameters) -> "Channels":
         """Return the judged rows of a log, (num_rows,) bool, for a model and its effects."""
         tau, has_position = (
             np.asarray(model.tau, float),
             "p" in log and "q" in log and "v" not in log,
         )
-        lanes = make_lanes(log, np.ones(len(log), bool), tau, float(model.g))
-        certain = is_applied_certain(make_record(log), tau)[lanes.row]
-        lanes = lanes._replace(counts=_counts(lanes, judged, certain, has_position))
-        return replace(cls.of(lanes, model, ()), levels=_levels(lanes), has_position=has_position)
+        chunks = make_chunks(log, np.ones(len(log), bool), tau, float(model.g))
+        certain = is_applied_certain(make_record(log), tau)[chunks.row]
+        chunks = chunks._replace(counts=_counts(chunks, scored_rows, certain, has_position))
+        return replace(cls.of(chunks, model, ()), levels=_levels(chunks), has_position=has_position)
 
     def residuals(self, vectors: np.ndarray) -> np.ndarray:
-        """Return residuals, (num_models, rows, lanes, NUM_AXES, 2); 0 where nothing counts."""
+        """Return residuals, (num_models, rows, chunks, NUM_AXES, 2); 0 where nothing counts."""
         found = super().residuals(vectors)
         for left in found:
             in_line = self._of_channels(_in_line(left))
@@ -140,7 +140,7 @@ class Channels(Problem):
     def _of_channels(self, left: np.ndarray) -> np.ndarray:
         """Return the channels' residuals from those of single steps, (all rows, NUM_AXES, 2)."""
         before = Rotation.from_quat(
-            _in_line(np.roll(self.lanes.record.quat, 1, axis=0)), scalar_first=True
+            _in_line(np.roll(self.chunks.record.quat, 1, axis=0)), scalar_first=True
         )
         found, turn = left.copy(), left[:, TURNS, 1]
         for axes in (TURNS, FORCES):
@@ -157,7 +157,7 @@ class Channels(Problem):
 
     def _of_positions(self, left: np.ndarray) -> np.ndarray:
         """Return residuals of positions from those of changes of velocity, (all rows, 3) m/s."""
-        record = self.lanes.record
+        record = self.chunks.record
         step_s = _in_line(np.roll(record.step_s, 1, axis=0))[:, None]  # of the step to the row
         change = _in_line(np.diff(record.vel_w, axis=0, prepend=record.vel_w[:1])) - left
         moved = (np.cumsum(change, axis=0) - 0.5 * change) * step_s
@@ -197,39 +197,39 @@ class Channels(Problem):
 
 
 def _counts(
-    lanes: Lanes, judged: np.ndarray, certain: np.ndarray, has_position: bool
+    chunks: Chunks, scored_rows: np.ndarray, certain: np.ndarray, has_position: bool
 ) -> np.ndarray:
     """Return what counts of judged rows.
 
-    certain: where applied actions are known, (rows, lanes, 4).
+    certain: where applied actions are known, (rows, chunks, 4).
     """
-    source = lanes.record.source_row
-    is_judged = judged[source] & (source >= 0) & (lanes.row >= 0)
-    is_judged[: lead_in_of(len(is_judged))] = False
-    behind = judged[
+    source = chunks.record.source_row
+    is_scored = scored_rows[source] & (source >= 0) & (chunks.row >= 0)
+    is_scored[: lead_in_of(len(is_scored))] = False
+    behind = scored_rows[
         np.maximum.accumulate(source, axis=0)
     ]  # of a filled row, the one before the gap
-    counts = lanes.counts & is_judged[..., None, None]
+    counts = chunks.counts & is_scored[..., None, None]
     counts[1:, :, FORCES, 0] &= behind[
         :-1, :, None
     ]  # a force is that of a step from measured values
-    if "w" in lanes.measured:
-        counts[..., TURNS, 0] = certain[..., :3] & (is_judged & lanes.is_joined)[..., None]
+    if "w" in chunks.measured:
+        counts[..., TURNS, 0] = certain[..., :3] & (is_scored & chunks.is_joined)[..., None]
     if has_position:
-        counts[..., FORCES, 1] = certain[..., 3:] & is_judged[..., None]
+        counts[..., FORCES, 1] = certain[..., 3:] & is_scored[..., None]
     return counts
 
 
-def _levels(lanes: Lanes) -> tuple[Windows, ...]:
+def _levels(chunks: Chunks) -> tuple[Windows, ...]:
     """Return the windows of levels.
 
     Those of voltage are flights; others are pieces, cut where doubt of commands ends.
     """
-    joined, counts = _in_line(lanes.is_joined), _in_line(lanes.counts[..., 1]).astype(float)
-    is_cut = np.diff(_in_line(lanes.record.piece), prepend=-1) != 0
+    joined, counts = _in_line(chunks.is_joined), _in_line(chunks.counts[..., 1]).astype(float)
+    is_cut = np.diff(_in_line(chunks.record.piece), prepend=-1) != 0
     found = []
     for axes in AXES:
-        known = _in_line(lanes.is_known[..., axes.start]) | ~joined
+        known = _in_line(chunks.is_known[..., axes.start]) | ~joined
         is_back = known & ~np.append(True, known[:-1])
         is_new = ~joined if axes is BATTERY else ~joined | is_cut | is_back
         found.append(Windows(np.flatnonzero(is_new), counts[:, axes]))
@@ -248,7 +248,7 @@ def _covariance(found: Linearization) -> np.ndarray:
     used = problem.counts.any(axis=(2, 3))
     columns = problem.whiten(found.slopes.columns)
     pulls = np.einsum("prlak,rlak->rlp", columns, white, optimize=True)[used]
-    pieces, piece = np.unique(problem.lanes.record.piece[used], return_inverse=True)
+    pieces, piece = np.unique(problem.chunks.record.piece[used], return_inverse=True)
     by_piece = np.zeros((len(pieces), len(bread)))
     np.add.at(by_piece, piece, pulls)
     robust = bread @ (by_piece.T @ by_piece) @ bread * (len(pieces) / max(len(pieces) - 1, 1))
@@ -293,7 +293,7 @@ def _polished(problem: Problem, vector: np.ndarray, places: list[int], steps: in
 
 def estimate(
     log: FlightLog,
-    judged: np.ndarray,
+    scored_rows: np.ndarray,
     start: ModelParameters,
     free: tuple[str, ...],
     report: Callable[[int, int], None] = lambda done, rounds: None,
@@ -309,7 +309,7 @@ def estimate(
         model: Any = jax.tree.map(lambda leaf: np.asarray(leaf, float), start)
         noise = FIRST_NOISE
         for number, steps in enumerate(LAST_STEPS):
-            problem = replace(Channels.of_log(log, judged, model), noise=noise)
+            problem = replace(Channels.of_log(log, scored_rows, model), noise=noise)
             vector = problem.clipped(problem.start)
             seen = problem.index([name for name in free if name in problem.names])
             near = Linearization(problem, problem.slopes(vector, seen))

@@ -256,10 +256,10 @@ def what_is_fitted(
     free = _free_names(model, log, fixed)
     model = with_values(model, fixed)
     model = model._replace(motion=required_motion(log, motion) or model.motion)
-    judged = ~held_out_rows(log, every)
-    _check_data(log, judged, free)
+    scored_rows = ~held_out_rows(log, every)
+    _check_data(log, scored_rows, free)
     _check_response(log, model)
-    return model, free, judged
+    return model, free, scored_rows
 
 
 def fit(
@@ -285,16 +285,16 @@ def fit(
     Raises:
         LogError, FitError: an implausible log; missing channels or motion, or a fit that diverged.
     """
-    model, free, judged = what_is_fitted(log, start, fixed, effects, every, motion)
+    model, free, scored_rows = what_is_fitted(log, start, fixed, effects, every, motion)
     notes = motion_notes(log, start, motion, f"replayed as {model.motion.value}")
     given = model.battery
     notes += voltage_notes(log, given)
     log = with_voltage(log, model)
     try:
-        result = estimate(log, judged, model, free, report)
+        result = estimate(log, scored_rows, model, free, report)
     except FitError as error:
         raise FitError(f"{log.source}: {error}") from error
-    _check_result(result, log, judged)
+    _check_result(result, log, scored_rows)
     intervals = _intervals(result)
     uncertainty = _map_uncertainty(result, log)
     battery = given
@@ -314,7 +314,7 @@ def fit(
     )
 
 
-def _check_data(log: FlightLog, judged: np.ndarray, free: tuple[str, ...]) -> None:
+def _check_data(log: FlightLog, scored_rows: np.ndarray, free: tuple[str, ...]) -> None:
     """Raise FitError where the log lacks channels or motion to estimate the free parameters."""
     if not free:
         raise FitError("fixed: found every parameter, expected one to estimate at least")
@@ -330,7 +330,7 @@ def _check_data(log: FlightLog, judged: np.ndarray, free: tuple[str, ...]) -> No
             f"{', '.join(log.channels)}"
         )
     for axis, (column, tau) in enumerate(zip(CHANNELS["u"], TAUS, strict=True)):
-        stick = log["u"][judged, axis]
+        stick = log["u"][scored_rows, axis]
         if tau in free and np.ptp(stick) < NEVER_MOVED:
             raise FitError(
                 f"{log.source}: {column}: stuck at {stick[0]:.4g}; {tau} cannot be identified: "
@@ -367,7 +367,7 @@ def _likely_cause(log: FlightLog, tau: str) -> str:
     return f"{ground}, is {frames} in another frame, or does {column} not drive it?"
 
 
-def _check_result(result: Estimate, log: FlightLog, judged: np.ndarray) -> None:
+def _check_result(result: Estimate, log: FlightLog, scored_rows: np.ndarray) -> None:
     """Raise FitError where the best model is no model of a drone."""
     values = dict(zip(names_of(result.model), to_vector(result.model), strict=True))
     for name in TAUS:
@@ -392,7 +392,7 @@ def _check_result(result: Estimate, log: FlightLog, judged: np.ndarray) -> None:
         for axis, column in enumerate(CHANNELS["w"]):
             left, measured = (
                 result.noise["w"][axis],
-                np.sqrt(np.mean(np.square(log["w"][judged, axis]))),
+                np.sqrt(np.mean(np.square(log["w"][scored_rows, axis]))),
             )
             if TAUS[axis] in result.free and left > AT_BOUND * measured:
                 raise FitError(

@@ -15,7 +15,7 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.state import BATTERY, BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_sysid import excitation
 
-# All manoeuvres have the same length to be comparable. Even: two flights fill a lane of a
+# All manoeuvres have the same length to be comparable. Even: two flights fill a chunk of a
 # diagnosis.
 FLIGHTS_PER_MANOEUVRE = 8
 SECONDS_PER_MANOEUVRE = FLIGHTS_PER_MANOEUVRE * excitation.FLIGHT_STEPS * excitation.DT_S

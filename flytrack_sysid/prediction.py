@@ -65,7 +65,7 @@ def runs_of(rows: np.ndarray, record: Record) -> list[tuple[int, int]]:
     return list(zip(starts.tolist(), ends.tolist(), strict=True))
 
 
-def judged_steps(rows: np.ndarray, prediction: Prediction) -> np.ndarray:
+def scored_steps(rows: np.ndarray, prediction: Prediction) -> np.ndarray:
     """Return the rows whose step to the next is judged, ascending; rows: (num_rows,) bool."""
     exists = rows & prediction.is_measured
     is_followed = np.append(exists[1:] & ~prediction.record.begins[1:], False)[: len(rows)]

@@ -13,8 +13,8 @@ from flytrack_sysid.prediction import (
     Prediction,
     columns,
     free_flights,
-    judged_steps,
     runs_of,
+    scored_steps,
 )
 from flytrack_sysid.sensors import specific_force_b
 
@@ -133,7 +133,7 @@ def one_step_errors(prediction: Prediction, rows: np.ndarray) -> OneStep:
     force = next((name for name in ("a", "f") if name in log and not lacking[name]), None)
     names = [name for name in ("p", "v", "q", "w") if name in log and not lacking[name]]
     names += [force] if force else []
-    here = judged_steps(rows, prediction)
+    here = scored_steps(rows, prediction)
     if not len(here):
         return OneStep(0, {})
     channels = {
@@ -263,7 +263,7 @@ def thrust_error(prediction: Prediction, rows: np.ndarray) -> ThrustError | None
 
     rows: (num_rows,) bool, those judged. Samples beyond an end are in its bin.
     """
-    log, model, here = prediction.log, prediction.model, judged_steps(rows, prediction)
+    log, model, here = prediction.log, prediction.model, scored_steps(rows, prediction)
     source = next(
         (name for name in ("f", "a") if name in log and not prediction.lacking[name]), None
     )

@@ -27,7 +27,7 @@ CHANNEL_OF = {"attitude": "q", "rates": "w", "velocity": "v", "position": "p"}
 QUANTITIES = tuple(CHANNEL_OF)
 UNITS = {"attitude": "rad", "rates": "rad/s", "velocity": "m/s", "position": "m"}
 # Windows come in multiples of so many: logs of one rate share one compiled program.
-CHUNK = 128
+WINDOWS_PER_BATCH = 128
 BLOCK_S = 2.0
 
 
@@ -63,11 +63,11 @@ class Windows(NamedTuple):
         return sums
 
 
-def chunks_of(windows: Windows) -> list[Windows]:
+def batches_of(windows: Windows) -> list[Windows]:
     """Return the windows in parts of CHUNK, the last filled up with the first one."""
     number = len(windows.start)
-    index = np.resize(np.arange(number), (-(-number // CHUNK), CHUNK))
-    index[-1, number - CHUNK * (len(index) - 1) :] = 0
+    index = np.resize(np.arange(number), (-(-number // WINDOWS_PER_BATCH), WINDOWS_PER_BATCH))
+    index[-1, number - WINDOWS_PER_BATCH * (len(index) - 1) :] = 0
     return [
         windows._replace(
             record=Record(*(leaf[:, part] for leaf in windows.record)),
@@ -80,7 +80,7 @@ def chunks_of(windows: Windows) -> list[Windows]:
     ]
 
 
-def make_windows(log: FlightLog, judged: np.ndarray, every_s: float, most: int) -> Windows:
+def make_windows(log: FlightLog, scored_rows: np.ndarray, every_s: float, most: int) -> Windows:
     """Return at most ``most`` windows over judged rows, (num_rows,) bool, one every ``every_s``.
 
     A window counts at the horizons that it reaches within rows that are judged and measured.
@@ -88,18 +88,22 @@ def make_windows(log: FlightLog, judged: np.ndarray, every_s: float, most: int) 
     filled = fill_gaps(log)
     step_s = float(np.median(usual_step(filled.log)))
     lead, ends = round(SETTLING_S / step_s), np.round(np.array(HORIZONS_S) / step_s).astype(int)
-    is_judged = judged[filled.behind] & (filled.source_row >= 0)
+    is_scored = scored_rows[filled.behind] & (filled.source_row >= 0)
     begins = filled.log.is_start()
     segment = np.cumsum(begins)
-    run = np.cumsum(begins | np.append(True, np.diff(judged[filled.behind].astype(int)) != 0))
+    run = np.cumsum(begins | np.append(True, np.diff(scored_rows[filled.behind].astype(int)) != 0))
     first = np.flatnonzero(begins)[segment - 1]
     rows = np.arange(len(segment))
-    can_start = is_judged & (rows - first >= lead)
+    can_start = is_scored & (rows - first >= lead)
     starts = rows[can_start & ((rows - first - lead) % max(round(every_s / step_s), 1) == 0)]
     last = np.minimum(starts + ends[:, None], len(rows) - 1)
-    reached = (starts + ends[:, None] < len(rows)) & (run[last] == run[starts]) & is_judged[last]
+    reached = (starts + ends[:, None] < len(rows)) & (run[last] == run[starts]) & is_scored[last]
     starts, reached = starts[reached.any(axis=0)], reached[:, reached.any(axis=0)]
-    most = len(starts) // CHUNK * CHUNK if CHUNK < len(starts) < most else most
+    most = (
+        len(starts) // WINDOWS_PER_BATCH * WINDOWS_PER_BATCH
+        if WINDOWS_PER_BATCH < len(starts) < most
+        else most
+    )
     if len(starts) > most:
         kept = np.linspace(0, len(starts) - 1, most).round().astype(int)
         starts, reached = starts[kept], reached[:, kept]

@@ -123,8 +123,8 @@ def force_w(residuals: Traces, model: str, time_s: np.ndarray) -> np.ndarray:
     )
     parts = np.column_stack([*columns, np.ones(len(time_s))])
     # By duration, so that the noise of velocities cancels between the ends of a window.
-    is_judged = counts[0] & np.isfinite(parts).all(axis=1)
-    weight = np.where(is_judged, np.diff(time_s, prepend=time_s[:1]), 0.0)[:, None]
+    is_scored = counts[0] & np.isfinite(parts).all(axis=1)
+    weight = np.where(is_scored, np.diff(time_s, prepend=time_s[:1]), 0.0)[:, None]
     summed = np.cumsum(np.where(weight > 0.0, parts * weight, 0.0), axis=0)
     summed = np.concatenate([np.zeros((1, 4)), summed])
     begin = np.searchsorted(time_s, time_s - 0.5 * WINDOW_S)

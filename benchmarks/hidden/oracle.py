@@ -17,14 +17,14 @@ from benchmarks.hidden.noise import DIGIT, STD
 from flytrack_bench.hidden import Truth
 from flytrack_bench.hidden.drone import SECONDS_PER_MINUTE
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.diagnosis.lanes import NUM_AXES, lanes_of
+from flytrack_sysid.diagnosis.chunks import NUM_AXES, cut_chunks
 from flytrack_sysid.diagnosis.model_selection import MAX_RIVALS, ablate_all
 from flytrack_sysid.diagnosis.noise import fit_noise
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import CANDIDATES
 from flytrack_sysid.diagnosis.search import (
     FittedModel,
-    Held,
+    HeldParameter,
     SearchState,
     add_effect,
     score_candidates,
@@ -65,11 +65,11 @@ def clean_problem(
     Of the voltage that is rounding, which lasts while the battery drains by a digit: it is fitted.
     """
     kept = clean.select(np.isin(np.round(clean.time, 6), np.round(log.time, 6)))
-    problem = Problem.of(lanes_of(kept, is_scored, model), model)
-    measured = Problem.of(lanes_of(log, is_scored, model), model)
+    problem = Problem.of(cut_chunks(kept, is_scored, model), model)
+    measured = Problem.of(cut_chunks(log, is_scored, model), model)
     errors = measured.residuals(problem.start[None])[0] - problem.residuals(problem.start[None])[0]
     noise = true_noise(float(np.median(np.diff(clean.time))))
-    noise[:, -1] = fit_noise(measured.lanes, errors, noise)[:, -1]
+    noise[:, -1] = fit_noise(measured.chunks, errors, noise)[:, -1]
     return problem.with_noise(noise)
 
 
@@ -109,7 +109,7 @@ def _scale_known(state: SearchState, model: FittedModel) -> Known:
     curve = state.problem.index(THRUST_COEFFS)
     vector = model.vector.copy()
     vector[curve] = state.problem.start[curve]
-    state = replace(state, held=tuple(Held(field, "") for field in THRUST_COEFFS))
+    state = replace(state, held=tuple(HeldParameter(field, "") for field in THRUST_COEFFS))
     nominal = state.fitted(model.candidates, vector)
     state, linearization = state.linearized(nominal.vector)
     scores = [
@@ -153,11 +153,11 @@ def removed(
     that, 1 is the noise.
     """
     with jax.enable_x64(True):
-        lanes = lanes_of(clean, np.ones(len(clean), bool), base)
-        vectors = [Problem.of(lanes, model).start for model in (base, extended)]
-        residuals = Problem.of(lanes, extended).residuals(np.stack(vectors))
+        chunks = cut_chunks(clean, np.ones(len(clean), bool), base)
+        vectors = [Problem.of(chunks, model).start for model in (base, extended)]
+        residuals = Problem.of(chunks, extended).residuals(np.stack(vectors))
     whitened = residuals[..., :6, 0] / np.repeat([STD["w"], STD["f"]], 3)
-    is_counted = lanes.counts[..., :6, 0]
+    is_counted = chunks.counts[..., :6, 0]
     base_power, power = (float(np.mean(np.square(values[is_counted]))) for values in whitened)
     return 1.0 - power / max(base_power, 1e-300), float(np.sqrt(base_power))
 

@@ -25,7 +25,7 @@ import optax
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.diagnosis.refinement import Tested
+from flytrack_sysid.diagnosis.refinement import FlightErrors
 from flytrack_sysid.log import FlightLog, usual_step
 from flytrack_sysid.prediction import columns, predict
 from flytrack_sysid.prediction_windows import HORIZONS_S, Windows
@@ -194,7 +194,7 @@ def fit_linear_boxes(rows: Rows) -> Mapping[str, BlackBox]:
     return {"fir": fit_linear(rows, _fir), "arx": fit_linear(rows, _arx)}
 
 
-def fly_windows(black_box: BlackBox, windows: Windows, base: np.ndarray) -> Tested:
+def fly_windows(black_box: BlackBox, windows: Windows, base: np.ndarray) -> FlightErrors:
     """Return a black box's errors on windows of a log.
 
     base: ``base_steps`` of all rows of the log.
@@ -234,4 +234,4 @@ def fly_windows(black_box: BlackBox, windows: Windows, base: np.ndarray) -> Test
             )
     assert len(errors) == len(HORIZONS_S)
     by_window = np.stack(errors).swapaxes(1, 2)
-    return Tested(np.where(windows.counts[..., None], by_window, 0.0)[None], windows)
+    return FlightErrors(np.where(windows.counts[..., None], by_window, 0.0)[None], windows)

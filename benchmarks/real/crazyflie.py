@@ -33,8 +33,8 @@ from benchmarks.report import ROOT, table
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid import FlightLog, import_log
 from flytrack_sysid.diagnosis import joined, refinement
+from flytrack_sysid.diagnosis.chunks import cut_chunks, thinned
 from flytrack_sysid.diagnosis.diagnose import split
-from flytrack_sysid.diagnosis.lanes import lanes_of, thinned
 from flytrack_sysid.diagnosis.noise import fit_noise
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import CANDIDATES
@@ -98,7 +98,7 @@ def fit_models(log: FlightLog, nominal: ModelParameters) -> tuple[np.ndarray, re
         for field, value in candidate.probes:
             vector[problem.names.index(field)] = value
     model = state.fitted(candidates, vector)
-    state = state.with_noise(fit_noise(problem.lanes, problem.residuals(model.vector[None])[0]))
+    state = state.with_noise(fit_noise(problem.chunks, problem.residuals(model.vector[None])[0]))
     base, model = state.fitted((), base.vector), state.fitted(candidates, model.vector)
     refined = refinement.refine(state, base, model, log, parts.held_out, is_explained=False)
     return base.vector, refined
@@ -120,7 +120,7 @@ def measure_fold(folder: Path, policy: str, seconds: float) -> dict[str, Any]:
         vectors["refitted_to_flights"] = refined.base
     errors = refinement.errors_at(problem, np.stack(list(vectors.values())), windows).errors
     results = {
-        name: refinement.Tested(error[None], windows)
+        name: refinement.FlightErrors(error[None], windows)
         for name, error in zip(vectors, errors, strict=True)
     }
     plain = from_vector(base, problem.like)._replace(effects=())
@@ -128,7 +128,7 @@ def measure_fold(folder: Path, policy: str, seconds: float) -> dict[str, Any]:
     boxes = {**fit_linear_boxes(rows), "network": fit_network(rows)}
     results |= {name: fly_windows(black_box, windows, steps) for name, black_box in boxes.items()}
     seen = make_windows(training, np.ones(len(training), bool), SPACING_S, MAX_WINDOWS)
-    results["placebo"] = refinement.Tested(refinement.placebo_errors(seen, windows), windows)
+    results["placebo"] = refinement.FlightErrors(refinement.placebo_errors(seen, windows), windows)
     return {
         "policy": policy,
         "rows": len(training),
@@ -151,7 +151,7 @@ def read_values(problem: Problem, fit: Any) -> dict[str, list[float]]:
 
 
 def error_ratios(
-    base: refinement.Tested, extended: refinement.Tested, segment: np.ndarray
+    base: refinement.FlightErrors, extended: refinement.FlightErrors, segment: np.ndarray
 ) -> dict[str, list[list[float]]]:
     """Return the extended model's errors over the base's, (horizons, quantities), by flight.
 
@@ -162,7 +162,7 @@ def error_ratios(
         part = segment == number
         windows = extended.windows._replace(counts=extended.windows.counts[:, part])
         base_rms, rms = (
-            refinement.Tested(model.errors[:, :, part], windows).rms()[0]
+            refinement.FlightErrors(model.errors[:, :, part], windows).rms()[0]
             for model in (base, extended)
         )
         ratios[str(number)] = np.nan_to_num(rms / base_rms, nan=0.0).round(4).tolist()
@@ -181,7 +181,7 @@ def fit_policies(
             continue
         windows = refinement.windows_of(log, is_used)
         assert windows is not None
-        problem = Problem.of(thinned(lanes_of(log, is_used, model)), model)
+        problem = Problem.of(thinned(cut_chunks(log, is_used, model)), model)
         vector = problem.start.copy()
         vector[problem.index(list(start))] = list(start.values())
         scale = refinement.errors_at(problem, vector[None], windows).rms()[0]

@@ -21,9 +21,9 @@ from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
 from flytrack_sysid import FlightLog, Imported, diagnose, import_log
 from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.evidence import words_of
-from flytrack_sysid.diagnosis.refinement import Tested
+from flytrack_sysid.diagnosis.refinement import FlightErrors
 from flytrack_sysid.diagnosis.report import verdict_of
-from flytrack_sysid.prediction_windows import QUANTITIES, Windows, chunks_of, prediction_errors
+from flytrack_sysid.prediction_windows import QUANTITIES, Windows, batches_of, prediction_errors
 
 Record = dict[str, Any]
 STYLES: dict[str, dict[str, Any]] = {
@@ -67,12 +67,12 @@ def import_mapped(files: Path | Sequence[Path], kind: str, mapping: str) -> Impo
 _errors = jax.jit(prediction_errors)
 
 
-def test_model(model: ModelParameters, windows: Windows) -> Tested:
+def test_model(model: ModelParameters, windows: Windows) -> FlightErrors:
     """Return a model's errors on windows; inside ``jax.enable_x64(True)``."""
     model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
-    parts = [np.asarray(_errors(model, chunk)) for chunk in chunks_of(windows)]
+    parts = [np.asarray(_errors(model, chunk)) for chunk in batches_of(windows)]
     errors = np.concatenate(parts, axis=1)[:, : len(windows.start)]
-    return Tested(errors.reshape(1, *errors.shape[:-1], len(QUANTITIES), 3), windows)
+    return FlightErrors(errors.reshape(1, *errors.shape[:-1], len(QUANTITIES), 3), windows)
 
 
 def format_number(value: float | None, unit: str = "1") -> str:

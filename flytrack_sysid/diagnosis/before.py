@@ -85,7 +85,7 @@ class Estimate(NamedTuple):
         base = state.fitted((), problem.start)
         state, linearization = state.linearized(base.vector)
         state = state.with_noise(
-            noises.fit_noise(problem.lanes, search.saturated_residuals(linearization))
+            noises.fit_noise(problem.chunks, search.saturated_residuals(linearization))
         )
         base = state.fitted((), base.vector)
         state, linearization = state.linearized(base.vector)
@@ -138,7 +138,7 @@ def diagnose_change(
         parts = calm(split(after, model, held_out, motion))
         model = nominal_parameters() if model is None else model
         later = Estimate.of(parts)
-        earlier = Estimate.of(calm(split(before, model, None, parts.moves.motion)))
+        earlier = Estimate.of(calm(split(before, model, None, parts.motion_estimate.motion)))
         alike: dict[str, tuple[str, ...]] = {}
         report(1, 3)
         while len(later.model.candidates) < MAX_EFFECTS:
@@ -186,7 +186,7 @@ def calm(parts: Split) -> Split:
 
 
 def _calm(problem: Problem) -> Problem:
-    record, counts = problem.lanes.record, problem.lanes.counts
+    record, counts = problem.chunks.record, problem.chunks.counts
     step_s = float(np.median(record.step_s))
     keep = np.exp(-step_s / JUMP_S)
     sticks = record.command[..., :3]
@@ -196,7 +196,7 @@ def _calm(problem: Problem) -> Problem:
     follows = signal.lfilter(np.ones(rows), [1.0], is_jump.astype(float), axis=0) > 0.5
     quiet = counts & ~follows[..., None, None]
     quiet[..., -1, :] = counts[..., -1, :]  # a battery does not mind
-    return replace(problem, lanes=problem.lanes._replace(counts=quiet))
+    return replace(problem, chunks=problem.chunks._replace(counts=quiet))
 
 
 class Refit(NamedTuple):

@@ -15,18 +15,23 @@ from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis import summary
 from flytrack_sysid.diagnosis.beyond import Learned, with_and_without, with_learned
-from flytrack_sysid.diagnosis.first_look import FirstLook
-from flytrack_sysid.diagnosis.lanes import (
-    Lanes,
+from flytrack_sysid.diagnosis.chunks import (
+    Chunks,
     at_usual_rate,
-    lanes_of,
+    cut_chunks,
     thinned,
     voltages_of,
 )
+from flytrack_sysid.diagnosis.first_look import FirstLook
 from flytrack_sysid.diagnosis.late_poses import with_late_poses
 from flytrack_sysid.diagnosis.lateness import read_poses
 from flytrack_sysid.diagnosis.learned import find_learned
-from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves, likelier_motion, problem_of
+from flytrack_sysid.diagnosis.motion_choice import (
+    MotionEstimate,
+    build_problem,
+    estimate_motion,
+    likelier_motion,
+)
 from flytrack_sysid.diagnosis.onset import (
     at_end,
     first_row_as_at_end,
@@ -70,17 +75,18 @@ class DiagnosisError(ValueError):
 class Split(NamedTuple):
     """A log, its held-out rows, (num_rows,) bool, and the problems to learn from and to judge by.
 
-    log: with all clocks together. logged: as it was, maybe more rows. as_logged: the lanes of both
-    problems with poses as logged; empty where these were in time. moves: how late they were.
+    log: with all clocks together. logged: as it was, maybe more rows. as_logged: the chunks of both
+    problems with poses as logged; empty where these were in time. motion_estimate: how late they
+    were.
     """
 
     logged: FlightLog
-    moves: Moves
+    motion_estimate: MotionEstimate
     log: FlightLog
     held_out: np.ndarray
     train: Problem
     test: Problem
-    as_logged: tuple[Lanes, ...]
+    as_logged: tuple[Chunks, ...]
     warnings: tuple[str, ...]
 
 
@@ -116,10 +122,14 @@ def diagnose(
         selection = select(*extended(state, base, base))
         # Drones, and who is late, are told by their clocks; two simulator's steps only by what they
         # leave. A measured log is continuous, and never gets here.
-        moves = parts.moves
-        if not (moves.is_sure or moves.late_s or moves.motion is Motion.CONTINUOUS):
+        motion_estimate = parts.motion_estimate
+        if not (
+            motion_estimate.is_sure
+            or motion_estimate.late_s
+            or motion_estimate.motion is Motion.CONTINUOUS
+        ):
             likelier = likelier_motion(selection.state.problem, selection.model.vector)
-            if likelier is not parts.moves.motion:
+            if likelier is not parts.motion_estimate.motion:
                 parts = split(log, model, held_out, likelier)
                 state, base = begun(parts)
                 selection = select(*extended(state, base, base))
@@ -127,13 +137,13 @@ def diagnose(
         selection, rejected = vetoed_in_time(selection, parts)
         test = held_out_under(selection, parts.test)
         report(3, len(STAGES))
-        judged = refined_within_range(selection, rejected, test, parts)
+        vetted = refined_within_range(selection, rejected, test, parts)
         report(4, len(STAGES))
-        found = summarize(judged, parts._replace(test=test))
+        found = summarize(vetted, parts._replace(test=test))
         nominal = nominal_parameters() if model is None else model
         found = replace(found, nominal=nominal._replace(motion=found.extended.motion))
         found = with_late_poses(
-            found, parts.moves, (selection.state.problem, test), parts.as_logged
+            found, parts.motion_estimate, (selection.state.problem, test), parts.as_logged
         )
         report(5, len(STAGES))
     return found
@@ -191,21 +201,23 @@ def split(
     for reduce in reductions:
         log, is_kept, notes = reduce(log)
         warnings, out = [*warnings, *notes], out[is_kept]
-    with_motion = how_it_moves(log, model, ~out, motion)
-    model = model._replace(motion=with_motion.motion)
-    corrected, is_known = read_poses(log, with_motion.late_s)
+    motion_estimate = estimate_motion(log, model, ~out, motion)
+    model = model._replace(motion=motion_estimate.motion)
+    corrected, is_known = read_poses(log, motion_estimate.late_s)
     corrected, out = corrected.select(is_known), out[is_known]
-    every, judged_by = (lanes_of(corrected, rows, model) for rows in (~out, out))
+    every, judged_by = (cut_chunks(corrected, rows, model) for rows in (~out, out))
     warnings += thinning_warning(every, thinned(every))
     same_rows = log.select(is_known)
     as_logged = tuple(
-        thinned(lanes_of(same_rows, rows, model)) for rows in (~out, out) if with_motion.late_s
+        thinned(cut_chunks(same_rows, rows, model))
+        for rows in (~out, out)
+        if motion_estimate.late_s
     )
     train, test = (
-        problem_of(thinned(lanes), corrected, log, model, with_motion.late_s)
-        for lanes in (every, judged_by)
+        build_problem(thinned(chunks), corrected, log, model, motion_estimate.late_s)
+        for chunks in (every, judged_by)
     )
-    return Split(logged, with_motion, corrected, out, train, test, as_logged, tuple(warnings))
+    return Split(logged, motion_estimate, corrected, out, train, test, as_logged, tuple(warnings))
 
 
 def held_out_under(selection: Selection, test: Problem) -> Problem:
@@ -214,7 +226,7 @@ def held_out_under(selection: Selection, test: Problem) -> Problem:
     return replace(test.with_noise(problem.noise), windows=problem.windows)
 
 
-class Judged(NamedTuple):
+class VettedModel(NamedTuple):
     """A selection after its vetoes and its refinement.
 
     Attributes:
@@ -251,7 +263,7 @@ def vetoed_in_time(selection: Selection, parts: Split) -> tuple[Selection, dict[
 
 def refined_within_range(
     selection: Selection, rejected: Mapping[str, Veto], test: Problem, parts: Split
-) -> Judged:
+) -> VettedModel:
     """Return a selection and its refinement, without effects that end where the search does.
 
     A law that fits best beyond anything known stands in for another one, and bends the values of
@@ -262,7 +274,7 @@ def refined_within_range(
         refined = refined_by_prediction(selection, parts)
         stuck = summary.causes_at_end(selection, refined, test)
         if not stuck:
-            return Judged(selection, rejected, refused, refined)
+            return VettedModel(selection, rejected, refused, refined)
         selection, again = apply_vetoes(reject(selection, [one.effect for one in stuck]), test)
         rejected, refused = {**rejected, **again}, (*refused, *stuck)
 
@@ -283,7 +295,7 @@ def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
     return refined._replace(kept=tuple(kept))
 
 
-class Named(NamedTuple):
+class NamedModel(NamedTuple):
     """What a refined model is named by, and the model.
 
     Attributes:
@@ -303,10 +315,10 @@ class Named(NamedTuple):
     lost: tuple[str, ...]
 
 
-def name_causes(judged: Judged, parts: Split) -> Named:
+def name_causes(vetted: VettedModel, parts: Split) -> NamedModel:
     """Return the causes of a refined model, in float64."""
-    test, refined = parts.test, judged.refined
-    selection = reduced(judged.selection, refined)
+    test, refined = parts.test, vetted.refined
+    selection = reduced(vetted.selection, refined)
     model = selection.model
     # Intervals are of the model itself: those of ground_effect were a third too short with slopes
     # of a model nearby.
@@ -315,7 +327,7 @@ def name_causes(judged: Judged, parts: Split) -> Named:
     effects = summary.effect_causes(selection, test, linearization)
     in_base, lost_in_base = summary.base_causes(selection, test, linearization, effects)
     contradicted = [
-        name for name, veto in judged.rejected.items() if veto is contradicted_on_held_out
+        name for name, veto in vetted.rejected.items() if veto is contradicted_on_held_out
     ]
     extended = model if refined.fit is None else model._replace(vector=refined.fit.vector)
     found = summary.with_refined_values([*effects, *in_base], refined, extended.vector)
@@ -330,7 +342,7 @@ def name_causes(judged: Judged, parts: Split) -> Named:
     found, negligible = split_by_size(
         found, state.problem, extended.vector, refined.flight_errors, without
     )
-    return Named(
+    return NamedModel(
         selection=selection,
         linearization=linearization,
         extended=extended,
@@ -341,7 +353,7 @@ def name_causes(judged: Judged, parts: Split) -> Named:
 
 
 def learn_rest(
-    named: Named, extended: FittedModel, refined: Refined, test: Problem
+    named: NamedModel, extended: FittedModel, refined: Refined, test: Problem
 ) -> tuple[Learned | None, np.ndarray]:
     """Return the law of what is left unexplained, if one is found, and the vector with it.
 
@@ -357,17 +369,17 @@ def learn_rest(
     ):
         return None, extended.vector
     always, always_held = (replace(one, windows=()) for one in (problem, test))
-    return find_learned(always, always_held, extended, selection.base.vector, refined.judge)
+    return find_learned(always, always_held, extended, selection.base.vector, refined.flight_test)
 
 
-def summarize(judged: Judged, parts: Split) -> Diagnosis:
+def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
     """Return the diagnosis of a refined model, in float64; so is the nominal model in it."""
-    test, refined = parts.test, judged.refined
-    named = name_causes(judged, parts)
+    test, refined = parts.test, vetted.refined
+    named = name_causes(vetted, parts)
     selection, linearization = named.selection, named.linearization
     problem, unexplained = selection.state.problem, selection.unexplained
     causes = tuple(one for one in named.found if not one.beyond)
-    beyond = (*judged.refused, *(one for one in named.found if one.beyond))
+    beyond = (*vetted.refused, *(one for one in named.found if one.beyond))
     outliers = outliers_of((problem, test), named.extended.vector)
     vectors = {
         "nominal": problem.start,
@@ -386,10 +398,10 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
     notes = [
         *outlier_notes(outliers),
         *summary.warnings_of(problem, (*causes, *beyond), named.lost),
-        *summary.refinement_notes(judged.refined, selection.model),
+        *summary.refinement_notes(vetted.refined, selection.model),
         *summary.stand_in_notes(selection, flying["extended"]),
         *summary.given_law_notes(problem, unexplained),
-        *summary.unseen_at_rest_notes(judged.rejected),
+        *summary.unseen_at_rest_notes(vetted.rejected),
         *notes_of(selection, linearization, parts.log),
     ]
     rest = summary.with_lost_causes(unexplained, named.lost)
@@ -411,12 +423,12 @@ def summarize(judged: Judged, parts: Split) -> Diagnosis:
         base=summary.model_of(problem, selection.base),
         extended=with_learned(summary.model_of(problem, extended), learned),
         noise=summary.sensor_noise(problem),
-        voltages=voltages_of(problem.lanes),
+        voltages=voltages_of(problem.chunks),
         source=Path(parts.logged.source).name,
         sha256=parts.logged.sha256,
         warnings=(*parts.warnings, *notes),
         prediction=prediction,
-        changed=summary.changed_parameters(linearization, extended, judged.refined),
+        changed=summary.changed_parameters(linearization, extended, vetted.refined),
         half_response_s=summary.half_responses_of(linearization, selection.model, refined, flying),
         outliers=outliers,
         learned=learned,
@@ -481,8 +493,8 @@ def unused_channels(logs: Sequence[FlightLog]) -> list[str]:
     ]
 
 
-def thinning_warning(every: Lanes, kept: Lanes) -> list[str]:
-    """Return a warning where a log is so long that only some of its lanes are learnt from."""
+def thinning_warning(every: Chunks, kept: Chunks) -> list[str]:
+    """Return a warning where a log is so long that only some of its chunks are learnt from."""
     if kept.num_judged == every.num_judged:
         return []
     return [

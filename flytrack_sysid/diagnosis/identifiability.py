@@ -18,7 +18,7 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, MAX_DELAY_STEPS
 from flytrack_env.plants import Simulator
 from flytrack_sysid.collect import states_flown
-from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, make_lanes, voltages_of
+from flytrack_sysid.diagnosis.chunks import CHUNK_S, Chunks, make_chunks, voltages_of
 from flytrack_sysid.diagnosis.problem import SEARCHED, Problem
 from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG, NotIdentifiable
 from flytrack_sysid.diagnosis.score_test import Candidate, Linearization, candidates_of
@@ -41,7 +41,7 @@ SEPARATE = 20.0  # noncentrality beside a rival from which it tells the two apar
 LOOKS_ALIKE = 0.1  # of an effect's noncentrality: what is left of it beside a look-alike
 ROUNDING = 1e-6  # of DETECTED
 BASE_ONLY = ("thrust_scale",)  # no log tells it from the free thrust curve: a cause of the base
-LANES_PER_MANOEUVRE = int(FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S) // LANE_S
+CHUNKS_PER_MANOEUVRE = int(FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S) // CHUNK_S
 PRIOR_SHARE = 1e-2  # of what shows an effect: less comes from the log's own prior
 # Of the best share: a manoeuvre that comes so near is as good, and an easier one comes first.
 NEARLY_BEST = 0.8
@@ -172,20 +172,20 @@ def _flown(
     return jax.vmap(fly)(starts, commands)[:, :-1]
 
 
-def _absent_channels(lanes: Lanes) -> list[str]:
-    """Return the channels of states that the log of these lanes did not have."""
+def _absent_channels(chunks: Chunks) -> list[str]:
+    """Return the channels of states that the log of these chunks did not have."""
     record, turned, moved = (
-        lanes.record,
-        lanes.counts[..., 0, 1].any(),
-        lanes.counts[..., 3, 1].any(),
+        chunks.record,
+        chunks.counts[..., 0, 1].any(),
+        chunks.counts[..., 3, 1].any(),
     )
     present = {
-        "w": "w" in lanes.measured,
-        "a": "f" in lanes.measured,
+        "w": "w" in chunks.measured,
+        "a": "f" in chunks.measured,
         "q": bool(turned or np.any(record.quat != UPRIGHT)),
         "v": bool(moved),
         "p": bool(record.pos_w.any()),
-        "v_bat": voltages_of(lanes) is not None,
+        "v_bat": voltages_of(chunks) is not None,
         "uprev": bool(record.is_applied_known.any()),
     }
     return [name for name, is_present in present.items() if not is_present]
@@ -197,7 +197,7 @@ def _seen_flights(problem: Problem, vector: np.ndarray) -> tuple[FlightLog, np.n
     The log of the flights has the channels of the problem's log.
     """
     model = problem.like._replace(thrust_coeffs=vector[problem.index(THRUST_COEFFS)])
-    voltages = voltages_of(problem.lanes) or _battery_range(problem.like)
+    voltages = voltages_of(problem.chunks) or _battery_range(problem.like)
     flights = flights_of(MANOEUVRES, hover_action(model, voltages), voltages=voltages)
     starts = np.stack([one.start for one in flights])
     commands = np.stack([one.command for one in flights])
@@ -207,22 +207,22 @@ def _seen_flights(problem: Problem, vector: np.ndarray) -> tuple[FlightLog, np.n
     last = np.maximum.accumulate(np.where(inside, np.arange(states.shape[1]), 0), axis=1)
     states = np.take_along_axis(states, last[..., None], axis=1)
     log = log_of_states(zip(states, commands, strict=True), DT_S, "manoeuvres")
-    return log.without(*_absent_channels(problem.lanes)), inside.reshape(-1)
+    return log.without(*_absent_channels(problem.chunks)), inside.reshape(-1)
 
 
-def _in_parts(lanes: Lanes, size: int) -> Iterator[Lanes]:
-    """Return lanes so many at a time, the last ones filled with lanes that count for nothing."""
-    number = lanes.counts.shape[1]
+def _in_parts(chunks: Chunks, size: int) -> Iterator[Chunks]:
+    """Return chunks so many at a time, the last ones filled with chunks that count for nothing."""
+    number = chunks.counts.shape[1]
     for begin in range(0, number, size):
         places = np.arange(begin, begin + size)
-        part = lanes.selected(np.minimum(places, number - 1))
+        part = chunks.selected(np.minimum(places, number - 1))
         yield part._replace(counts=part.counts & (places < number)[:, None, None])
 
 
 def _information_along(
     linearization: Linearization, columns: Sequence[int], ahead: Problem, vector: np.ndarray
 ) -> np.ndarray:
-    """Return the information by lane about some columns, (lanes, columns, columns)."""
+    """Return the information by chunk about some columns, (chunks, columns, columns)."""
     end = len(linearization.places)
     places = [linearization.places[column] for column in columns if column < end]
     probes = [linearization.probes[column - end] for column in columns if column >= end]
@@ -244,13 +244,13 @@ def information_of_manoeuvres(
     """
     columns = sorted(set(columns))
     log, counts = _seen_flights(problem, model.vector)
-    lanes = make_lanes(log, counts, model.vector[problem.index(TAUS)], float(problem.like.g))
-    by_lane = []
-    # As many lanes at a time as the log has, for which programs are compiled.
-    for part in _in_parts(lanes, problem.counts.shape[1]):
+    chunks = make_chunks(log, counts, model.vector[problem.index(TAUS)], float(problem.like.g))
+    by_chunk = []
+    # As many chunks at a time as the log has, for which programs are compiled.
+    for part in _in_parts(chunks, problem.counts.shape[1]):
         ahead = Problem.of(part, problem.like).with_noise(problem.noise)
-        by_lane.append(_information_along(linearization, columns, ahead, model.vector))
-    every = np.concatenate(by_lane)[: len(MANOEUVRES) * LANES_PER_MANOEUVRE]
+        by_chunk.append(_information_along(linearization, columns, ahead, model.vector))
+    every = np.concatenate(by_chunk)[: len(MANOEUVRES) * CHUNKS_PER_MANOEUVRE]
     result = {}
     for name, own in zip(MANOEUVRES, np.split(every, len(MANOEUVRES)), strict=True):
         result[name] = np.zeros_like(linearization.total)

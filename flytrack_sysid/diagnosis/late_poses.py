@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from flytrack_env.effects import BY_NAME, MocapLatency
-from flytrack_sysid.diagnosis.lanes import Lanes
+from flytrack_sysid.diagnosis.chunks import Chunks
 from flytrack_sysid.diagnosis.lateness import latency_of
-from flytrack_sysid.diagnosis.motion_choice import STANDARD_ERRORS, Moves
+from flytrack_sysid.diagnosis.motion_choice import STANDARD_ERRORS, MotionEstimate
 from flytrack_sysid.diagnosis.problem import Problem, robust_square, vector_of
 from flytrack_sysid.diagnosis.result import Cause, Changed, Diagnosis, Estimated
 from flytrack_sysid.diagnosis.summary import TWO_SIDED_95, verdict_of
@@ -17,7 +17,7 @@ EFFECT = BY_NAME["mocap_latency"]
 BOUNDS = EFFECT.ranges["latency_s"]
 
 
-def gain_of(problem: Problem, as_logged: Lanes, vector: np.ndarray) -> float:
+def gain_of(problem: Problem, as_logged: Chunks, vector: np.ndarray) -> float:
     """Return the gain of corrected over logged poses, in minus twice the log likelihood.
 
     Nothing is refitted.
@@ -25,23 +25,26 @@ def gain_of(problem: Problem, as_logged: Lanes, vector: np.ndarray) -> float:
     counts = problem.counts & as_logged.counts
 
     def cost(one: Problem) -> float:
-        judged = replace(one, lanes=one.lanes._replace(counts=counts)).with_noise(problem.noise)
-        return robust_square(judged.whitened_residuals(vector)[0])
+        scored = replace(one, chunks=one.chunks._replace(counts=counts)).with_noise(problem.noise)
+        return robust_square(scored.whitened_residuals(vector)[0])
 
-    return cost(replace(problem.with_lanes(as_logged), late=None)) - cost(problem)
+    return cost(replace(problem.with_chunks(as_logged), late=None)) - cost(problem)
 
 
 def with_late_poses(
-    found: Diagnosis, moves: Moves, problems: Sequence[Problem], logged: Sequence[Lanes]
+    found: Diagnosis,
+    motion_estimate: MotionEstimate,
+    problems: Sequence[Problem],
+    logged: Sequence[Chunks],
 ) -> Diagnosis:
     """Return a diagnosis of corrected poses with how late they were, as a cause where it matters.
 
-    problems: learnt from and judged by; logged: the lanes of each as logged.
+    problems: learnt from and judged by; logged: the chunks of each as logged.
     """
     before_s, late_s, sigma_s = (
         latency_of(found.nominal),
-        min(moves.late_s, BOUNDS.high),
-        moves.sigma_s,
+        min(motion_estimate.late_s, BOUNDS.high),
+        motion_estimate.sigma_s,
     )
     if not late_s and not before_s:
         return found
@@ -63,7 +66,7 @@ def with_late_poses(
         heldout_gain=gains[1],
         lambda_=size,
         lambda_sep=size,
-        beyond=f"latency_s at least {late_s:.3g} s" if moves.late_s > BOUNDS.high else "",
+        beyond=f"latency_s at least {late_s:.3g} s" if motion_estimate.late_s > BOUNDS.high else "",
     )
     changed = Changed(name, before_s, late_s, latency.ci95, unit, bool(cause.beyond))
     found = replace(found, changed=(*found.changed, changed))

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import read_later
-from flytrack_sysid.diagnosis.lanes import NUM_AXES, Lanes
+from flytrack_sysid.diagnosis.chunks import NUM_AXES, Chunks
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.record import Record, fill_gaps, record_of
 
@@ -32,19 +32,19 @@ SAME = 1e-6  # of a step
 
 
 class Late(NamedTuple):
-    """How level residuals of corrected lanes become those of what was logged.
+    """How level residuals of corrected chunks become those of what was logged.
 
-    weights: (rows, lanes, taps) of the modelled changes. constant: (rows, lanes, NUM_AXES), rad and
-    m/s.
+    weights: (rows, chunks, taps) of the modelled changes. constant: (rows, chunks, NUM_AXES), rad
+    and m/s.
     """
 
     weights: np.ndarray
     constant: np.ndarray
 
     def residuals(self, left: np.ndarray) -> np.ndarray:
-        """Return the log's residuals from those of corrected lanes.
+        """Return the log's residuals from those of corrected chunks.
 
-        left: (models, rows, lanes, NUM_AXES, 2).
+        left: (models, rows, chunks, NUM_AXES, 2).
         """
         found = left.copy()
         found[..., :-1, 1] = _delayed(left[..., :-1, 1], self.weights, -3) + self.constant[..., :-1]
@@ -92,10 +92,10 @@ def _changes(record: Record) -> np.ndarray:
     return np.where(record.begins[:, None], 0.0, changes)
 
 
-def judged_as_logged(
-    lanes: Lanes, corrected: FlightLog, logged: FlightLog, late_s: float, motion: Motion
-) -> tuple[Lanes, Late]:
-    """Return lanes of a corrected log that are judged where poses were logged, and their lateness.
+def scored_as_logged(
+    chunks: Chunks, corrected: FlightLog, logged: FlightLog, late_s: float, motion: Motion
+) -> tuple[Chunks, Late]:
+    """Return chunks of a corrected log that are judged where poses were logged, and their lateness.
 
     late_s: of the logged poses; ``corrected`` has them in time and may lack some of the rows.
     """
@@ -112,9 +112,9 @@ def judged_as_logged(
     weights = _weights((own + late_s - clock[place]) / step_s, motion)
     constant = _changes(record_of(seen))[place] - _delayed(_changes(record), weights, 0)
     constant = np.pad(np.where(record.begins[:, None], 0.0, constant), ((0, 0), (0, NUM_AXES - 6)))
-    index = np.where(lanes.row < len(own), lanes.row, -1)
+    index = np.where(chunks.row < len(own), chunks.row, -1)
     is_inside = index >= 0
-    counts = lanes.counts.copy()
+    counts = chunks.counts.copy()
     counts[..., :-1, 1] &= (is_logged[index] & is_inside)[..., None]
     late = Late(weights[index], np.where(is_inside[..., None], constant[index], 0.0))
-    return lanes._replace(counts=counts), late
+    return chunks._replace(counts=counts), late

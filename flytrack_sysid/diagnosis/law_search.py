@@ -20,14 +20,14 @@ from flytrack_env.dynamics import collective_thrust
 from flytrack_env.effects.grammar import QUANTITIES, SHAPES, XYZ, Factor, Moment, Term
 from flytrack_env.quaternion import Vec3
 from flytrack_env.state import Action
-from flytrack_sysid.diagnosis.lanes import LANE_S
+from flytrack_sysid.diagnosis.chunks import CHUNK_S
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_square
 from flytrack_sysid.diagnosis.search import FittedModel
 from flytrack_sysid.diagnosis.unexplained import (
     BUMP_PLACES,
     BUMP_WIDTHS_M,
     SIDES,
-    Flown,
+    FlightVariables,
     SideFit,
     SideTest,
     flight_of,
@@ -52,12 +52,12 @@ HELD_OUT_SHARE = 0.6  # of the gain on held-out rows that a law would have there
 MIN_EXPECTED_GAIN = 10.0  # of that gain: with less, held-out rows say nothing of a law
 
 
-def moment_of_flight(problem: Problem, vector: np.ndarray, flight: Flown) -> Moment:
+def moment_of_flight(problem: Problem, vector: np.ndarray, flight: FlightVariables) -> Moment:
     """Return the quantities a law may depend on, at the beginning of the step to each row.
 
-    Arrays are (rows, lanes).
+    Arrays are (rows, chunks).
     """
-    model, record = from_vector(vector, problem.like), problem.lanes.record
+    model, record = from_vector(vector, problem.like), problem.chunks.record
     wind = model.effect("wind")
     air_w = np.array([float(wind.v_x), float(wind.v_y), float(wind.v_z)])
     rotation = flight.body_to_world
@@ -66,8 +66,8 @@ def moment_of_flight(problem: Problem, vector: np.ndarray, flight: Flown) -> Mom
     thrust = collective_thrust(flight.applied[..., 3], volts, model.thrust_coeffs)
     full = np.radians(vector[problem.index(MAX_RATES)])
     rates_b = flight.applied[..., :XYZ] * full
-    if "w" in problem.lanes.measured:
-        gyro = problem.lanes.measured["w"]
+    if "w" in problem.chunks.measured:
+        gyro = problem.chunks.measured["w"]
         rates_b = np.concatenate([gyro[:1], gyro[:-1]])
 
     def vec(values: np.ndarray) -> Vec3:
@@ -86,7 +86,7 @@ def moment_of_flight(problem: Problem, vector: np.ndarray, flight: Flown) -> Mom
 
 
 def directions_of(term: Term, moment: Moment, rotation: np.ndarray) -> np.ndarray:
-    """Return a term's unit directions in the world frame, (coefficients, rows, lanes, 3)."""
+    """Return a term's unit directions in the world frame, (coefficients, rows, chunks, 3)."""
     body = [
         np.stack(np.broadcast_arrays(*unit, moment.time_s)[:-1], axis=-1)
         for unit in term.basis(moment)
@@ -104,7 +104,7 @@ class Side(NamedTuple):
     problem: Problem
     vector: np.ndarray
     moment: Moment
-    flight: Flown
+    flight: FlightVariables
     test: SideTest
     acting: tuple[int, ...]
 
@@ -123,7 +123,7 @@ class Side(NamedTuple):
         return cls(name, problem, model.vector, moment, flight, test, acting)
 
     def white(self, term: Term) -> np.ndarray:
-        """Return a term's unit coefficients as innovations, (coefficients, rows, lanes, 3, 2)."""
+        """Return a term's unit coefficients as innovations, (coefficients, rows, chunks, 3, 2)."""
         signal = np.broadcast_to(term.signal(self.moment), np.shape(self.moment.time_s))[..., None]
         directions = directions_of(term, self.moment, self.flight.body_to_world)
         return whitened(self.problem, directions * signal, self.name)
@@ -307,7 +307,7 @@ def _with_numbers(term: Term, values: np.ndarray) -> Term | None:
     return replace(term, factors=tuple(factors))
 
 
-class Found(NamedTuple):
+class FittedLaw(NamedTuple):
     """A law of one side, and what it is worth.
 
     vector: of the model with what the law changes in its free numbers. gain: on rows that were
@@ -367,7 +367,7 @@ def cross_validate(side: Side, terms: Sequence[Term]) -> tuple[float, float]:
     For a law that does not act in held-out rows, such as a thermal that they do not pass.
     """
     columns = np.concatenate([side.columns(term) for term in terms], axis=1)
-    half = np.indices((LANE_S, len(columns) // LANE_S)).sum(axis=0).ravel() % 2
+    half = np.indices((CHUNK_S, len(columns) // CHUNK_S)).sum(axis=0).ravel() % 2
     gain = expected = 0.0
     for one in range(2):
         step = (
@@ -381,17 +381,17 @@ def cross_validate(side: Side, terms: Sequence[Term]) -> tuple[float, float]:
     return gain, expected
 
 
-def judge_law(side: Side, held: Side, terms: tuple[Term, ...], fit: SideFit) -> Found:
+def judge_law(side: Side, held: Side, terms: tuple[Term, ...], fit: SideFit) -> FittedLaw:
     """Return terms that were fitted as a law, with what it gains on held-out rows."""
     vector, white = side.vector_beside(fit.given), [held.white(term) for term in terms]
     coefficients = [
         np.array(term.coefficients[: len(own)]) for term, own in zip(terms, white, strict=True)
     ]
     learnt = np.tensordot(np.concatenate(coefficients), np.concatenate(white), axes=1)
-    return Found(terms, vector, fit.chi2, *held_out(side, held, learnt, vector))
+    return FittedLaw(terms, vector, fit.chi2, *held_out(side, held, learnt, vector))
 
 
-def is_confirmed(side: Side, law: Found) -> bool:
+def is_confirmed(side: Side, law: FittedLaw) -> bool:
     """Return whether held-out rows confirm a law.
 
     Where the law hardly acts in them, cross-validation on the other rows decides.
@@ -402,7 +402,7 @@ def is_confirmed(side: Side, law: Found) -> bool:
     return gain >= HELD_OUT_SHARE * expected
 
 
-def drop_weak_terms(side: Side, held: Side, law: Found, number: int) -> Found | None:
+def drop_weak_terms(side: Side, held: Side, law: FittedLaw, number: int) -> FittedLaw | None:
     """Drop terms that gain too little beside all others; return the rest, the best first.
 
     A first term may only have stood in for later ones. None where held-out rows do not confirm the
@@ -427,7 +427,7 @@ def drop_weak_terms(side: Side, held: Side, law: Found, number: int) -> Found | 
     return found if is_confirmed(side, found) else None
 
 
-def find_law(side: Side, held: Side) -> Found | None:
+def find_law(side: Side, held: Side) -> FittedLaw | None:
     """Return the law of a side that rows learnt from and held-out rows agree on; None without one.
 
     The search starts from the best terms of several quantities: each wave of a sum may gain less
@@ -461,13 +461,13 @@ def best_of(side: Side, test: SideTest, pool: Sequence[Term]) -> tuple[list[Tria
 
 def grow_law(
     side: Side, held: Side, first: Trial, pool: Sequence[Term], number: int
-) -> Found | None:
+) -> FittedLaw | None:
     """Return the law that begins with a term, to which others of a pool are added while they gain.
 
     number: of terms among which they are chosen.
     """
     terms: list[Term] = []
-    best: Found | None = None
+    best: FittedLaw | None = None
 
     def uses_time(term: Term) -> bool:
         return any(one.quantity == "time" for one in term.factors)

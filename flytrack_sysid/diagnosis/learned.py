@@ -9,15 +9,15 @@ import numpy as np
 
 from flytrack_env.effects.grammar import Law
 from flytrack_sysid.diagnosis.beyond import Learned
-from flytrack_sysid.diagnosis.lanes import thinned
-from flytrack_sysid.diagnosis.law_search import MIN_EXPECTED_GAIN, Found, Side, find_law
+from flytrack_sysid.diagnosis.chunks import thinned
+from flytrack_sysid.diagnosis.law_search import MIN_EXPECTED_GAIN, FittedLaw, Side, find_law
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import (
     LIKELY,
     LIKELY_WORSE,
     WORSE_ANYWHERE,
-    Judge,
-    Tested,
+    FlightErrors,
+    FlightTest,
     errors_at,
 )
 from flytrack_sysid.diagnosis.search import FittedModel
@@ -36,12 +36,16 @@ LAW_SHARE = 0.75  # of what smooth functions of everything explain: the least th
 
 
 def find_learned(
-    problem: Problem, test: Problem, model: FittedModel, base: np.ndarray, judge: Judge | None
+    problem: Problem,
+    test: Problem,
+    model: FittedModel,
+    base: np.ndarray,
+    flight_test: FlightTest | None,
 ) -> tuple[Learned | None, np.ndarray]:
     """Return the law of what a model leaves, None without one, and the model's vector beside it.
 
     problem, test: of rows to learn from and of others. base: vector of the refitted model without
-    effects. judge: of free flights on held-out rows; None without any.
+    effects. flight_test: of free flights on held-out rows; None without any.
     """
     problem, test = thinned_problem(problem), thinned_problem(test)
     waves = waves_of(problem, model, find_lines(problem, model))
@@ -58,12 +62,12 @@ def find_learned(
             continue
         more = _with_side(learned, name, law)
         acts_there = law.expected >= MIN_EXPECTED_GAIN
-        if _predicts(problem, judge, (learned, model.vector), (more, law.vector), acts_there):
+        if _predicts(problem, flight_test, (learned, model.vector), (more, law.vector), acts_there):
             learned, model = more, model._replace(vector=law.vector)
     return learned, model.vector
 
 
-def _with_side(learned: Learned | None, name: str, law: Found) -> Learned:
+def _with_side(learned: Learned | None, name: str, law: FittedLaw) -> Learned:
     """Return what was learnt, with the law of one more side."""
     learned = learned or Learned(Law(()), {}, {}, {})
     return Learned(
@@ -75,19 +79,19 @@ def _with_side(learned: Learned | None, name: str, law: Found) -> Learned:
 
 
 def thinned_problem(problem: Problem) -> Problem:
-    """Return a problem of fewer lanes, evenly spread, where a log is long.
+    """Return a problem of fewer chunks, evenly spread, where a log is long.
 
     Hundreds of terms are tried.
     """
-    lanes = thinned(problem.lanes, max(MAX_ROWS // len(problem.lanes.row), 2))
-    if lanes is problem.lanes or problem.late is not None:
+    chunks = thinned(problem.chunks, max(MAX_ROWS // len(problem.chunks.row), 2))
+    if chunks is problem.chunks or problem.late is not None:
         return problem
-    return problem.with_lanes(lanes)
+    return problem.with_chunks(chunks)
 
 
 def _predicts(
     problem: Problem,
-    judge: Judge | None,
+    flight_test: FlightTest | None,
     before: tuple[Learned | None, np.ndarray],
     after: tuple[Learned | None, np.ndarray],
     acts_there: bool,
@@ -97,20 +101,22 @@ def _predicts(
     before, after: what was learnt, and the model's vector beside it. acts_there: whether it acts in
     them enough to be judged.
     """
-    if judge is None:
+    if flight_test is None:
         return True
-    old, new = (_flight_errors(problem, judge, *each) for each in (before, after))
+    old, new = (_flight_errors(problem, flight_test, *each) for each in (before, after))
     ratio, lost = new.against(old)
-    return improves_flights(ratio[judge.is_known], lost[judge.is_known], acts_there)
+    return improves_flights(ratio[flight_test.is_known], lost[flight_test.is_known], acts_there)
 
 
 def _flight_errors(
-    problem: Problem, judge: Judge, learned: Learned | None, vector: np.ndarray
-) -> Tested:
+    problem: Problem, flight_test: FlightTest, learned: Learned | None, vector: np.ndarray
+) -> FlightErrors:
     """Return the errors of held-out flights with what was learnt, if anything."""
     if learned is None:
-        return errors_at(problem, vector[None], judge.windows)
-    return errors_at(problem.with_law(learned.effect), learned.beside(vector)[None], judge.windows)
+        return errors_at(problem, vector[None], flight_test.windows)
+    return errors_at(
+        problem.with_law(learned.effect), learned.beside(vector)[None], flight_test.windows
+    )
 
 
 def improves_flights(ratio: np.ndarray, lost: np.ndarray, acts_there: bool) -> bool:

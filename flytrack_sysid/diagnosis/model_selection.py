@@ -23,7 +23,7 @@ from flytrack_sysid.diagnosis.search import (
     MAX_REFITTED,
     PER_PARAMETER,
     FittedModel,
-    Held,
+    HeldParameter,
     SearchState,
     add_effect,
     score_candidates,
@@ -327,7 +327,7 @@ def _is_immaterial(problem: Problem, fields: Sequence[str], model: FittedModel) 
     change = model.vector[places] - problem.start[places]
     if fields != THRUST_COEFFS:
         return bool(np.all(np.abs(change) < IMMATERIAL * np.abs(problem.start[places])))
-    record = problem.lanes.record
+    record = problem.chunks.record
     thrust = np.asarray(collective_thrust(record.command[..., 3], record.battery_v, change))
     weight = float(problem.like.m) * float(problem.like.g)
     return (
@@ -392,7 +392,7 @@ def _best_instead(
 ) -> tuple[SearchState, FittedModel | None]:
     """Return the best model with base parameters held and at most one more effect, if better."""
     given, problem, held = state, state.problem, state.held
-    state = replace(state, held=(*held, *(Held(field, "") for field in fields)))
+    state = replace(state, held=(*held, *(HeldParameter(field, "") for field in fields)))
     less = state.fitted(model.candidates, problem.at_start(model.vector, fields))
     state, nearby = state.linearized(less.vector)
     limit = model.cost + PER_PARAMETER * len(fields)
@@ -409,7 +409,7 @@ def _best_instead(
     if best is None:
         return given, None  # and its slopes, of the model without anything held
     effect = "".join(one.effect for one in best.candidates if one not in model.candidates)
-    return replace(state, held=(*held, *(Held(field, effect) for field in fields))), best
+    return replace(state, held=(*held, *(HeldParameter(field, effect) for field in fields))), best
 
 
 def is_determined(

@@ -26,8 +26,8 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, Effect
 from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.lanes import Lanes, lanes_of
-from flytrack_sysid.diagnosis.lateness import judged_as_logged, read_poses
+from flytrack_sysid.diagnosis.chunks import Chunks, cut_chunks
+from flytrack_sysid.diagnosis.lateness import read_poses, scored_as_logged
 from flytrack_sysid.diagnosis.motion_of_sensors import apparent_lateness, motion_of_sensors
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_weight
 from flytrack_sysid.diagnosis.score_test import Linearization, solve
@@ -42,7 +42,7 @@ CLEAR = 10.0  # of minus twice the log likelihood, by which a simulator's step h
 LATE = 60.0
 NEAR = 300.0  # of it: within so much of the best, lateness is fitted before one is chosen
 UNDECIDED = 60.0  # of it: while the second best is so near, more of the log is asked
-MAX_LANES = 4  # at a time, evenly spread: twenty seconds decide mostly
+MAX_CHUNKS = 4  # at a time, evenly spread: twenty seconds decide mostly
 # What a correlation has to say: smaller offsets are within its bias, or its standard errors up to a
 # bound.
 ON_TIME_S, STANDARD_ERRORS, UNCERTAIN_S = 0.7e-3, 3.0, 1.5e-3
@@ -68,7 +68,7 @@ LOOK_ALIKES: tuple[Effect, ...] = tuple(
 )
 
 
-class Moves(NamedTuple):
+class MotionEstimate(NamedTuple):
     """How a log moves, and how late its poses are.
 
     late_s: the poses against the gyro, 0 if on time. sigma_s: the standard error of ``late_s``.
@@ -86,85 +86,92 @@ class Moves(NamedTuple):
 class Trial(NamedTuple):
     """A motion and a lateness, and what was fitted under them."""
 
-    moves: Moves
+    motion_estimate: MotionEstimate
     problem: Problem
     vector: np.ndarray
 
 
-def problem_of(
-    lanes: Lanes,
+def build_problem(
+    chunks: Chunks,
     corrected: FlightLog,
     logged: FlightLog,
     model: ModelParameters,
     late_s: float,
 ) -> Problem:
-    """Return the problem of lanes of a corrected log, whose poses were logged late."""
+    """Return the problem of chunks of a corrected log, whose poses were logged late."""
     late = None
     if late_s:
-        lanes, late = judged_as_logged(lanes, corrected, logged, late_s, model.motion)
-    return Problem.of(lanes, model, late=late)
+        chunks, late = scored_as_logged(chunks, corrected, logged, late_s, model.motion)
+    return Problem.of(chunks, model, late=late)
 
 
-class Seen(NamedTuple):
-    """Rows of a log to learn from, a model to start from, and the part of the lanes that is used.
+class LogPart(NamedTuple):
+    """Rows of a log to learn from, a model to start from, and the part of the chunks that is used.
 
-    judged: (num_rows,) bool.
+    scored_rows: (num_rows,) bool.
 
-    num_parts: of some lanes each.
+    num_parts: of some chunks each.
     """
 
     log: FlightLog
-    judged: np.ndarray
+    scored_rows: np.ndarray
     model: ModelParameters
     part: int = 0
     num_parts: int = 1
 
-    def lanes(self, log: FlightLog) -> Lanes:
-        """Return the lanes of this part; in ``log`` poses may be at other times."""
-        lanes = lanes_of(log, self.judged, self.model)
-        return lanes.selected(np.arange(self.part, lanes.row.shape[1], self.num_parts)[:MAX_LANES])
+    def chunks(self, log: FlightLog) -> Chunks:
+        """Return the chunks of this part; in ``log`` poses may be at other times."""
+        chunks = cut_chunks(log, self.scored_rows, self.model)
+        return chunks.selected(
+            np.arange(self.part, chunks.row.shape[1], self.num_parts)[:MAX_CHUNKS]
+        )
 
-    def problem(self, moves: Moves) -> Problem:
+    def problem(self, motion_estimate: MotionEstimate) -> Problem:
         """Return the problem of a log that moves so."""
-        model, late_s = self.model._replace(motion=moves.motion), max(moves.late_s, 0.0)
+        model, late_s = (
+            self.model._replace(motion=motion_estimate.motion),
+            max(motion_estimate.late_s, 0.0),
+        )
         in_time = read_poses(self.log, late_s)[0]
-        return problem_of(self.lanes(in_time), in_time, self.log, model, late_s)
+        return build_problem(self.chunks(in_time), in_time, self.log, model, late_s)
 
 
-def _places(problem: Problem, moves: Moves) -> list[int]:
+def _places(problem: Problem, motion_estimate: MotionEstimate) -> list[int]:
     """Return what is fitted; sensors are late only where poses would be early."""
     names = [f"{one.name}.{name}" for one in LOOK_ALIKES for name in one.ranges]
     return problem.index(
         [
             *base_of(problem.like),
-            *(name for name in names if name != IMU_LATENCY or moves.late_s < 0.0),
+            *(name for name in names if name != IMU_LATENCY or motion_estimate.late_s < 0.0),
         ]
     )
 
 
-def _fit(seen: Seen, moves: Moves, last: Trial | None = None) -> Trial:
+def _fit(seen: LogPart, motion_estimate: MotionEstimate, last: Trial | None = None) -> Trial:
     """Return a fit, from that of another motion or a similar lateness if there is one."""
-    problem = seen.problem(moves)
+    problem = seen.problem(motion_estimate)
     vector = (problem.start if last is None else last.vector).copy()
-    if last is None or last.moves.motion is not moves.motion:
+    if last is None or last.motion_estimate.motion is not motion_estimate.motion:
         latency = problem.names.index(IMU_LATENCY)
-        vector[latency] = problem.start[latency] + max(-moves.late_s, 0.0)
+        vector[latency] = problem.start[latency] + max(-motion_estimate.late_s, 0.0)
     noise = None if last is None else last.problem.noise
     if noise is None:
-        noise = noises.first_guess(problem.lanes, problem.residuals(vector[None])[0])
+        noise = noises.first_guess(problem.chunks, problem.residuals(vector[None])[0])
     for _ in range(2 if last is None else 1):  # what is badly fitted passes for noise at first
         problem = problem.with_noise(noise)
-        vector, _ = refine(problem, problem.clipped(vector), _places(problem, moves))
-        noise = noises.fit_noise(problem.lanes, problem.residuals(vector[None])[0], noise)
-    return Trial(moves, problem.with_noise(noise), vector)
+        vector, _ = refine(problem, problem.clipped(vector), _places(problem, motion_estimate))
+        noise = noises.fit_noise(problem.chunks, problem.residuals(vector[None])[0], noise)
+    return Trial(motion_estimate, problem.with_noise(noise), vector)
 
 
-def _with_later_poses(seen: Seen, trial: Trial) -> Moves:
+def _with_later_poses(seen: LogPart, trial: Trial) -> MotionEstimate:
     """Return the lateness that fits better, all else refitted, to first order."""
-    moves, problem, vector = trial
-    later = seen.problem(moves._replace(late_s=moves.late_s + DIFFERENCE_S))
+    motion_estimate, problem, vector = trial
+    later = seen.problem(motion_estimate._replace(late_s=motion_estimate.late_s + DIFFERENCE_S))
     change = (later.residuals(vector[None]) - problem.residuals(vector[None])) / DIFFERENCE_S
-    linearization = Linearization(problem, problem.slopes(vector, _places(problem, moves)))
+    linearization = Linearization(
+        problem, problem.slopes(vector, _places(problem, motion_estimate))
+    )
     root = np.sqrt(robust_weight(linearization.white))
     column = problem.whiten(np.where(problem.counts & later.counts, change, 0.0))
     own, rest = blocks_of(column * root)[:, 0], linearization.columns * blocks_of(root)[:, None]
@@ -175,16 +182,18 @@ def _with_later_poses(seen: Seen, trial: Trial) -> Moves:
         share @ linearization.score
     )
     step_s = np.clip(score / information, -MAX_STEP_S, MAX_STEP_S)
-    return Moves(moves.motion, moves.late_s + float(step_s), information**-0.5)
+    return MotionEstimate(
+        motion_estimate.motion, motion_estimate.late_s + float(step_s), information**-0.5
+    )
 
 
-def _fit_lateness(seen: Seen, trial: Trial, rounds: int = ROUNDS) -> Trial:
+def _fit_lateness(seen: LogPart, trial: Trial, rounds: int = ROUNDS) -> Trial:
     """Return the trial with the lateness of its poses fitted, down to none."""
     for _ in range(rounds):
-        if trial.moves.late_s <= 0.0:
+        if trial.motion_estimate.late_s <= 0.0:
             break
-        moves = _with_later_poses(seen, trial)
-        trial = _fit(seen, moves._replace(late_s=max(moves.late_s, 0.0)), trial)
+        motion_estimate = _with_later_poses(seen, trial)
+        trial = _fit(seen, motion_estimate._replace(late_s=max(motion_estimate.late_s, 0.0)), trial)
     return trial
 
 
@@ -193,9 +202,9 @@ def _misfits(trials: Sequence[Trial]) -> list[float]:
     counts = np.logical_and.reduce([trial.problem.counts for trial in trials])
     misfits = []
     for _, problem, vector in trials:
-        lanes, left = problem.lanes._replace(counts=counts), problem.residuals(vector[None])[0]
+        chunks, left = problem.chunks._replace(counts=counts), problem.residuals(vector[None])[0]
         misfits.append(
-            noises.total_misfit(lanes, left, noises.fit_noise(lanes, left, problem.noise))
+            noises.total_misfit(chunks, left, noises.fit_noise(chunks, left, problem.noise))
         )
     return misfits
 
@@ -203,14 +212,14 @@ def _misfits(trials: Sequence[Trial]) -> list[float]:
 def _costs(trials: Sequence[Trial], misfits: Sequence[float]) -> list[float]:
     """Return the misfits and what it costs that a sensor is late."""
     return [
-        misfit + LATE * bool(trial.moves.late_s)
+        misfit + LATE * bool(trial.motion_estimate.late_s)
         for trial, misfit in zip(trials, misfits, strict=True)
     ]
 
 
-def how_it_moves(
-    log: FlightLog, model: ModelParameters, judged: np.ndarray, motion: Motion | None = None
-) -> Moves:
+def estimate_motion(
+    log: FlightLog, model: ModelParameters, scored_rows: np.ndarray, motion: Motion | None = None
+) -> MotionEstimate:
     """Return how a log moves, likeliest on judged rows, (num_rows,) bool, in float64.
 
     model: where the search starts. motion: the only one that is tried, if given, or if the sensors
@@ -218,7 +227,7 @@ def how_it_moves(
     """
     motion = motion_of_sensors(log) if motion is None else motion
     motions, apparent = tuple(Motion) if motion is None else (motion,), apparent_lateness(log)
-    late = {one: Moves(one) for one in motions}
+    late = {one: MotionEstimate(one) for one in motions}
     if apparent is not None:
         offset_s, sigma_s = apparent
         # Rates of a simulator's step are those in its middle.
@@ -227,33 +236,33 @@ def how_it_moves(
         for one in motions:
             late_s = offset_s if one is Motion.CONTINUOUS else offset_s + half_s
             if abs(late_s) > is_small:
-                late[one] = Moves(one, late_s, sigma_s)
+                late[one] = MotionEstimate(one, late_s, sigma_s)
     if motion is not None and late[motion].late_s <= 0.0:
-        return Moves(motion, is_sure=True)
-    if apparent is not None and [one for one in motions if late[one] == Moves(one)] == [
+        return MotionEstimate(motion, is_sure=True)
+    if apparent is not None and [one for one in motions if late[one] == MotionEstimate(one)] == [
         Motion.CONTINUOUS
     ]:
-        return Moves(Motion.CONTINUOUS)
-    seen = Seen(log, judged & _known_around(log, list(late.values())), model)
-    num_parts = max(lanes_of(log, seen.judged, model).row.shape[1] // MAX_LANES, 1)
+        return MotionEstimate(Motion.CONTINUOUS)
+    seen = LogPart(log, scored_rows & _known_around(log, list(late.values())), model)
+    num_parts = max(cut_chunks(log, seen.scored_rows, model).row.shape[1] // MAX_CHUNKS, 1)
     found = _chosen(seen._replace(num_parts=num_parts), list(late.values()))
     is_late = found.late_s > max(MIN_LATENCY_S, STANDARD_ERRORS * found.sigma_s)
-    found = found if is_late else Moves(found.motion)
+    found = found if is_late else MotionEstimate(found.motion)
     return found._replace(is_sure=motion is not None)
 
 
-def _known_around(log: FlightLog, moves: Sequence[Moves]) -> np.ndarray:
+def _known_around(log: FlightLog, motion_estimate: Sequence[MotionEstimate]) -> np.ndarray:
     """Return the rows at which poses are known for each lateness and a few fit steps around it."""
     room = ROUNDS * MAX_STEP_S + DIFFERENCE_S
-    late_s = [one.late_s for one in moves if one.late_s > 0.0]
+    late_s = [one.late_s for one in motion_estimate if one.late_s > 0.0]
     ends = (min(0.0, min(late_s) - room), max(late_s) + room) if late_s else (0.0,)
     return np.logical_and.reduce([read_poses(log, end_s)[1] for end_s in ends])
 
 
-def _chosen(seen: Seen, late: Sequence[Moves]) -> Moves:
+def _chosen(seen: LogPart, late: Sequence[MotionEstimate]) -> MotionEstimate:
     """Return the likeliest of several; those that come near the best are fitted further."""
     first = _fit(seen, late[0])
-    trials = [first, *(_fit(seen, moves, first) for moves in late[1:])]
+    trials = [first, *(_fit(seen, motion_estimate, first) for motion_estimate in late[1:])]
     misfits = _misfits(trials)
     trials = [
         _fit_lateness(seen, trial) if misfit < min(misfits) + NEAR else trial
@@ -266,26 +275,30 @@ def _chosen(seen: Seen, late: Sequence[Moves]) -> Moves:
         if len(kept) < 2:
             break
         other, trials = seen._replace(part=part), [trials[place] for place in kept]
-        again = [_fit_lateness(other, _fit(other, one.moves, one), rounds=1) for one in trials]
+        again = [
+            _fit_lateness(other, _fit(other, one.motion_estimate, one), rounds=1) for one in trials
+        ]
         misfits = list(np.array(misfits)[kept] + _misfits(again))
         trials = [_both(*pair) for pair in zip(trials, again, strict=True)]
     costs = _costs(trials, misfits)
     for trial, cost in zip(trials, costs, strict=True):
-        if trial.moves.motion is Motion.CONTINUOUS and cost <= min(costs) + CLEAR:
-            return trial.moves
-    return trials[int(np.argmin(costs))].moves
+        if trial.motion_estimate.motion is Motion.CONTINUOUS and cost <= min(costs) + CLEAR:
+            return trial.motion_estimate
+    return trials[int(np.argmin(costs))].motion_estimate
 
 
 def _both(first: Trial, second: Trial) -> Trial:
     """Return the second trial with the lateness that both say."""
-    one_s, sigma_s = first.moves.late_s, first.moves.sigma_s
-    other_s, other_sigma_s = second.moves.late_s, second.moves.sigma_s
+    one_s, sigma_s = first.motion_estimate.late_s, first.motion_estimate.sigma_s
+    other_s, other_sigma_s = second.motion_estimate.late_s, second.motion_estimate.sigma_s
     if one_s <= 0.0:
         return second
     weights = np.array([sigma_s, other_sigma_s]) ** -2.0
     late_s = float(weights @ [one_s, other_s] / weights.sum())
     sigma_s = float(weights.sum() ** -0.5)
-    return second._replace(moves=first.moves._replace(late_s=late_s, sigma_s=sigma_s))
+    return second._replace(
+        motion_estimate=first.motion_estimate._replace(late_s=late_s, sigma_s=sigma_s)
+    )
 
 
 def likelier_motion(problem: Problem, vector: np.ndarray) -> Motion:
@@ -299,8 +312,8 @@ def likelier_motion(problem: Problem, vector: np.ndarray) -> Motion:
     def misfit(motion: Motion) -> float:
         moving = replace(problem, like=problem.like._replace(motion=motion))
         left = moving.residuals(vector[None])[0]
-        noise = noises.fit_noise(problem.lanes, left, problem.noise)
-        return noises.total_misfit(problem.lanes, left, noise) - CLEAR * (
+        noise = noises.fit_noise(problem.chunks, left, problem.noise)
+        return noises.total_misfit(problem.chunks, left, noise) - CLEAR * (
             motion is problem.like.motion
         )
 
@@ -321,4 +334,4 @@ def motion_of(log: FlightLog, model: ModelParameters) -> Motion:
     if (shown := motion_of_sensors(log)) is not None:
         return shown
     with jax.enable_x64(True):
-        return how_it_moves(log, model, np.ones(len(log), bool)).motion
+        return estimate_motion(log, model, np.ones(len(log), bool)).motion

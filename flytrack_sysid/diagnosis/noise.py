@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.fusion import one_kernel
-from flytrack_sysid.diagnosis.lanes import NUM_AXES, Lanes
+from flytrack_sysid.diagnosis.chunks import NUM_AXES, Chunks
 
 # Variance of a level at its first row, over that of its noise: its first innovation is about 0.
 UNKNOWN_START = 1e8
@@ -39,8 +39,8 @@ TAU_RANGE_S = (0.02, 5.0)
 FIRST_DAMPING, MORE, LESS = 1e-2, 10.0, 0.2
 MAX_ROUNDS = 12
 ENOUGH = 1.0  # of minus twice the log likelihood: the error of one parameter
-# Sizes of the compiled programs: rows of lanes, and models, at a time.
-NUM_ROWS, NUM_LANES, NUM_MODELS = 200, 8, 8
+# Sizes of the compiled programs: rows of chunks, and models, at a time.
+NUM_ROWS, NUM_CHUNKS, NUM_MODELS = 200, 8, 8
 OUTLIER = 4.0  # innovations beyond count by their size, not its square
 
 
@@ -157,10 +157,10 @@ def innovations_of_row(
     return later, direct * gain.direct_scale, off * gain.level_scale
 
 
-def conditions_of(lanes: Lanes) -> Conditions:
-    """Return the conditions of the rows of lanes, leaves (rows, lanes, ...)."""
+def conditions_of(chunks: Chunks) -> Conditions:
+    """Return the conditions of the rows of chunks, leaves (rows, chunks, ...)."""
     return Conditions(
-        step_to(lanes)[..., None], lanes.is_known.astype(float), lanes.counts.astype(float)
+        step_to(chunks)[..., None], chunks.is_known.astype(float), chunks.counts.astype(float)
     )
 
 
@@ -168,7 +168,7 @@ def conditions_of(lanes: Lanes) -> Conditions:
 def _gains_of_rows(
     log_noise: jax.Array, state: Variances, rows: Conditions
 ) -> tuple[Variances, Gains]:
-    """Return the covariance after some rows, and the gains at them, (NUM_ROWS, NUM_LANES, ...)."""
+    """Return the covariance after some rows, and the gains at them, (NUM_ROWS, NUM_CHUNKS, ...)."""
     noise = noise_of(log_noise)
 
     def next_row(state: Variances, row: Conditions) -> tuple[Variances, Gains]:
@@ -181,7 +181,7 @@ def _gains_of_rows(
 def _whiten_rows(
     state: Filtered, gains: Gains, counts: jax.Array, residuals: jax.Array
 ) -> tuple[Filtered, jax.Array]:
-    """Return the state after some rows, and innovations (NUM_ROWS, NUM_MODELS, NUM_LANES, ...)."""
+    """Return the state after some rows, and innovations (NUM_ROWS, NUM_MODELS, NUM_CHUNKS, ...)."""
 
     def next_row(state: Filtered, inputs: tuple[Any, ...]) -> tuple[Filtered, jax.Array]:
         gain, counting, values = inputs
@@ -192,69 +192,69 @@ def _whiten_rows(
 
 
 class Whitener:
-    """The filter of a noise for rows of lanes: a linear map for residuals and their slopes."""
+    """The filter of a noise for rows of chunks: a linear map for residuals and their slopes."""
 
-    def __init__(self, lanes: Lanes, log_noise: np.ndarray):
-        self._lanes, self._log_noise = lanes, log_noise
+    def __init__(self, chunks: Chunks, log_noise: np.ndarray):
+        self._chunks, self._log_noise = chunks, log_noise
 
     @cached_property
     def _parts(self) -> dict[int, dict[int, tuple[Gains, jax.Array]]]:
-        """The gains and what counts, by first lane and first row."""
-        nothing = jnp.zeros((NUM_LANES, NUM_AXES))
+        """The gains and what counts, by first chunk and first row."""
+        nothing = jnp.zeros((NUM_CHUNKS, NUM_AXES))
         found: dict[int, dict[int, tuple[Gains, jax.Array]]] = {}
-        for lane, parts in cut_to_size(conditions_of(self._lanes)).items():
-            state, found[lane] = Variances(nothing, nothing, nothing), {}
+        for chunk, parts in cut_to_size(conditions_of(self._chunks)).items():
+            state, found[chunk] = Variances(nothing, nothing, nothing), {}
             for begin, rows in parts.items():
                 state, gains = _gains_of_rows(self._log_noise, state, rows)
-                found[lane][begin] = gains, rows.counts
+                found[chunk][begin] = gains, rows.counts
         return found
 
     def __call__(self, residuals: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
-        """Return residuals (models, rows, lanes, axes, 2) as innovations of variance 1.
+        """Return residuals (models, rows, chunks, axes, 2) as innovations of variance 1.
 
         They are 0 where nothing counts. axes: which of ``NUM_AXES`` they are.
         """
-        num_models, (num_rows, num_lanes) = len(residuals), self._lanes.row.shape
-        filled = -num_models % NUM_MODELS, -num_rows % NUM_ROWS, -num_lanes % NUM_LANES
-        size = np.add((num_models, num_rows, num_lanes), filled)
+        num_models, (num_rows, num_chunks) = len(residuals), self._chunks.row.shape
+        filled = -num_models % NUM_MODELS, -num_rows % NUM_ROWS, -num_chunks % NUM_CHUNKS
+        size = np.add((num_models, num_rows, num_chunks), filled)
         values = np.zeros((size[1], size[0], size[2], NUM_AXES, 2))
-        chosen = values[:num_rows, :num_models, :num_lanes, axes]
+        chosen = values[:num_rows, :num_models, :num_chunks, axes]
         chosen[...] = np.moveaxis(residuals, 0, 1)
-        nothing = jnp.zeros((NUM_MODELS, NUM_LANES, NUM_AXES))
-        for (lane, parts), model in product(self._parts.items(), range(0, size[0], NUM_MODELS)):
+        nothing = jnp.zeros((NUM_MODELS, NUM_CHUNKS, NUM_AXES))
+        for (chunk, parts), model in product(self._parts.items(), range(0, size[0], NUM_MODELS)):
             state = Filtered(nothing, nothing, nothing)
             for begin, (gains, counts) in parts.items():
                 place = (
                     slice(begin, begin + NUM_ROWS),
                     slice(model, model + NUM_MODELS),
-                    slice(lane, lane + NUM_LANES),
+                    slice(chunk, chunk + NUM_CHUNKS),
                 )
                 state, values[place] = _whiten_rows(state, gains, counts, values[place])
         return np.moveaxis(chosen, 0, 1)
 
 
 def cut_to_size(tree: Any) -> dict[int, dict[int, Any]]:
-    """Return leaves (rows, lanes, ...) in parts of one size, by first lane and first row.
+    """Return leaves (rows, chunks, ...) in parts of one size, by first chunk and first row.
 
     So one program serves logs of any length and rate. What fills parts up is 0.
     """
-    num_rows, num_lanes = jax.tree.leaves(tree)[0].shape[:2]
-    fill = [(0, -num_rows % NUM_ROWS), (0, -num_lanes % NUM_LANES)]
+    num_rows, num_chunks = jax.tree.leaves(tree)[0].shape[:2]
+    fill = [(0, -num_rows % NUM_ROWS), (0, -num_chunks % NUM_CHUNKS)]
     padded = jax.tree.map(lambda leaf: np.pad(leaf, fill + [(0, 0)] * (leaf.ndim - 2)), tree)
 
-    def part(row: int, lane: int) -> Any:
-        place = slice(row, row + NUM_ROWS), slice(lane, lane + NUM_LANES)
+    def part(row: int, chunk: int) -> Any:
+        place = slice(row, row + NUM_ROWS), slice(chunk, chunk + NUM_CHUNKS)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf[place]), padded)
 
     return {
-        lane: {row: part(row, lane) for row in range(0, num_rows, NUM_ROWS)}
-        for lane in range(0, num_lanes, NUM_LANES)
+        chunk: {row: part(row, chunk) for row in range(0, num_rows, NUM_ROWS)}
+        for chunk in range(0, num_chunks, NUM_CHUNKS)
     }
 
 
-def step_to(lanes: Lanes) -> np.ndarray:
-    """Return the time from the row before, (rows, lanes) s."""
-    step_s = lanes.record.step_s
+def step_to(chunks: Chunks) -> np.ndarray:
+    """Return the time from the row before, (rows, chunks) s."""
+    step_s = chunks.record.step_s
     return np.concatenate([step_s[:1], step_s[:-1]])
 
 
@@ -282,7 +282,7 @@ def _misfit_rows(
     """
     shifts = DIFFERENCE * jnp.eye(len(log_noise))[:, :, None]
     noise = jax.vmap(noise_of)(jnp.concatenate([log_noise[None], log_noise + shifts]))
-    noise = jax.tree.map(lambda leaf: leaf[:, None, :], noise)  # (noises, lanes, axes)
+    noise = jax.tree.map(lambda leaf: leaf[:, None, :], noise)  # (noises, chunks, axes)
 
     def next_row(noise: Noise, state: Any, inputs: Any) -> Any:
         row, values = inputs
@@ -313,14 +313,14 @@ def _misfit_rows(
 
 
 class Likelihood:
-    """Residuals of lanes, (rows, lanes, NUM_AXES, 2), whose noise is asked for."""
+    """Residuals of chunks, (rows, chunks, NUM_AXES, 2), whose noise is asked for."""
 
-    def __init__(self, lanes: Lanes, residuals: np.ndarray):
-        self._parts = cut_to_size((conditions_of(lanes), residuals))
+    def __init__(self, chunks: Chunks, residuals: np.ndarray):
+        self._parts = cut_to_size((conditions_of(chunks), residuals))
 
     def misfit(self, log_noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the sums of ``_misfit_rows`` over all rows."""
-        nothing = jnp.zeros((1 + len(log_noise), NUM_LANES, NUM_AXES))
+        nothing = jnp.zeros((1 + len(log_noise), NUM_CHUNKS, NUM_AXES))
         begin = Variances(*[nothing] * 3), Filtered(*[nothing] * 3)
         sums = []
         for parts in self._parts.values():
@@ -335,19 +335,19 @@ class Likelihood:
         return total, slopes, curvature
 
 
-def floors_of(lanes: Lanes) -> np.ndarray:
+def floors_of(chunks: Chunks) -> np.ndarray:
     """Return the least noise of each channel, (2, NUM_AXES): of its last digit, or of float32."""
-    return np.maximum(FLOORS, lanes.quanta * UNIFORM)
+    return np.maximum(FLOORS, chunks.quanta * UNIFORM)
 
 
-def least_noise(lanes: Lanes) -> np.ndarray:
+def least_noise(chunks: Chunks) -> np.ndarray:
     """Return the logarithms of the least noise, (6, NUM_AXES), with which a problem begins."""
-    return _bounds(lanes)[0]
+    return _bounds(chunks)[0]
 
 
-def first_guess(lanes: Lanes, left: np.ndarray) -> np.ndarray:
+def first_guess(chunks: Chunks, left: np.ndarray) -> np.ndarray:
     """Return log noise to start the search from, (6, NUM_AXES), robust against slow residuals."""
-    counts, floors = lanes.counts, floors_of(lanes)
+    counts, floors = chunks.counts, floors_of(chunks)
     both = counts[1:] & counts[:-1]
     found = np.zeros((6, NUM_AXES))
     for axis in range(NUM_AXES):
@@ -360,26 +360,26 @@ def first_guess(lanes: Lanes, left: np.ndarray) -> np.ndarray:
     return found
 
 
-def disturbance_gain(lanes: Lanes, left: np.ndarray, log_noise: np.ndarray) -> np.ndarray:
+def disturbance_gain(chunks: Chunks, left: np.ndarray, log_noise: np.ndarray) -> np.ndarray:
     """Return how much a disturbance lowers minus twice the log likelihood, by axis."""
     still = log_noise.copy()
     still[3] = np.log(MIN_DISTURBANCE_RATIO)
-    likelihood = Likelihood(lanes, left)
+    likelihood = Likelihood(chunks, left)
     return likelihood.misfit(still)[0] - likelihood.misfit(log_noise)[0]
 
 
-def total_misfit(lanes: Lanes, left: np.ndarray, log_noise: np.ndarray) -> float:
+def total_misfit(chunks: Chunks, left: np.ndarray, log_noise: np.ndarray) -> float:
     """Return minus twice the log likelihood of residuals under a noise."""
-    return float(np.sum(Likelihood(lanes, left).misfit(log_noise)[0]))
+    return float(np.sum(Likelihood(chunks, left).misfit(log_noise)[0]))
 
 
-def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-    """Return the likeliest noise, (6, NUM_AXES), of residuals (rows, lanes, NUM_AXES, 2).
+def fit_noise(chunks: Chunks, left: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+    """Return the likeliest noise, (6, NUM_AXES), of residuals (rows, chunks, NUM_AXES, 2).
 
     Fisher scoring with Levenberg damping, every axis by itself.
     """
-    likelihood, (low, high) = Likelihood(lanes, left), _bounds(lanes)
-    best = np.clip(first_guess(lanes, left) if start is None else start, low, high)
+    likelihood, (low, high) = Likelihood(chunks, left), _bounds(chunks)
+    best = np.clip(first_guess(chunks, left) if start is None else start, low, high)
     misfit, slopes, curvature = likelihood.misfit(best)
     damping = np.full(NUM_AXES, FIRST_DAMPING)
     for _ in range(MAX_ROUNDS):
@@ -407,7 +407,7 @@ def fit_noise(lanes: Lanes, left: np.ndarray, start: np.ndarray | None = None) -
     return best
 
 
-def _bounds(lanes: Lanes) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(chunks: Chunks) -> tuple[np.ndarray, np.ndarray]:
     """Return the bounds of the search, (6, NUM_AXES) and (6, 1), as logarithms and a logit."""
     low = [
         np.log(MIN_DISTURBANCE_RATIO),
@@ -417,6 +417,6 @@ def _bounds(lanes: Lanes) -> tuple[np.ndarray, np.ndarray]:
     ]
     high = [np.log(1e3)] * 4 + [np.log(TAU_RANGE_S[1]), 5.0]
     lowest = np.concatenate(
-        [np.log(floors_of(lanes)), np.repeat(low, NUM_AXES).reshape(-1, NUM_AXES)]
+        [np.log(floors_of(chunks)), np.repeat(low, NUM_AXES).reshape(-1, NUM_AXES)]
     )
     return lowest, np.array(high)[:, None]

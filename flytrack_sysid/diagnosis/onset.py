@@ -19,7 +19,7 @@ import numpy as np
 from scipy import optimize, stats
 
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.lanes import LANE_S, Lanes, lead_in_of
+from flytrack_sysid.diagnosis.chunks import CHUNK_S, Chunks, lead_in_of
 from flytrack_sysid.diagnosis.problem import Problem, Window, robust_square
 from flytrack_sysid.diagnosis.result import Estimated
 from flytrack_sysid.diagnosis.score_test import (
@@ -123,13 +123,13 @@ class Hypothesis(NamedTuple):
         return self.gain - threshold(self.num_parameters)
 
 
-def seconds_of(lanes: Lanes) -> tuple[np.ndarray, np.ndarray]:
+def seconds_of(chunks: Chunks) -> tuple[np.ndarray, np.ndarray]:
     """Return the first row of each second, and the rows at which an effect may begin or end.
 
     Seconds are in the order of ``problem.blocks_of``.
     """
-    rows = lanes.row[lead_in_of(len(lanes.row)) :]
-    start = rows[:: len(rows) // LANE_S].ravel()
+    rows = chunks.row[lead_in_of(len(chunks.row)) :]
+    start = rows[:: len(rows) // CHUNK_S].ravel()
     known = np.sort(start[start >= 0])
     least = int(np.ceil(max(MIN_SIDE_S, MIN_SIDE_FRACTION * len(known))))
     return start, known[least : len(known) - least + 1]
@@ -142,7 +142,7 @@ def changes_of(
 
     linearization: of the model, along everything. lacking: effects that are not looked for.
     """
-    seconds = seconds_of(linearization.problem.lanes)
+    seconds = seconds_of(linearization.problem.chunks)
     if not len(seconds[1]):
         return []
     best: dict[str, Hypothesis] = {}
@@ -239,7 +239,7 @@ def profile_of(problem: Problem, test: Problem, vector: np.ndarray, row: int) ->
 
     test: of rows held out, which decide as well.
     """
-    step_s = float(np.median(problem.lanes.record.step_s))
+    step_s = float(np.median(problem.chunks.record.step_s))
     problems = problem, replace(test, windows=problem.windows).with_noise(problem.noise)
     # As if what changes at the row changed after the log, and before it.
     sides = [
@@ -256,7 +256,7 @@ def profile_of(problem: Problem, test: Problem, vector: np.ndarray, row: int) ->
         ]
         costs = np.zeros(len(tried))
         for own, (before, after) in zip(problems, sides, strict=True):
-            is_after = own.lanes.row[..., None, None] >= np.array(tried)[:, None, None, None, None]
+            is_after = own.chunks.row[..., None, None] >= np.array(tried)[:, None, None, None, None]
             white = own.whiten(np.where(is_after, after, before))
             costs += [robust_square(one) for one in white]
         known |= dict(zip(tried, costs.tolist(), strict=True))
@@ -266,9 +266,9 @@ def profile_of(problem: Problem, test: Problem, vector: np.ndarray, row: int) ->
 
 def log_rows(problem: Problem, test: Problem, rows: Sequence[int]) -> np.ndarray:
     """Return the rows of the log, as fractions, of rows of the record."""
-    lanes = problem.lanes, test.lanes
-    own = np.concatenate([one.row.ravel() for one in lanes])
-    source = np.concatenate([one.record.source_row.ravel() for one in lanes])
+    chunks = problem.chunks, test.chunks
+    own = np.concatenate([one.row.ravel() for one in chunks])
+    source = np.concatenate([one.record.source_row.ravel() for one in chunks])
     known = (own >= 0) & (source >= 0)
     order = np.argsort(own[known])
     return np.interp(rows, own[known][order], source[known][order])
@@ -401,11 +401,11 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
 
 def misfit(selection: Selection, problem: Problem) -> float:
     """Return minus twice the log likelihood of a problem under a selection and its noise."""
-    state, lanes = selection.state, problem.lanes
+    state, chunks = selection.state, problem.chunks
     left = replace(problem, windows=state.problem.windows).residuals(selection.model.vector[None])[
         0
     ]
-    return noises.total_misfit(lanes, left, state.problem.noise)
+    return noises.total_misfit(chunks, left, state.problem.noise)
 
 
 def windowed(state: SearchState, windows: Sequence[Window]) -> SearchState:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import stats
 
-from flytrack_sysid.diagnosis.lanes import AXES
+from flytrack_sysid.diagnosis.chunks import AXES
 from flytrack_sysid.diagnosis.noise import OUTLIER
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import CHANNELS, Outliers
@@ -45,7 +45,7 @@ def outliers_of(problems: Sequence[Problem], vector: np.ndarray) -> dict[str, Ou
 
 
 def _short_runs(is_far: np.ndarray) -> int:
-    """Return how many rows, (rows, lanes) bool, lie in runs of at most ``MAX_RUN_LENGTH``."""
+    """Return how many rows, (rows, chunks) bool, lie in runs of at most ``MAX_RUN_LENGTH``."""
     edges = np.diff(np.pad(is_far, ((1, 1), (0, 0))).astype(int), axis=0)
     starts, ends = (np.argwhere(sign == edges.T)[:, 1] for sign in (1, -1))
     lengths = ends - starts

@@ -1,6 +1,6 @@
 """A log and all that its model may be: residuals, slopes and whitening for parameter vectors.
 
-One program replays pairs of a model and a lane, some rows at a time, whatever the length, rate and
+One program replays pairs of a model and a chunk, some rows at a time, whatever the length, rate and
 channels of a log. Each model has every effect of the list; a model without an effect has it at its
 neutral value. So no set of effects needs a compilation of its own.
 
@@ -29,7 +29,7 @@ from flytrack_env.dynamics import ModelParameters, read_sensors
 from flytrack_env.effects import BY_NAME, EFFECTS, LEARNED_LAW, Effect, LearnedLaw, effect_of
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.lanes import AXES, LANE_S, NUM_AXES, Lanes, lead_in_of
+from flytrack_sysid.diagnosis.chunks import AXES, CHUNK_S, NUM_AXES, Chunks, lead_in_of
 from flytrack_sysid.diagnosis.lateness import Late
 from flytrack_sysid.parameters import TAUS, from_vector, names_of, range_of, to_vector
 from flytrack_sysid.record import Record
@@ -41,7 +41,7 @@ from flytrack_sysid.trace_cache import keep_trace
 SEARCHED = tuple(
     effect for effect in EFFECTS if "pose" not in effect.hooks and not effect.search.is_setting
 )
-# Size of the compiled replay: pairs of a model and a lane, and rows at a time.
+# Size of the compiled replay: pairs of a model and a chunk, and rows at a time.
 NUM_PAIRS, NUM_ROWS = 32, 200
 RELATIVE_STEP = 1e-6  # of a parameter's scale, for slopes
 
@@ -69,7 +69,7 @@ class Measured(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Rows of lanes, the gyro at them, and what was measured at the rows after them."""
+    """Rows of chunks, the gyro at them, and what was measured at the rows after them."""
 
     row: Record
     gyro_b: Any
@@ -107,7 +107,7 @@ def _replay_rows(
     """Return the states of pairs after some rows, and (rows, NUM_PAIRS, NUM_AXES, 2) residuals.
 
     vectors: (NUM_PAIRS, parameters), the model of each pair, in the order of
-    ``parameters.names_of(like)``. rows: leaves (rows, NUM_PAIRS, ...), the lane of each pair.
+    ``parameters.names_of(like)``. rows: leaves (rows, NUM_PAIRS, ...), the chunk of each pair.
     """
 
     def of_pair(vector: jax.Array, leaves: States, rows: Rows) -> Any:
@@ -122,9 +122,9 @@ def _replay_rows(
 
 
 class Batch(NamedTuple):
-    """What ``NUM_PAIRS`` pairs of a model and a lane are replayed with.
+    """What ``NUM_PAIRS`` pairs of a model and a chunk are replayed with.
 
-    first: the first row of each pair's lane. parts: all rows, ``NUM_ROWS`` at a time.
+    first: the first row of each pair's chunk. parts: all rows, ``NUM_ROWS`` at a time.
     """
 
     first: Record
@@ -132,29 +132,29 @@ class Batch(NamedTuple):
 
 
 class Batches:
-    """The batches of lanes: pairs of all lanes and the first model, then of the second, and so on.
+    """Batches of chunks: pairs of all chunks and the first model, then of the second, and so on.
 
     One size serves logs of any length, rate and channels.
     """
 
-    def __init__(self, lanes: Lanes):
-        nowhere = np.zeros((*lanes.row.shape, 3))
-        record, gyro_b = lanes.record, lanes.measured.get("w", nowhere + np.nan)
-        force_b = lanes.measured.get("f", nowhere)
+    def __init__(self, chunks: Chunks):
+        nowhere = np.zeros((*chunks.row.shape, 3))
+        record, gyro_b = chunks.record, chunks.measured.get("w", nowhere + np.nan)
+        force_b = chunks.measured.get("f", nowhere)
         self._record, self._gyro_b = record, gyro_b
         self._measured = Measured(record.quat, record.vel_w, record.battery_v, gyro_b, force_b)
-        self._num_rows, self._num_lanes = lanes.row.shape
+        self._num_rows, self._num_chunks = chunks.row.shape
         self._known: dict[int, Batch] = {}
 
     def at(self, first_pair: int) -> Batch:
-        """Return the batch that begins with a pair, made once for each lane it begins with."""
-        first_lane = first_pair % self._num_lanes
-        if first_lane not in self._known:
-            self._known[first_lane] = self._beginning_with(first_lane)
-        return self._known[first_lane]
+        """Return the batch that begins with a pair, made once for each chunk it begins with."""
+        first_chunk = first_pair % self._num_chunks
+        if first_chunk not in self._known:
+            self._known[first_chunk] = self._beginning_with(first_chunk)
+        return self._known[first_chunk]
 
-    def _beginning_with(self, first_lane: int) -> Batch:
-        pair = (first_lane + np.arange(NUM_PAIRS)) % self._num_lanes
+    def _beginning_with(self, first_chunk: int) -> Batch:
+        pair = (first_chunk + np.arange(NUM_PAIRS)) % self._num_chunks
 
         def at(first: int, values: Any) -> Any:
             row = np.minimum(first + np.arange(NUM_ROWS), self._num_rows - 1)
@@ -181,7 +181,7 @@ class Window(NamedTuple):
 class Slopes(NamedTuple):
     """A model's residuals, and how they change along columns, not whitened.
 
-    residuals: (rows, lanes, NUM_AXES, 2). columns: (num_columns, rows, lanes, NUM_AXES, 2).
+    residuals: (rows, chunks, NUM_AXES, 2). columns: (num_columns, rows, chunks, NUM_AXES, 2).
 
     places: the parameters of the first columns; ways to other vectors follow.
     """
@@ -199,11 +199,11 @@ class Problem:
     like: the nominal model with every effect, float64. given_effects: those that the nominal model
     has. low, high, scale: of each parameter, its bounds and the size of its steps. noise: (6,
     NUM_AXES), as of ``noise.fit_noise``, and its filter; the least one before ``with_noise``. late:
-    of lanes whose poses were corrected. windows: of the effects that act for a part of the log
+    of chunks whose poses were corrected. windows: of the effects that act for a part of the log
     only.
     """
 
-    lanes: Lanes
+    chunks: Chunks
     like: ModelParameters
     given_effects: tuple[str, ...]
     names: tuple[str, ...]
@@ -220,12 +220,12 @@ class Problem:
     @classmethod
     def of(
         cls,
-        lanes: Lanes,
+        chunks: Chunks,
         model: ModelParameters,
         effects: Sequence[Effect] = SEARCHED,
         late: Late | None = None,
     ) -> Self:
-        """Return the problem of lanes and a nominal model, with the least noise.
+        """Return the problem of chunks and a nominal model, with the least noise.
 
         effects: those that the model may have.
         """
@@ -234,30 +234,30 @@ class Problem:
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), every)
         names, start = names_of(like), to_vector(like)
         low, high = np.array([range_of(name)[:2] for name in names]).T
-        noise = noises.least_noise(lanes)
+        noise = noises.least_noise(chunks)
         return cls(
-            lanes=lanes,
+            chunks=chunks,
             like=like,
             given_effects=tuple(effect_of(one).name for one in model.effects),
             names=names,
             start=start,
             low=low,
-            high=np.minimum(high, _longest(names, lanes)),
+            high=np.minimum(high, _longest(names, chunks)),
             scale=np.array([_scale(name, value) for name, value in zip(names, start, strict=True)]),
-            batches=Batches(lanes),
+            batches=Batches(chunks),
             noise=noise,
-            whitener=noises.Whitener(lanes, noise),
+            whitener=noises.Whitener(chunks, noise),
             late=late,
         )
 
     def with_noise(self, noise: np.ndarray) -> "Problem":
         """Return the same problem, weighted by a noise, (6, NUM_AXES)."""
-        return replace(self, noise=noise, whitener=noises.Whitener(self.lanes, noise))
+        return replace(self, noise=noise, whitener=noises.Whitener(self.chunks, noise))
 
-    def with_lanes(self, lanes: Lanes) -> "Problem":
-        """Return the same problem of other lanes."""
-        whitener = noises.Whitener(lanes, self.noise)
-        return replace(self, lanes=lanes, batches=Batches(lanes), whitener=whitener)
+    def with_chunks(self, chunks: Chunks) -> "Problem":
+        """Return the same problem of other chunks."""
+        whitener = noises.Whitener(chunks, self.noise)
+        return replace(self, chunks=chunks, batches=Batches(chunks), whitener=whitener)
 
     def with_law(self, law: LearnedLaw) -> "Problem":
         """Return the problem whose vectors end with the numbers of a law.
@@ -292,11 +292,11 @@ class Problem:
 
     @property
     def counts(self) -> np.ndarray:
-        """What is to be explained, (rows, lanes, NUM_AXES, 2) bool."""
-        return self.lanes.counts
+        """What is to be explained, (rows, chunks, NUM_AXES, 2) bool."""
+        return self.chunks.counts
 
     def residuals(self, vectors: np.ndarray) -> np.ndarray:
-        """Return residuals (num_models, rows, lanes, NUM_AXES, 2) of models.
+        """Return residuals (num_models, rows, chunks, NUM_AXES, 2) of models.
 
         vectors: (num_models, parameters).
 
@@ -307,17 +307,17 @@ class Problem:
         return found if self.late is None else self.late.residuals(found)
 
     def _replayed(self, vectors: np.ndarray) -> np.ndarray:
-        rows, lanes = self.lanes.row.shape
-        number = len(vectors) * lanes
+        rows, chunks = self.chunks.row.shape
+        number = len(vectors) * chunks
         pairs = np.zeros((rows, number, NUM_AXES, 2))
         for first in range(0, number, NUM_PAIRS):
             own = np.minimum(first + np.arange(NUM_PAIRS), number - 1)
-            found = self._replay_pairs(vectors[own // lanes], self.batches.at(first))
+            found = self._replay_pairs(vectors[own // chunks], self.batches.at(first))
             pairs[1:, first : first + NUM_PAIRS] = found[:, : number - first]
-        result = np.swapaxes(pairs.reshape(rows, len(vectors), lanes, NUM_AXES, 2), 0, 1)
-        result *= self.lanes.is_joined[..., None, None]
+        result = np.swapaxes(pairs.reshape(rows, len(vectors), chunks, NUM_AXES, 2), 0, 1)
+        result *= self.chunks.is_joined[..., None, None]
         for name, axes in zip(("w", "f"), AXES, strict=False):
-            if name not in self.lanes.measured:
+            if name not in self.chunks.measured:
                 result[..., axes, 0] = 0.0
         return result
 
@@ -327,12 +327,12 @@ class Problem:
         for rows in batch.parts:
             states, residuals = _replay_rows(vectors, self.like, states, rows)
             parts.append(residuals)
-        return np.concatenate(parts)[: len(self.lanes.row) - 1]
+        return np.concatenate(parts)[: len(self.chunks.row) - 1]
 
     def _composed(self, vectors: np.ndarray) -> np.ndarray:
         """Return residuals of models whose effects act in windows; each row is of one replay."""
         found = self._replayed(vectors)
-        row = self.lanes.row
+        row = self.chunks.row
         acts = np.stack([(row >= one.start) & (row < one.end) for one in self.windows])
         for acting in np.unique(acts.reshape(len(acts), -1), axis=1).T:
             if not acting.all():
@@ -358,11 +358,11 @@ class Problem:
         return vectors
 
     def whiten(self, left: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
-        """Return residuals (num_models, rows, lanes, axes, 2) of some axes as innovations."""
+        """Return residuals (num_models, rows, chunks, axes, 2) of some axes as innovations."""
         return self.whitener(left, axes)
 
     def whitened_residuals(self, *vectors: np.ndarray) -> np.ndarray:
-        """Return the innovations of models, (num_models, rows, lanes, NUM_AXES, 2)."""
+        """Return the innovations of models, (num_models, rows, chunks, NUM_AXES, 2)."""
         return self.whiten(self.residuals(np.stack(vectors)))
 
     def clipped(self, vectors: np.ndarray) -> np.ndarray:
@@ -412,9 +412,9 @@ def vector_of(model: ModelParameters) -> np.ndarray:
     return to_vector(as_replayed(model).with_effects(*(model.effect(one.name) for one in SEARCHED)))
 
 
-def _longest(names: Sequence[str], lanes: Lanes) -> np.ndarray:
+def _longest(names: Sequence[str], chunks: Chunks) -> np.ndarray:
     """Return the longest delays that effects remember, s; infinity for other parameters."""
-    step_s = float(np.median(lanes.record.step_s))
+    step_s = float(np.median(chunks.record.step_s))
     fields = [name.partition(".") for name in names]
     steps = [
         BY_NAME[effect].max_steps.get(field, np.inf) if field else np.inf
@@ -442,14 +442,14 @@ def robust_square(white: np.ndarray) -> float:
 
 
 def blocks_of(values: np.ndarray) -> np.ndarray:
-    """Reshape (..., rows, lanes, axes, 2) to blocks of a second, (blocks, ..., numbers).
+    """Reshape (..., rows, chunks, axes, 2) to blocks of a second, (blocks, ..., numbers).
 
     The lead-in is left out.
     """
-    rows, lanes = values.shape[-4:-2]
+    rows, chunks = values.shape[-4:-2]
     kept = values[..., lead_in_of(rows) :, :, :, :]
-    second = kept.shape[-4] // LANE_S
-    split = kept.reshape(*kept.shape[:-4], LANE_S, second, lanes, kept.shape[-2] * 2)
+    second = kept.shape[-4] // CHUNK_S
+    split = kept.reshape(*kept.shape[:-4], CHUNK_S, second, chunks, kept.shape[-2] * 2)
     return np.moveaxis(split, (-4, -2), (0, 1)).reshape(
-        LANE_S * lanes, *kept.shape[:-4], second * kept.shape[-2] * 2
+        CHUNK_S * chunks, *kept.shape[:-4], second * kept.shape[-2] * 2
     )

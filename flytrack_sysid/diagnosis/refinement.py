@@ -36,12 +36,12 @@ from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import DRAIN, from_vector, in_batches
 from flytrack_sysid.prediction_windows import (
-    CHUNK,
     HORIZONS_S,
     QUANTITIES,
     UNITS,
+    WINDOWS_PER_BATCH,
     Windows,
-    chunks_of,
+    batches_of,
     make_windows,
     prediction_errors,
 )
@@ -50,7 +50,7 @@ from flytrack_sysid.trace_cache import keep_trace
 BATCH = 8  # models at once
 SPACING_S, SHORT_SPACING_S = 0.25, 0.05
 # To fit and to judge by. Windows overlap: fewer say nearly as much, and a fit flies them often.
-MAX_FITTED_WINDOWS, MAX_SCORED_WINDOWS = CHUNK, 3 * CHUNK
+MAX_FITTED_WINDOWS, MAX_SCORED_WINDOWS = WINDOWS_PER_BATCH, 3 * WINDOWS_PER_BATCH
 MIN_WINDOWS, MIN_BLOCKS = 12, 3  # fewer say nothing of a cell
 RIDGE = 0.05  # of the placebo, in units of its regressors' variance
 ALWAYS_FITTED_S = 0.25  # horizons up to this are fitted even where the placebo is as good
@@ -75,7 +75,7 @@ LIKELY_WORSE, WORSE_ANYWHERE = 1.005, 2.0
 SURELY_WORSE = 3.0
 
 
-class Tested(NamedTuple):
+class FlightErrors(NamedTuple):
     """Errors on windows, measured minus predicted: (models, horizons, windows, quantities, 3)."""
 
     errors: np.ndarray
@@ -106,7 +106,7 @@ class Tested(NamedTuple):
         """The rms errors of the first model to divide by, (horizons, quantities); 1 if none."""
         return np.maximum(np.nan_to_num(self.rms()[0], nan=1.0), 1e-9)
 
-    def against(self, base: "Tested") -> tuple[np.ndarray, np.ndarray]:
+    def against(self, base: "FlightErrors") -> tuple[np.ndarray, np.ndarray]:
         """Return the errors over a base's, and by how many standard errors they are larger.
 
         Both are (horizons, quantities).
@@ -128,20 +128,20 @@ def _errors(vectors: jax.Array, like: ModelParameters, windows: Windows) -> jax.
     return jax.vmap(lambda vector: prediction_errors(from_vector(vector, like), windows))(vectors)
 
 
-def errors_at(problem: Problem, vectors: np.ndarray, windows: Windows) -> Tested:
+def errors_at(problem: Problem, vectors: np.ndarray, windows: Windows) -> FlightErrors:
     """Return the errors of models on windows; one compiled program serves all.
 
     vectors: (num_vectors, num_parameters).
     """
 
     def of_batch(part: np.ndarray) -> np.ndarray:
-        found = [np.asarray(_errors(part, problem.like, chunk)) for chunk in chunks_of(windows)]
+        found = [np.asarray(_errors(part, problem.like, batch)) for batch in batches_of(windows)]
         return np.concatenate(found, axis=2)[:, :, : len(windows.start)]
 
     errors = in_batches(of_batch, vectors, BATCH)
     # A model that runs away is as bad as can be, but still a number.
     errors = np.nan_to_num(np.clip(errors, -1e6, 1e6), nan=1e6)
-    return Tested(errors.reshape(*errors.shape[:-1], len(QUANTITIES), 3), windows)
+    return FlightErrors(errors.reshape(*errors.shape[:-1], len(QUANTITIES), 3), windows)
 
 
 def _regressors(windows: Windows) -> np.ndarray:
@@ -165,14 +165,15 @@ def _changes(windows: Windows) -> np.ndarray:
     return np.stack(found)
 
 
-def placebo_errors(learnt: Windows, judged: Windows) -> np.ndarray:
+def placebo_errors(learnt: Windows, held_out_windows: Windows) -> np.ndarray:
     """Return the errors of ridge regression on the start state, (1, horizons, windows, ...)."""
     known, wanted = _regressors(learnt), _changes(learnt)
     mean, spread = known.mean(axis=0), known.std(axis=0) + 1e-9
     rows, others = (
-        np.c_[(one - mean) / spread, np.ones(len(one))] for one in (known, _regressors(judged))
+        np.c_[(one - mean) / spread, np.ones(len(one))]
+        for one in (known, _regressors(held_out_windows))
     )
-    measured, errors = _changes(judged), []
+    measured, errors = _changes(held_out_windows), []
     for index in range(len(HORIZONS_S)):
         used = learnt.counts[index].any(axis=-1)
         # Without a window that is so long, it predicts no change, and nothing is judged there.
@@ -184,7 +185,7 @@ def placebo_errors(learnt: Windows, judged: Windows) -> np.ndarray:
         turns = (Rotation.from_rotvec(one[:, 0]) for one in (predicted, measured[index]))
         left[:, 0] = (next(turns).inv() * next(turns)).as_rotvec()
         errors.append(left)
-    return np.where(judged.counts[..., None], np.stack(errors), 0.0)[None]
+    return np.where(held_out_windows.counts[..., None], np.stack(errors), 0.0)[None]
 
 
 class Fit(NamedTuple):
@@ -274,7 +275,7 @@ class Target(NamedTuple):
         return covariance * stats.t.ppf(0.975, number - 1) ** 2
 
 
-class Judge(NamedTuple):
+class FlightTest(NamedTuple):
     """Held-out windows, errors of the refitted base and the placebo there, and cells of evidence.
 
     scale: the base's rms errors, (horizons, quantities). matters: (horizons, quantities) bool, a
@@ -283,19 +284,29 @@ class Judge(NamedTuple):
 
     problem: Problem
     windows: Windows
-    base: Tested
-    placebo: Tested
+    base: FlightErrors
+    placebo: FlightErrors
     scale: np.ndarray
     matters: np.ndarray
 
     @classmethod
-    def of(cls, problem: Problem, learnt: Windows, judged: Windows, base: np.ndarray) -> "Judge":
+    def of(
+        cls, problem: Problem, learnt: Windows, held_out_windows: Windows, base: np.ndarray
+    ) -> "FlightTest":
         """Return the judge of a base model before anything is known to matter."""
-        tested, placebo = errors_at(problem, base[None], judged), placebo_errors(learnt, judged)
-        nothing = np.zeros(tested.scale.shape, bool)
-        return cls(problem, judged, tested, Tested(placebo, judged), tested.scale, nothing).seeing(
-            base
+        tested, placebo = (
+            errors_at(problem, base[None], held_out_windows),
+            placebo_errors(learnt, held_out_windows),
         )
+        nothing = np.zeros(tested.scale.shape, bool)
+        return cls(
+            problem,
+            held_out_windows,
+            tested,
+            FlightErrors(placebo, held_out_windows),
+            tested.scale,
+            nothing,
+        ).seeing(base)
 
     @property
     def is_known(self) -> np.ndarray:
@@ -304,11 +315,11 @@ class Judge(NamedTuple):
         blocks = self.windows.sums_by_block(counts.swapaxes(0, 1).astype(int))
         return (counts.sum(axis=1) >= MIN_WINDOWS) & ((blocks > 0).sum(axis=0) >= MIN_BLOCKS)
 
-    def tested(self, *vectors: np.ndarray) -> Tested:
+    def tested(self, *vectors: np.ndarray) -> FlightErrors:
         """Return the errors of models on the held-out windows."""
         return errors_at(self.problem, np.stack(vectors), self.windows)
 
-    def seeing(self, vector: np.ndarray) -> "Judge":
+    def seeing(self, vector: np.ndarray) -> "FlightTest":
         """Return the judge that also counts cells as evidence where a model beats the placebo."""
         lost = self.placebo.by_block(self.scale)[0] - self.tested(vector).by_block(self.scale)[0]
         beats = sureness(lost) > SURE_OF_COMMANDS
@@ -350,7 +361,7 @@ class Refined(NamedTuple):
     removed: tuple[str, ...]
     without: Mapping[str, np.ndarray]
     problem: Problem
-    judge: Judge | None
+    flight_test: FlightTest | None
 
     def with_law(self, law: LearnedLaw) -> "Refined":
         """Return the same of the problem with a law, its base without it."""
@@ -363,9 +374,9 @@ class Refined(NamedTuple):
     @property
     def removal_costs(self) -> dict[str, float]:
         """By which share the held-out error grows without an effect, all else refitted."""
-        if self.judge is None or self.fit is None or not self.without:
+        if self.flight_test is None or self.fit is None or not self.without:
             return {}
-        losses = self.judge.losses(self.fit.vector, *self.without.values()).sum(axis=1)
+        losses = self.flight_test.losses(self.fit.vector, *self.without.values()).sum(axis=1)
         costs = np.sqrt(losses[1:] / losses[0]) - 1.0
         return {name: float(cost) for name, cost in zip(self.without, costs, strict=True)}
 
@@ -384,9 +395,9 @@ class Refined(NamedTuple):
 
         Of position, or of what the log has instead: attitude, or else rates.
         """
-        if self.judge is None:
+        if self.flight_test is None:
             return {}
-        found = table_of(self.judge.tested(vector).rms()[0])
+        found = table_of(self.flight_test.tested(vector).rms()[0])
         keys = (
             f"{name}_{UNITS[name].replace('/', '_per_')}"
             for name in ("position", "attitude", "rates")
@@ -397,8 +408,8 @@ class Refined(NamedTuple):
 def windows_of(log: FlightLog, rows: np.ndarray, most: int = MAX_SCORED_WINDOWS) -> Windows | None:
     """Return windows over some rows of a log; None where there are none."""
     found = make_windows(log, rows, SPACING_S, most)
-    if len(found.start) < CHUNK:  # a chunk costs the same, full or not
-        found = make_windows(log, rows, SHORT_SPACING_S, CHUNK)
+    if len(found.start) < WINDOWS_PER_BATCH:  # a chunk costs the same, full or not
+        found = make_windows(log, rows, SHORT_SPACING_S, WINDOWS_PER_BATCH)
     return found if len(found.start) else None
 
 
@@ -447,19 +458,24 @@ def refine(
     residuals leave noise only; the model is then the most likely one already, and stands as long as
     it predicts no horizon worse than the base.
     """
-    learnt, judged = windows_of(log, ~held_out, MAX_FITTED_WINDOWS), windows_of(log, held_out)
+    learnt, held_out_windows = (
+        windows_of(log, ~held_out, MAX_FITTED_WINDOWS),
+        windows_of(log, held_out),
+    )
     problem, candidates, extended = state.problem, model.candidates, model.vector
     as_found = Refined(candidates, None, None, (), {}, problem, None)
-    if learnt is None or judged is None:
+    if learnt is None or held_out_windows is None:
         return as_found
-    judge = Judge.of(problem, learnt, judged, base.vector).seeing(extended)
-    as_found = as_found._replace(judge=judge)
-    if not candidates or not judge.is_known.any():
+    flight_test = FlightTest.of(problem, learnt, held_out_windows, base.vector).seeing(extended)
+    as_found = as_found._replace(flight_test=flight_test)
+    if not candidates or not flight_test.is_known.any():
         return as_found
     acting = _acting(problem, _probed(problem, extended, candidates), candidates, learnt)
-    found = _Refinement(judge, learnt, base.vector, tuple(state.base_places), acting, is_explained)
+    found = _Refinement(
+        flight_test, learnt, base.vector, tuple(state.base_places), acting, is_explained
+    )
     is_at_bound = bool(at_bounds(problem, extended, found.fields_of(candidates)))
-    if is_explained and not is_at_bound and not judge.is_surely_worse(extended):
+    if is_explained and not is_at_bound and not flight_test.is_surely_worse(extended):
         return as_found
     return found.run(extended, as_found)
 
@@ -471,7 +487,7 @@ class _Refinement(NamedTuple):
     see, whose values stay as they are. is_explained: as in ``refine``.
     """
 
-    judge: Judge
+    flight_test: FlightTest
     learnt: Windows
     base: np.ndarray
     base_places: tuple[int, ...]
@@ -486,7 +502,7 @@ class _Refinement(NamedTuple):
         """Return what is fitted: cells that are evidence, and short horizons."""
         scale = errors_at(problem, self.base[None], self.learnt).scale
         is_short = (np.array(HORIZONS_S) <= ALWAYS_FITTED_S)[:, None]
-        return Target(problem, self.learnt, scale, self.judge.matters | is_short)
+        return Target(problem, self.learnt, scale, self.flight_test.matters | is_short)
 
     def places(self, problem: Problem, candidates: Sequence[Candidate]) -> list[int]:
         """Return the free places that act on the windows."""
@@ -509,35 +525,35 @@ class _Refinement(NamedTuple):
             problem = widened(problem, stuck)
             target = target._replace(problem=problem)
             fit = target.fitted(fit.vector, fit.places, MAX_ROUNDS)
-        judge = self.judge.seeing(fit.vector)
+        flight_test = self.flight_test.seeing(fit.vector)
         base = target.fitted(self.base, self.places(problem, ()), MAX_ROUNDS).vector
-        found = as_found._replace(fit=fit, base=base, problem=problem, judge=judge)
+        found = as_found._replace(fit=fit, base=base, problem=problem, flight_test=flight_test)
         return self._eliminate(found, target)
 
     def _eliminate(self, found: Refined, target: Target) -> Refined:
         """Return the model without effects that are not needed, or that make any horizon worse."""
-        assert found.fit is not None and found.judge is not None
-        judge, fit, without = found.judge, found.fit, {}
+        assert found.fit is not None and found.flight_test is not None
+        flight_test, fit, without = found.flight_test, found.fit, {}
         kept = [one for one in found.kept if not _is_neutral(found.problem, fit.vector, one.fields)]
         removed = [one.effect for one in found.kept if one not in kept]
         while any(one.effect in self.acting for one in kept):
             tried = [one for one in kept if one.effect in self.acting]
             fits = [self._without(target, fit, kept, one) for one in tried]
-            losses = judge.losses(fit.vector, *(one.vector for one in fits))
+            losses = flight_test.losses(fit.vector, *(one.vector for one in fits))
             sure = np.array([sureness(one - losses[0]) for one in losses[1:]])
             worth = np.sqrt(losses[1:].sum(axis=1) / losses[0].sum()) - 1.0
             needed = np.where(
                 (worth >= WORTHWHILE) & (sure >= LIKELY), np.maximum(sure, SURE), sure
             )
-            needed[:] = needed if judge.matters.any() else np.inf  # nothing that could tell
+            needed[:] = needed if flight_test.matters.any() else np.inf  # nothing that could tell
             without = {one.effect: less.vector for one, less in zip(tried, fits, strict=True)}
-            if self.is_explained and not judge.is_surely_worse(fit.vector):
+            if self.is_explained and not flight_test.is_surely_worse(fit.vector):
                 break
             weakest = int(np.argmin(needed))
             if needed[weakest] >= SURE:
-                if judge.worst_ratio(fit.vector) < 1.0:
+                if flight_test.worst_ratio(fit.vector) < 1.0:
                     break
-                weakest = int(np.argmin([judge.worst_ratio(one.vector) for one in fits]))
+                weakest = int(np.argmin([flight_test.worst_ratio(one.vector) for one in fits]))
             kept.remove(tried[weakest])
             removed.append(tried[weakest].effect)
             places = self.places(target.problem, kept)
@@ -614,7 +630,7 @@ def reduced(selection: Selection, refined: Refined) -> Selection:
         )
     if refined.kept:
         kept = selection if refined.kept == model.candidates else _narrowed(selection, refined.kept)
-        if not _flies_worse(kept, refined.judge):
+        if not _flies_worse(kept, refined.flight_test):
             return kept
     state, base = selection.state, selection.base
     # What an effect that is gone held at nominal is free again, as it was when the base was fitted.
@@ -635,14 +651,14 @@ def _narrowed(selection: Selection, kept: Sequence[Candidate]) -> Selection:
     return selection._replace(state=state, model=model, ablations=ablations)
 
 
-def _flies_worse(selection: Selection, judge: Judge | None) -> bool:
+def _flies_worse(selection: Selection, flight_test: FlightTest | None) -> bool:
     """Return whether a model predicts held-out flights worse than its base does.
 
     The model is the one after its last change within the log.
     """
-    if judge is None:
+    if flight_test is None:
         return False
     vector = selection.state.problem.without(selection.model.vector, ended(selection))
     if selection.unexplained.flagged:
-        return judge.worst_ratio(vector) >= 1.0
-    return judge.is_surely_worse(vector)
+        return flight_test.worst_ratio(vector) >= 1.0
+    return flight_test.is_surely_worse(vector)

@@ -8,7 +8,7 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis.beyond import Learned
-from flytrack_sysid.diagnosis.lanes import AXES
+from flytrack_sysid.diagnosis.chunks import AXES
 
 SCHEMA = 1
 TO_LOG = "log "  # what comes instead of a manoeuvre where a channel is missing

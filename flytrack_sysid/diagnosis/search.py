@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.lanes import voltages_of
+from flytrack_sysid.diagnosis.chunks import voltages_of
 from flytrack_sysid.diagnosis.problem import NUM_PAIRS, SEARCHED, Problem
 from flytrack_sysid.diagnosis.score_test import (
     Candidate,
@@ -75,7 +75,7 @@ class FittedModel(NamedTuple):
         return (*rest, candidate._replace(fields=fields))
 
 
-class Held(NamedTuple):
+class HeldParameter(NamedTuple):
     """A base parameter held at nominal; effect: what explains its change, "" if none does."""
 
     field: str
@@ -94,7 +94,7 @@ class SearchState:
     problem: Problem
     unobservable: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
-    held: tuple[Held, ...] = ()
+    held: tuple[HeldParameter, ...] = ()
     linearization: Linearization | None = None
 
     @classmethod
@@ -103,14 +103,14 @@ class SearchState:
 
         problem: of rows of the log.
         """
-        noise = noises.first_guess(problem.lanes, problem.residuals(problem.start[None])[0])
-        channels = {*log.channels, *problem.lanes.measured}
+        noise = noises.first_guess(problem.chunks, problem.residuals(problem.start[None])[0])
+        channels = {*log.channels, *problem.chunks.measured}
         lacking = tuple(
             effect.name for effect in SEARCHED if not set(effect.search.needs) <= channels
         )
         # The replay's voltage is then assumed at every row; what falls within a step would pass for
         # thrust.
-        held = () if voltages_of(problem.lanes) else (Held(DRAIN, ""),)
+        held = () if voltages_of(problem.chunks) else (HeldParameter(DRAIN, ""),)
         return cls(problem.with_noise(noise), unobservable=lacking, held=held)
 
     @property
@@ -208,7 +208,7 @@ def _step(problem: Problem, now: Linearization) -> tuple[float, Linearization]:
 
     As many shares are tried at once as are replayed at once.
     """
-    step, at_once = now.step_inside(), max(NUM_PAIRS // problem.lanes.row.shape[1], 1)
+    step, at_once = now.step_inside(), max(NUM_PAIRS // problem.chunks.row.shape[1], 1)
     promised = float(step @ now.score)
     best, gained = now, -np.inf
     for first in range(0, len(STEP_SHARES), at_once):
@@ -355,7 +355,7 @@ def with_noise_of(state: SearchState, model: FittedModel) -> tuple[SearchState, 
     """
     state, linearization = state.linearized(model.vector)
     left = saturated_residuals(linearization)
-    state = state.with_noise(noises.fit_noise(state.problem.lanes, left, state.problem.noise))
+    state = state.with_noise(noises.fit_noise(state.problem.chunks, left, state.problem.noise))
     state, linearization = state.linearized(model.vector)
     return state, state.fitted(model.candidates, model.vector, linearization)
 

@@ -72,7 +72,7 @@ def _change(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> np.n
 
 def _is_base_notable(fields: Sequence[str], problem: Problem, vector: np.ndarray) -> bool:
     if fields == THRUST_COEFFS:
-        stick, volt = problem.lanes.record.command[..., 3], problem.lanes.record.battery_v
+        stick, volt = problem.chunks.record.command[..., 3], problem.chunks.record.battery_v
         more = collective_thrust(stick, volt, _change(problem, vector, fields))
         weight = float(problem.like.m) * float(problem.like.g)
         return bool(np.sqrt(np.mean(np.square(more))) >= NOTABLE_THRUST * weight)

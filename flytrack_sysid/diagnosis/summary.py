@@ -8,8 +8,8 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_env.effects import BY_NAME, effect_of
 from flytrack_sysid.diagnosis import vetoes
+from flytrack_sysid.diagnosis.chunks import voltages_of
 from flytrack_sysid.diagnosis.identifiability import advise, unit_of, unseen_effects
-from flytrack_sysid.diagnosis.lanes import voltages_of
 from flytrack_sysid.diagnosis.model_selection import (
     BaseChange,
     Marginal,
@@ -82,7 +82,7 @@ def estimates(
 
 def mean_thrust(problem: Problem) -> np.ndarray:
     """Return the mean thrust of judged rows, N, per unit of each thrust coefficient, (6,)."""
-    record, flown = problem.lanes.record, problem.counts.any(axis=(2, 3))
+    record, flown = problem.chunks.record, problem.counts.any(axis=(2, 3))
     return np.array(
         [
             np.mean(
@@ -344,7 +344,7 @@ def sensor_noise(problem: Problem) -> dict[str, list[float]]:
 
 
 def _with_voltage_summed(left: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return residuals with those of the battery summed up, less their mean in each lane.
+    """Return residuals with those of the battery summed up, less their mean in each chunk.
 
     A voltage changes by less in a step than its last digit, so that a single step tells nothing of
     it.
@@ -492,19 +492,19 @@ def with_refined_values(
 
 def prediction_of(refined: Refined, vectors: Mapping[str, np.ndarray]) -> Prediction:
     """Return how far ahead models predict held-out flights; empty if too few could be judged."""
-    judge = refined.judge
-    if judge is None:
+    flight_test = refined.flight_test
+    if flight_test is None:
         return Prediction()
     models = dict(vectors)
     if refined.base is not None:
         models["refitted_to_flights"] = refined.base
-    found = errors_at(refined.problem, np.stack(list(models.values())), judge.windows).rms()
+    found = errors_at(refined.problem, np.stack(list(models.values())), flight_test.windows).rms()
     errors = {name: table_of(one) for name, one in zip(models, found, strict=True)}
-    errors["placebo"] = table_of(judge.placebo.rms()[0])
+    errors["placebo"] = table_of(flight_test.placebo.rms()[0])
     evidence = {
-        quantity: tuple(float(one) for one in np.array(HORIZONS_S)[judge.matters[:, index]])
+        quantity: tuple(float(one) for one in np.array(HORIZONS_S)[flight_test.matters[:, index]])
         for index, quantity in enumerate(QUANTITIES)
-        if judge.is_known[:, index].any()
+        if flight_test.is_known[:, index].any()
     }
     return Prediction(errors, evidence, refined.removal_costs)
 
@@ -540,8 +540,8 @@ def changed_parameters(
 
 def refinement_notes(refined: Refined, model: FittedModel) -> list[str]:
     """Return what a refinement found out beside values; model: what is left of the selected one."""
-    judge = refined.judge
-    if judge is None:
+    flight_test = refined.flight_test
+    if flight_test is None:
         return []
     notes = []
     removed = [
@@ -561,7 +561,7 @@ def refinement_notes(refined: Refined, model: FittedModel) -> list[str]:
     silent = [
         f"{HORIZONS_S[index]:g} s"
         for index in range(len(HORIZONS_S))
-        if judge.is_known[index].any() and not judge.matters[index].any()
+        if flight_test.is_known[index].any() and not flight_test.matters[index].any()
     ]
     if silent and refined.fit is not None:
         notes.append(
@@ -642,10 +642,10 @@ def _at_bound(cause: Cause) -> str:
 def _voltage_unknown(problem: Problem, causes: Sequence[Cause]) -> list[str]:
     """Return a warning where thrust is named and the voltage it depends on was not measured."""
     thrust = [cause.effect for cause in causes if cause.effect in ("thrust_curve", "thrust_scale")]
-    if not thrust or voltages_of(problem.lanes) is not None:
+    if not thrust or voltages_of(problem.chunks) is not None:
         return []
     assumed = (
-        f"no voltage was logged and {problem.lanes.record.battery_v.flat[0]:.4g} V were assumed"
+        f"no voltage was logged and {problem.chunks.record.battery_v.flat[0]:.4g} V were assumed"
     )
     return [f"{assumed}: {thrust[0]} may only be the error of that"]
 

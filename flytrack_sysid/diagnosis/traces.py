@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters, lag
 from flytrack_env.state import Action
-from flytrack_sysid.diagnosis.lanes import Lanes, lanes_of, lead_in_of
+from flytrack_sysid.diagnosis.chunks import Chunks, cut_chunks, lead_in_of
 from flytrack_sysid.diagnosis.lateness import latency_of, read_poses
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import PLACES
@@ -114,7 +114,7 @@ REGRESSORS: dict[str, tuple[str, str]] = {
 
 @jax.jit
 def _lagged(record: Record, tau: np.ndarray) -> Action:
-    """Return the applied action at the rows of lanes: commands after lags, (rows, lanes) each."""
+    """Return the applied action at the rows of chunks: commands after lags, (rows, chunks) each."""
 
     def next_row(applied: Action, row: Record) -> tuple[Action, Action]:
         restarts = row.begins | row.is_applied_known
@@ -128,7 +128,7 @@ def _lagged(record: Record, tau: np.ndarray) -> Action:
 
 
 class _Rows(NamedTuple):
-    """Where the log's rows are in lanes, and what was fed in there.
+    """Where the log's rows are in chunks, and what was fed in there.
 
     place: of the record's rows; kept: of these, the log's rows. record: in that order. before:
     attitude in the row before each of the log's.
@@ -140,26 +140,26 @@ class _Rows(NamedTuple):
     before: Rotation
 
     def along(self, values: np.ndarray) -> np.ndarray:
-        """Return values (rows, lanes, ...) in the record's order, filled rows included."""
+        """Return values (rows, chunks, ...) in the record's order, filled rows included."""
         return np.asarray(values)[self.place]
 
 
-def _rows_of(lanes: Lanes) -> _Rows:
+def _rows_of(chunks: Chunks) -> _Rows:
     row = np.where(
-        (np.arange(len(lanes.row)) >= lead_in_of(len(lanes.row)))[:, None], lanes.row, -1
+        (np.arange(len(chunks.row)) >= lead_in_of(len(chunks.row)))[:, None], chunks.row, -1
     )
-    lane, place = np.nonzero(row.T >= 0)  # lane after lane is the record's order
-    record = Record(*(leaf[place, lane] for leaf in lanes.record))
-    record = record._replace(begins=~lanes.is_joined[place, lane])
+    chunk, place = np.nonzero(row.T >= 0)  # chunk after chunk is the record's order
+    record = Record(*(leaf[place, chunk] for leaf in chunks.record))
+    record = record._replace(begins=~chunks.is_joined[place, chunk])
     kept = np.flatnonzero(record.source_row >= 0)
     before = Rotation.from_quat(np.roll(record.quat, 1, axis=0)[kept], scalar_first=True)
-    return _Rows((place, lane), kept, record, before)
+    return _Rows((place, chunk), kept, record, before)
 
 
 def _residuals(left: np.ndarray, rows: _Rows) -> dict[str, np.ndarray]:
     """Return the channels of one model on the log's rows.
 
-    left: (rows, lanes, NUM_AXES, 2), world frame.
+    left: (rows, chunks, NUM_AXES, 2), world frame.
     """
     along, record = rows.along(left), rows.record
     step_s = np.roll(record.step_s, 1)[:, None]
@@ -179,9 +179,9 @@ def _residuals(left: np.ndarray, rows: _Rows) -> dict[str, np.ndarray]:
     return found
 
 
-def _counts(lanes: Lanes, rows: _Rows) -> dict[str, np.ndarray]:
+def _counts(chunks: Chunks, rows: _Rows) -> dict[str, np.ndarray]:
     """Return where channels count; changes since a row that was lost do not."""
-    along, record = rows.along(lanes.counts), rows.record
+    along, record = rows.along(chunks.counts), rows.record
     after_measured = np.append(False, record.source_row[:-1] >= 0) & ~record.begins
     found = {name: along[:, axes, number].all(axis=1) for name, (axes, number) in PLACES.items()}
     return {
@@ -220,13 +220,13 @@ def _regressors(
 
 
 def _predicted(
-    residuals: dict[str, np.ndarray], lanes: Lanes, rows: _Rows, gravity: float
+    residuals: dict[str, np.ndarray], chunks: Chunks, rows: _Rows, gravity: float
 ) -> dict[str, np.ndarray]:
     """Return the rates and specific force that a model predicts: measured minus residual."""
     record, before = rows.record, rows.before
     step_s = np.roll(record.step_s, 1)[rows.kept, None]
-    if "w" in lanes.measured:
-        rates = rows.along(lanes.measured["w"])[rows.kept] - residuals["rates"]
+    if "w" in chunks.measured:
+        rates = rows.along(chunks.measured["w"])[rows.kept] - residuals["rates"]
     else:
         after = Rotation.from_quat(record.quat[rows.kept], scalar_first=True)
         rates = (before.inv() * after).as_rotvec() / step_s - residuals["attitude"]
@@ -261,24 +261,25 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
     log = in_time[latency_of(base)]
     with jax.enable_x64(True):
         by_lateness = {
-            late_s: lanes_of(one, np.ones(len(one), bool), base) for late_s, one in in_time.items()
+            late_s: cut_chunks(one, np.ones(len(one), bool), base)
+            for late_s, one in in_time.items()
         }
         left = []
         for model in models.values():
             problem = Problem.of(by_lateness[latency_of(model)], model._replace(motion=base.motion))
             left.append(problem.residuals(problem.start[None])[0])
-        lanes = by_lateness[latency_of(base)]
-        lagged = _lagged(lanes.record, np.asarray(base.tau, float))
+        chunks = by_lateness[latency_of(base)]
+        lagged = _lagged(chunks.record, np.asarray(base.tau, float))
         applied = np.stack([np.asarray(stick) for stick in lagged], axis=-1)
-    rows = _rows_of(lanes)
+    rows = _rows_of(chunks)
     residuals = {name: _residuals(one, rows) for name, one in zip(models, left, strict=True)}
     found = _regressors(base, rows.record, rows.along(applied))
     since = log.time - log.time[log.is_start()][np.cumsum(log.is_start()) - 1]
     step_s = float(np.median(rows.record.step_s))
     regressors = {"time": since, **{name: values[rows.kept] for name, values in found.items()}}
-    regressors |= _predicted(residuals[like], lanes, rows, float(base.g))
+    regressors |= _predicted(residuals[like], chunks, rows, float(base.g))
     slot = np.arange(len(rows.record.begins)) + BETWEEN_FLIGHTS * np.cumsum(rows.record.begins)
-    elapsed_s, counts = step_s * rows.kept, _counts(lanes, rows)
+    elapsed_s, counts = step_s * rows.kept, _counts(chunks, rows)
     row = np.flatnonzero(is_known)
     return Traces(
         residuals, counts, regressors, elapsed_s, slot[rows.kept], step_s, rows.before, row

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.state import ACTION_SIZE
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.lanes import AXES, lead_in_of
+from flytrack_sysid.diagnosis.chunks import AXES, lead_in_of
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_weight
 from flytrack_sysid.diagnosis.result import Unexplained
 from flytrack_sysid.diagnosis.score_test import inflation_of, solve, threshold
@@ -41,11 +41,11 @@ BUMP_PLACES, BUMP_WIDTHS_M = 24, (3.0, 8.0)
 BUMP_SIZE = 3  # features of one bump: a force along each world axis
 
 
-class Flown(NamedTuple):
-    """The flight at the step to each row: what a force or rate may depend on, (rows, lanes, ...).
+class FlightVariables(NamedTuple):
+    """The flight at the step to each row: what a force or rate may depend on, (rows, chunks, ...).
 
-    body_to_world: (rows, lanes, 3, 3). applied: action, and change: its derivative, 1/s; (rows,
-    lanes, 4). is_counted: bool, rows that are judged.
+    body_to_world: (rows, chunks, 3, 3). applied: action, and change: its derivative, 1/s; (rows,
+    chunks, 4). is_counted: bool, rows that are judged.
     """
 
     body_to_world: np.ndarray
@@ -57,23 +57,23 @@ class Flown(NamedTuple):
     is_counted: np.ndarray
 
 
-def flight_of(problem: Problem, model: FittedModel) -> Flown:
+def flight_of(problem: Problem, model: FittedModel) -> FlightVariables:
     """Return what was flown, with the lags of a model between commands and applied action."""
-    lanes, tau = problem.lanes, model.vector[problem.index(TAUS)]
+    chunks, tau = problem.chunks, model.vector[problem.index(TAUS)]
 
     def before(values: np.ndarray) -> np.ndarray:  # a step begins at the row before
         return np.concatenate([values[:1], values[:-1]])
 
-    record = lanes.record
+    record = chunks.record
     quat = before(record.quat).reshape(-1, 4)
     rotation = (
-        Rotation.from_quat(quat, scalar_first=True).as_matrix().reshape(*lanes.row.shape, 3, 3)
+        Rotation.from_quat(quat, scalar_first=True).as_matrix().reshape(*chunks.row.shape, 3, 3)
     )
     applied = _lagged(record.command, record.step_s, tau)
     change = (record.command - applied) / tau
-    time_s = np.where(lanes.row >= 0, lanes.row, 0) * float(np.median(noises.step_to(lanes)))
-    is_counted = np.asarray(lanes.counts.any(axis=(2, 3)))
-    return Flown(
+    time_s = np.where(chunks.row >= 0, chunks.row, 0) * float(np.median(noises.step_to(chunks)))
+    is_counted = np.asarray(chunks.counts.any(axis=(2, 3)))
+    return FlightVariables(
         rotation,
         before(record.pos_w),
         before(record.vel_w),
@@ -85,7 +85,7 @@ def flight_of(problem: Problem, model: FittedModel) -> Flown:
 
 
 def _lagged(command: np.ndarray, step_s: np.ndarray, tau: np.ndarray) -> np.ndarray:
-    """Return commands after a first-order lag, whose start the lead-in of lanes forgets."""
+    """Return commands after a first-order lag, whose start the lead-in of chunks forgets."""
     applied = command.copy()
     for row in range(1, len(command)):
         keep = np.exp(-step_s[row - 1, :, None] / tau)
@@ -94,14 +94,14 @@ def _lagged(command: np.ndarray, step_s: np.ndarray, tau: np.ndarray) -> np.ndar
 
 
 def _rank_waves(values: np.ndarray, is_counted: np.ndarray, number: int) -> np.ndarray:
-    """Return cosines of the rank of a value, as a share of the flight, (number, rows, lanes)."""
+    """Return cosines of the rank of a value, as a share of the flight, (number, rows, chunks)."""
     share = np.zeros(values.shape)
     share[is_counted] = (stats.rankdata(values[is_counted]) - 0.5) / max(int(is_counted.sum()), 1)
     return np.stack([np.cos(np.pi * order * share) for order in range(1, number + 1)])
 
 
-def _place_waves(flight: Flown) -> np.ndarray:
-    """Return products of cosines of the ranks of x, y and z, (number, rows, lanes)."""
+def _place_waves(flight: FlightVariables) -> np.ndarray:
+    """Return products of cosines of the ranks of x, y and z, (number, rows, chunks)."""
     axes = [
         _rank_waves(flight.pos_w[..., axis], flight.is_counted, PLACE_WAVES) for axis in range(3)
     ]
@@ -110,10 +110,10 @@ def _place_waves(flight: Flown) -> np.ndarray:
     return np.stack([axes[0][i] * axes[1][j] * axes[2][k] for i, j, k in orders if i + j + k > 0])
 
 
-def bumps(flight: Flown) -> np.ndarray:
+def bumps(flight: FlightVariables) -> np.ndarray:
     """Return forces that act only near some places of the flight, like a thermal.
 
-    (bumps * BUMP_SIZE, rows, lanes, 3), world frame; all axes of a bump in a row.
+    (bumps * BUMP_SIZE, rows, chunks, 3), world frame; all axes of a bump in a row.
     """
     where = flight.pos_w[flight.is_counted]
     chosen = np.linspace(0, len(where) - 1, 2 * BUMP_PLACES + 1).astype(int)[1::2]
@@ -126,17 +126,17 @@ def bumps(flight: Flown) -> np.ndarray:
 
 
 def _along(waves: np.ndarray, vectors_w: np.ndarray) -> np.ndarray:
-    """Multiply features by world vectors (directions, rows, lanes, 3).
+    """Multiply features by world vectors (directions, rows, chunks, 3).
 
     Returns:
-        (features, rows, lanes, 3), a row for each feature and direction.
+        (features, rows, chunks, 3), a row for each feature and direction.
     """
     product = waves[:, None, ..., None] * vectors_w[None]
     return product.reshape(-1, *product.shape[2:])
 
 
-def time_features(flight: Flown) -> np.ndarray:
-    """Return smooth functions of time along the body's axes, (features, rows, lanes, 3).
+def time_features(flight: FlightVariables) -> np.ndarray:
+    """Return smooth functions of time along the body's axes, (features, rows, chunks, 3).
 
     They are in the world frame.
     """
@@ -145,10 +145,10 @@ def time_features(flight: Flown) -> np.ndarray:
     return _along(times, np.moveaxis(flight.body_to_world, -1, 0))
 
 
-def dependences(flight: Flown) -> Mapping[str, Mapping[str, np.ndarray]]:
+def dependences(flight: FlightVariables) -> Mapping[str, Mapping[str, np.ndarray]]:
     """Return by side (rate, force) and dependence what an unknown effect might add, of unit size.
 
-    (features, rows, lanes, 3), world frame.
+    (features, rows, chunks, 3), world frame.
     """
     counted = flight.is_counted
     body = np.moveaxis(flight.body_to_world, -1, 0)  # body axes in the world
@@ -184,7 +184,7 @@ def dependences(flight: Flown) -> Mapping[str, Mapping[str, np.ndarray]]:
     return {"rate": rate, "force": force}
 
 
-def constants(flight: Flown, side: str) -> np.ndarray:
+def constants(flight: FlightVariables, side: str) -> np.ndarray:
     """Return unit rates along the body's axes, or unit forces along fixed directions.
 
     The forces are along the body's and the world's axes, and the direction of flight.
@@ -194,8 +194,8 @@ def constants(flight: Flown, side: str) -> np.ndarray:
     return body if side == "rate" else np.concatenate([body, world, _direction(flight)[None]])
 
 
-def _direction(flight: Flown) -> np.ndarray:
-    """Return the direction of flight, world frame, (rows, lanes, 3).
+def _direction(flight: FlightVariables) -> np.ndarray:
+    """Return the direction of flight, world frame, (rows, chunks, 3).
 
     Its length is below 1 where the drone hardly moves.
     """
@@ -262,7 +262,7 @@ class SideTest(NamedTuple):
     def of(cls, side: str, white: np.ndarray, slopes: np.ndarray) -> "SideTest":
         """Return the test of whitened residuals beside slopes.
 
-        white: (rows, lanes, NUM_AXES, 2). slopes: (count, rows, lanes, NUM_AXES, 2).
+        white: (rows, chunks, NUM_AXES, 2). slopes: (count, rows, chunks, NUM_AXES, 2).
         """
         axes = SIDES[side]
         own = white[..., axes, :]
@@ -338,9 +338,9 @@ class SideTest(NamedTuple):
 
 
 def whitened(problem: Problem, features_w: np.ndarray, side: str) -> np.ndarray:
-    """Return whitened what features (count, rows, lanes, 3) would leave on a side's axes."""
-    step_s = noises.step_to(problem.lanes)[..., None]
-    joined = features_w * problem.lanes.is_joined[..., None]
+    """Return whitened what features (count, rows, chunks, 3) would leave on a side's axes."""
+    step_s = noises.step_to(problem.chunks)[..., None]
+    joined = features_w * problem.chunks.is_joined[..., None]
     return problem.whiten(np.stack([joined, joined * step_s], axis=-1), SIDES[side])
 
 
@@ -444,7 +444,7 @@ def _greedy(
     side: str,
     smooth: Sequence[Feature],
     places: Feature | None,
-    flight: Flown,
+    flight: FlightVariables,
     least: float,
     noise: float,
 ) -> list[Dependence]:
@@ -502,7 +502,7 @@ def find_lines(problem: Problem, model: FittedModel) -> list[Line]:
             np.einsum("rlji,rlj->rli", flight.body_to_world, left[..., axes, 0]) * counts[..., None]
         )
         series = np.swapaxes(body[lead_in_of(len(body)) :], 0, 1).reshape(-1, 3)
-        step_s = float(np.median(noises.step_to(problem.lanes)))
+        step_s = float(np.median(noises.step_to(problem.chunks)))
         power = (np.abs(np.fft.rfft(series, axis=0)) ** 2).max(axis=1)
         frequency = np.fft.rfftfreq(len(series), step_s)
         usual = ndimage.median_filter(power, 2 * NEIGHBOURS + 1, mode="nearest")
@@ -533,7 +533,7 @@ def stochastic_shares(problem: Problem, model: FittedModel) -> dict[str, float]:
     noise = problem.fitted_noise
     felt = np.asarray(noise.coupling) > FELT
     share = np.asarray(noise.disturbance / noise.direct)
-    gain = noises.disturbance_gain(problem.lanes, left, problem.noise)
+    gain = noises.disturbance_gain(problem.chunks, left, problem.noise)
     result = {}
     for side, axes in SIDES.items():
         size = float(np.sqrt(np.sum((share * (felt & (gain > STOCHASTIC_GAIN)))[axes] ** 2)))

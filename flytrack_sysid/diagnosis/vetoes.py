@@ -14,7 +14,7 @@ import numpy as np
 from flytrack_env.effects import BY_NAME
 from flytrack_sysid.diagnosis import model_selection
 from flytrack_sysid.diagnosis import unexplained as unknown
-from flytrack_sysid.diagnosis.lanes import AXES
+from flytrack_sysid.diagnosis.chunks import AXES
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of
 from flytrack_sysid.diagnosis.result import Unexplained
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, threshold
@@ -226,9 +226,9 @@ def contradicted_on_held_out(selection: Selection, test: Problem) -> list[str]:
 
 
 def rests(record: Record) -> np.ndarray:
-    """Return where the rate commands have rested for a while, (rows, lanes) bool.
+    """Return where the rate commands have rested for a while, (rows, chunks) bool.
 
-    record: in lanes.
+    record: in chunks.
     """
     sticks = record.command[..., :3]
     rows = max(round(REST_S / float(np.median(record.step_s))), 1)
@@ -251,7 +251,7 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
         laws = [name for name in laws if "gyro" not in BY_NAME[name].hooks]
     if not laws:
         return []
-    at_rest = rests(state.problem.lanes.record)
+    at_rest = rests(state.problem.chunks.record)
 
     def seen(without: np.ndarray) -> tuple[float, float]:
         white = state.problem.whitened_residuals(without, model.vector)

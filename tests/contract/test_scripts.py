@@ -10,8 +10,8 @@ from numpy.testing import assert_array_equal
 from flytrack.cli import main
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid import collect, load_log
-from flytrack_sysid.diagnosis.identifiability import LANES_PER_MANOEUVRE, next_flight
-from flytrack_sysid.diagnosis.lanes import LANE_S
+from flytrack_sysid.diagnosis.chunks import CHUNK_S
+from flytrack_sysid.diagnosis.identifiability import CHUNKS_PER_MANOEUVRE, next_flight
 from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, HEIGHTS
 from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights_of, hover_action
 from flytrack_sysid.script_file import (
@@ -38,7 +38,7 @@ def test_every_manoeuvre_can_be_flown_and_says_how():
     assert all(
         manoeuvre.how.endswith(".") and len(manoeuvre.how) > 20 for manoeuvre in MANOEUVRES.values()
     )
-    assert FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S == LANES_PER_MANOEUVRE * LANE_S
+    assert FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S == CHUNKS_PER_MANOEUVRE * CHUNK_S
     flights = script.commands.reshape(-1, FLIGHT_STEPS * 4)
     assert len(np.unique(np.hstack([script.starts, flights]), axis=0)) == len(flights), (
         "no flight twice"

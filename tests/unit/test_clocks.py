@@ -10,7 +10,7 @@ from benchmarks.diagnosis import model_of
 from flytrack_env.motion import Motion
 from flytrack_sysid import clocks, sensors
 from flytrack_sysid.clocks import on_one_clock, with_causal_commands
-from flytrack_sysid.diagnosis.motion_choice import Moves, how_it_moves
+from flytrack_sysid.diagnosis.motion_choice import MotionEstimate, estimate_motion
 from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 from tests.support.hidden_flights import scripted
@@ -106,11 +106,11 @@ def test_lateness_is_found_where_there_is_one():
     def found(late_s):
         truth, log = scripted(3, SECONDS, mocap_late_s=late_s)
         with jax.enable_x64(True):
-            return how_it_moves(log, model_of(truth), np.ones(len(log), bool), Motion.HANDOUT)
+            return estimate_motion(log, model_of(truth), np.ones(len(log), bool), Motion.HANDOUT)
 
     late = found(POSE_LATE_S)
     assert 0.0 < late.sigma_s < 1e-3 and abs(late.late_s - POSE_LATE_S) < 4.0 * late.sigma_s
-    assert found(0.0) == Moves(Motion.HANDOUT, is_sure=True)
+    assert found(0.0) == MotionEstimate(Motion.HANDOUT, is_sure=True)
 
 
 @pytest.mark.slow
@@ -118,6 +118,6 @@ def test_a_drone_on_time_is_no_simulator_however_little_the_model_explains():
     """Commands unrelated to the motion stand for a rate loop that the model lacks."""
     log = noisy(flight(TIME_S), seed=1)
     with jax.enable_x64(True):
-        assert how_it_moves(log, HandoutPlant().model(), np.ones(len(log), bool)) == Moves(
-            Motion.CONTINUOUS
-        )
+        assert estimate_motion(
+            log, HandoutPlant().model(), np.ones(len(log), bool)
+        ) == MotionEstimate(Motion.CONTINUOUS)

@@ -1,4 +1,4 @@
-"""Parts of the diagnosis: its noise filter, lanes, messages, and logs that say too little."""
+"""Parts of the diagnosis: its noise filter, chunks, messages, and logs that say too little."""
 
 import operator
 from dataclasses import replace
@@ -16,16 +16,16 @@ from flytrack.cli import main
 from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, vetoes
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
-from flytrack_sysid.diagnosis.lanes import (
-    LANE_S,
+from flytrack_sysid.diagnosis.chunks import (
+    CHUNK_S,
     LEAD_IN_S,
     NUM_AXES,
     at_usual_rate,
-    lanes_of,
-    make_lanes,
+    cut_chunks,
+    make_chunks,
     thinned,
 )
+from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
 from flytrack_sysid.diagnosis.learned import improves_flights
 from flytrack_sysid.diagnosis.model_selection import Ablation
 from flytrack_sysid.diagnosis.problem import Problem
@@ -60,62 +60,62 @@ def flown():
 
 
 @pytest.fixture(scope="module")
-def lanes(flown):
+def chunks(flown):
     """All rows of that log."""
     truth, log = flown
-    return make_lanes(log, np.ones(len(log), bool), np.array(truth.tau), truth.gravity)
+    return make_chunks(log, np.ones(len(log), bool), np.array(truth.tau), truth.gravity)
 
 
 @pytest.fixture(scope="module")
-def state(flown, lanes):
+def state(flown, chunks):
     """The state of a search in that log."""
     truth, log = flown
     with jax.enable_x64(True):
-        problem = Problem.of(lanes, model_of(truth))
-        noise = noises.first_guess(lanes, problem.residuals(problem.start[None])[0])
+        problem = Problem.of(chunks, model_of(truth))
+        noise = noises.first_guess(chunks, problem.residuals(problem.start[None])[0])
         yield SearchState.start(log, problem.with_noise(noise))
 
 
 @pytest.fixture(scope="module")
-def disturbed(lanes):
-    """Residuals of white sensors and a disturbance of the drone, (rows, lanes, NUM_AXES, 2)."""
+def disturbed(chunks):
+    """Residuals of white sensors and a disturbance of the drone, (rows, chunks, NUM_AXES, 2)."""
     rng, keep = np.random.default_rng(4), np.exp(-DT_S / TAU_S)
-    count = 1 + int(lanes.row.max())
+    count = 1 + int(chunks.row.max())
     fresh = rng.standard_normal((count, NUM_AXES))
     acting = DISTURBANCE * lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], fresh, axis=0)
     walk = WANDER * np.sqrt(DT_S) * rng.standard_normal((count, NUM_AXES))
     level = np.cumsum(acting * DT_S + walk, axis=0) + LEVEL * rng.standard_normal((count, NUM_AXES))
     direct = acting + DIRECT * rng.standard_normal((count, NUM_AXES))
     series = np.stack([direct, np.diff(level, axis=0, prepend=level[:1])], axis=-1)
-    return series[lanes.row] * lanes.is_joined[..., None, None]
+    return series[chunks.row] * chunks.is_joined[..., None, None]
 
 
 def correlation(first, second):
-    """Return the mean product over rows and lanes where both are there; 0 where none are."""
+    """Return the mean product over rows and chunks where both are there; 0 where none are."""
     product = first * second
     return np.nansum(product, axis=(0, 1)) / np.maximum(np.isfinite(product).sum(axis=(0, 1)), 1)
 
 
-def test_innovations_are_white_and_of_variance_one(lanes, disturbed):
+def test_innovations_are_white_and_of_variance_one(chunks, disturbed):
     ones = np.ones(NUM_AXES)
     shares = np.log([WANDER / LEVEL, DISTURBANCE / DIRECT, TAU_S * ones])
     felt = 30.0 * ones  # a logit: the drone feels all of the disturbance
     log_noise = np.concatenate([np.log([DIRECT, LEVEL]), shares, felt[None]])  # made of
     with jax.enable_x64(True):
-        found = noises.Whitener(lanes, log_noise)(disturbed[None])[0]
-    found[~lanes.counts] = np.nan
-    counting = lanes.counts.any(axis=(0, 1))
+        found = noises.Whitener(chunks, log_noise)(disturbed[None])[0]
+    found[~chunks.counts] = np.nan
+    counting = chunks.counts.any(axis=(0, 1))
     assert counting.sum() == 2 * NUM_AXES - 1
-    sigmas = 5.0 / np.sqrt(lanes.counts.sum(axis=(0, 1))[counting])
+    sigmas = 5.0 / np.sqrt(chunks.counts.sum(axis=(0, 1))[counting])
     assert np.all(np.abs(correlation(found, found)[counting] - 1.0) < np.sqrt(2.0) * sigmas)
     for lag in (1, 2, 10):
         assert np.all(np.abs(correlation(found[lag:], found[:-lag])[counting]) < sigmas)
     assert np.all(np.abs(correlation(found[..., 0], found[..., 1])[:BATTERY]) < sigmas[0])
 
 
-def test_the_noise_of_residuals_is_found_again(lanes, disturbed):
+def test_the_noise_of_residuals_is_found_again(chunks, disturbed):
     with jax.enable_x64(True):
-        found = jax.tree.map(np.asarray, noises.noise_of(noises.fit_noise(lanes, disturbed)))
+        found = jax.tree.map(np.asarray, noises.noise_of(noises.fit_noise(chunks, disturbed)))
     moving = slice(0, BATTERY)
     np.testing.assert_allclose(found.direct[moving], DIRECT[moving], rtol=0.08)
     np.testing.assert_allclose(found.level, LEVEL, rtol=0.15)
@@ -124,18 +124,18 @@ def test_the_noise_of_residuals_is_found_again(lanes, disturbed):
     assert np.all(found.coupling[moving] > 0.6)
 
 
-def test_lanes_are_only_where_something_is_judged(flown):
+def test_chunks_are_only_where_something_is_judged(flown):
     truth, log = flown
     judged = (log.time > 7.0) & (log.time < 19.0) | (log.time > 33.0)
-    lanes = make_lanes(log, judged, np.array(truth.tau), truth.gravity)
-    own, lead_in = lanes.row[LEAD_IN_S * RATE :], lanes.row[: LEAD_IN_S * RATE]
+    chunks = make_chunks(log, judged, np.array(truth.tau), truth.gravity)
+    own, lead_in = chunks.row[LEAD_IN_S * RATE :], chunks.row[: LEAD_IN_S * RATE]
     rows = own[own >= 0]
     assert len(np.unique(rows)) == len(rows)
     record = make_record(log)
     source = record.source_row
     wanted = np.flatnonzero((source >= 0) & judged[source])
     assert np.isin(wanted, rows).all()
-    counting = own[lanes.counts[LEAD_IN_S * RATE :].any(axis=(2, 3))]
+    counting = own[chunks.counts[LEAD_IN_S * RATE :].any(axis=(2, 3))]
     assert np.isin(counting, wanted).all()
     assert own.shape[1] == 6  # 12 s and 7 s, in stretches of five, and one that fills up
     assert (
@@ -148,13 +148,13 @@ def predictions(step, _):
     return tuple(map(jnp.stack, (step.after.rates_b, step.moved.context.force_b, step.after.acc_w)))
 
 
-def test_lanes_agree_with_one_long_replay(flown, lanes):
+def test_chunks_agree_with_one_long_replay(flown, chunks):
     truth, log = flown
     model = model_of(truth).with_effects(
         CommandDelay(0.013), SecondOrderRates(0.01, 0.01, 0.01), LinearDrag(0.3, 0.3, 0.1)
     )
     with jax.enable_x64(True):
-        problem = Problem.of(lanes, model)
+        problem = Problem.of(chunks, model)
         left = problem.residuals(problem.start[None])[0]
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
         record = make_record(log)
@@ -172,18 +172,18 @@ def test_lanes_agree_with_one_long_replay(flown, lanes):
     }
     for (axis, channel), one in expected.items():
         axes = slice(axis, axis + 3)
-        counts = lanes.counts[..., axes, channel]
+        counts = chunks.counts[..., axes, channel]
         # In multiples of the noise; what came before the lead-in is forgotten to a millionth of
         # full stick.
-        error = (left[..., axes, channel] - one[lanes.row]) / (DIRECT, LEVEL)[channel][axes]
+        error = (left[..., axes, channel] - one[chunks.row]) / (DIRECT, LEVEL)[channel][axes]
         assert counts[LEAD_IN_S * RATE].any() and np.abs(error[counts]).max() < 1e-3
 
 
 def evaluate(log, model):
     """Run every program that a search for effects in a log needs."""
-    problem = Problem.of(lanes_of(log, np.ones(len(log), bool), model), model)
+    problem = Problem.of(cut_chunks(log, np.ones(len(log), bool), model), model)
     residuals = problem.residuals(np.repeat(problem.start[None], 3, axis=0))
-    problem = problem.with_noise(noises.fit_noise(problem.lanes, residuals[0]))
+    problem = problem.with_noise(noises.fit_noise(problem.chunks, residuals[0]))
     assert np.isfinite(problem.whiten(residuals)).all()
 
 
@@ -375,20 +375,20 @@ def test_a_law_without_memory_has_to_hold_while_commands_rest(state, effect, is_
 
 
 def test_a_long_log_is_thinned_with_a_warning_that_counts_judged_rows(state, monkeypatch):
-    """Unscored rows in the lanes must not make up for scored rows that are lost."""
-    lanes = state.problem.lanes
-    half = lanes.counts & (np.arange(len(lanes.row)) % 2 == 0)[:, None, None, None]
-    every = lanes._replace(counts=half)
+    """Unscored rows in the chunks must not make up for scored rows that are lost."""
+    chunks = state.problem.chunks
+    half = chunks.counts & (np.arange(len(chunks.row)) % 2 == 0)[:, None, None, None]
+    every = chunks._replace(counts=half)
     assert thinned(every) is every and thinning_warning(every, every) == []
-    monkeypatch.setattr("flytrack_sysid.diagnosis.lanes.MAX_ROWS", 4 * LANE_S * 100 + 10)
+    monkeypatch.setattr("flytrack_sysid.diagnosis.chunks.MAX_ROWS", 4 * CHUNK_S * 100 + 10)
     (warning,) = thinning_warning(every, thinned(every))
     kept, number = thinned(every).num_judged, every.num_judged
     assert kept < 0.8 * number and warning.startswith(
         f"only {kept} of {number} rows were learnt from"
     )
-    in_lanes = int((thinned(every).row[100:] >= 0).sum())
+    in_chunks = int((thinned(every).row[100:] >= 0).sum())
     assert (
-        in_lanes >= number
+        in_chunks >= number
     )  # as many rows as are judged: counting those would have hidden the loss
 
 

@@ -127,7 +127,7 @@ def test_measured_logs_are_replayed_continuously(truth):
     assert what_is_fitted(log, NOMINAL)[0].motion is Motion.CONTINUOUS
     assert what_is_fitted(log, NOMINAL, motion=Motion.HANDOUT)[0].motion is Motion.HANDOUT
     parts = split(log, NOMINAL, None, None)
-    for motion in (parts.moves.motion, parts.train.like.motion, parts.test.like.motion):
+    for motion in (parts.motion_estimate.motion, parts.train.like.motion, parts.test.like.motion):
         assert motion is Motion.CONTINUOUS
     assert "the model says handout" in " ".join(parts.warnings)
     errors, continuous = validate(NOMINAL, log), validate(CONTINUOUS, log)

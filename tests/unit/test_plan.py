@@ -10,8 +10,8 @@ import pytest
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.plants import Simulator
 from flytrack_sysid import collect
+from flytrack_sysid.diagnosis.chunks import cut_chunks
 from flytrack_sysid.diagnosis.identifiability import Question, advise
-from flytrack_sysid.diagnosis.lanes import lanes_of
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import Linearization
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
@@ -47,8 +47,8 @@ class Logged(NamedTuple):
 
 
 def logged(log):
-    lanes = lanes_of(log, np.ones(len(log), bool), MODEL)
-    state = SearchState(Problem.of(lanes, MODEL).with_noise(NOISE))
+    chunks = cut_chunks(log, np.ones(len(log), bool), MODEL)
+    state = SearchState(Problem.of(chunks, MODEL).with_noise(NOISE))
     model = FittedModel((), state.problem.start, 0.0, tuple(state.base_places))
     return Logged(state.problem, model, state.linearized(model.vector)[1])
 

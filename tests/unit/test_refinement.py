@@ -6,9 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
-from flytrack_sysid.diagnosis.lanes import lanes_of
+from flytrack_sysid.diagnosis.chunks import cut_chunks
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.refinement import Judge, errors_at, refine, windows_of
+from flytrack_sysid.diagnosis.refinement import FlightTest, errors_at, refine, windows_of
 from flytrack_sysid.diagnosis.score_test import CANDIDATES
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.log import FlightLog
@@ -24,10 +24,10 @@ BIAS = next(one for one in CANDIDATES if one.effect == "accelerometer_bias")
 CIRCLE_S, RADIUS_M = 4.0, 1.0
 
 
-def problem_of(truth, log):
+def build_problem(truth, log):
     """Return the problem of a plant's log and its team's model."""
     model = model_of(truth)
-    return Problem.of(lanes_of(log, ~held_out_rows(log), model), model)
+    return Problem.of(cut_chunks(log, ~held_out_rows(log), model), model)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def dragged():
     truth, log = scripted(3, SECONDS, effects={"linear_drag": TRUE_DRAG})
     values = {f"linear_drag.{name}": 0.5 * value for name, value in TRUE_DRAG.items()}
     with jax.enable_x64(True):
-        problem = problem_of(truth, log)
+        problem = build_problem(truth, log)
         vector = problem.start.copy()
         for name, value in (values | {"accelerometer_bias.x": 0.3}).items():
             vector[problem.names.index(name)] = value
@@ -66,7 +66,7 @@ def test_values_are_refined_by_flights(dragged):
     assert (
         found.removal_costs["linear_drag"] > 0.1 and "accelerometer_bias" not in found.removal_costs
     )
-    assert found.judge.worst_ratio(found.fit.vector) < 1.0
+    assert found.flight_test.worst_ratio(found.fit.vector) < 1.0
 
 
 @pytest.mark.parametrize("step_s", slow_but([0.01], [0.01, 0.005]))
@@ -75,7 +75,7 @@ def test_a_late_gyro_starts_flights_at_the_rates_of_their_time(step_s):
     late = {"imu_latency": {"latency_s": 3.7 * step_s}}
     truth, log = scripted(3, SECONDS, effects=late, step_s=step_s)
     with jax.enable_x64(True):
-        problem, windows = problem_of(truth, log), windows_of(log, held_out_rows(log))
+        problem, windows = build_problem(truth, log), windows_of(log, held_out_rows(log))
         late = problem.start.copy()
         late[problem.names.index("imu_latency.latency_s")] = 3.7 * step_s
         base, own = errors_at(problem, np.stack([problem.start, late]), windows).rms()
@@ -108,8 +108,10 @@ def test_a_path_that_is_known_without_commands_is_no_evidence(dragged):
     truth, log, *_ = dragged
     with jax.enable_x64(True):
         for one, is_evidence in ((circle(), False), (log, True)):
-            problem = problem_of(truth, one)
+            problem = build_problem(truth, one)
             parts = (windows_of(one, rows) for rows in (~held_out_rows(one), held_out_rows(one)))
-            judge = Judge.of(problem, *parts, problem.start)
-            assert judge.is_known[:3].all()
-            assert judge.matters.mean() > 0.5 if is_evidence else not judge.matters.any()
+            flight_test = FlightTest.of(problem, *parts, problem.start)
+            assert flight_test.is_known[:3].all()
+            assert (
+                flight_test.matters.mean() > 0.5 if is_evidence else not flight_test.matters.any()
+            )

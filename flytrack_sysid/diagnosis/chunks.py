@@ -1,8 +1,8 @@
-"""A log cut into lanes of equal length, which are replayed in parallel.
+"""A log cut into chunks of equal length, which are replayed in parallel.
 
 What a step needs of earlier steps (applied action, rates, memories) follows from the commands and
-is forgotten within a second. So the judged part of the log is cut into lanes of five seconds, each
-with a lead-in of the second before it, and all lanes are replayed at once: many times fewer steps
+is forgotten within a second. So the judged part of the log is cut into chunks of five seconds, each
+with a lead-in of the second before it, and all chunks are replayed at once: many times fewer steps
 in sequence.
 """
 
@@ -17,14 +17,14 @@ from flytrack_sysid.log import FlightLog, usual_step
 from flytrack_sysid.log_voltage import with_voltage
 from flytrack_sysid.record import Record, is_applied_certain, make_record, measured_channels
 
-LEAD_IN_S, LANE_S = 1, 5
-PIECES = LEAD_IN_S + LANE_S  # of a second each, the lead-in first
+LEAD_IN_S, CHUNK_S = 1, 5
+PIECES = LEAD_IN_S + CHUNK_S  # of a second each, the lead-in first
 MIN_ROWS_PER_S = 20
 # A rate loop takes 10 to 50 ms. Chosen for cost: what a lower rate hides was not measured.
 MAX_RATE_HZ = 250.0
 # replayed without lead-ins: all of their slopes are in memory at once, some 50 kB a row
 MAX_ROWS = 15_000
-LANES_PADDED_TO = 2  # logs of about the same length share one compiled program
+CHUNKS_PADDED_TO = 2  # logs of about the same length share one compiled program
 # Axes of a residual: rotation x, y, z, force x, y, z (all world), battery. Channels of an axis: a
 # direct one, and a level, whose rate of change the direct one measures.
 DIRECT, LEVEL = ("w", "f", None), ("q", "v", "v_bat")
@@ -33,13 +33,13 @@ AXES = (slice(0, 3), slice(3, 6), slice(6, 7))  # of each side: rotation, force,
 NUM_AXES = sum(SIZES)
 
 
-class Lanes(NamedTuple):
-    """A log in lanes; (rows, lanes, ...), where row k is followed by row k + 1 after ``step_s``.
+class Chunks(NamedTuple):
+    """A log in chunks; (rows, chunks, ...), where row k is followed by row k + 1 after ``step_s``.
 
     record: as in ``flytrack_sysid.record``. measured: by channel: w rad/s, f m/s^2 (body); others
-    are in the record. counts: (rows, lanes, NUM_AXES, 2) bool, what is judged; never the lead-in.
-    is_joined: (rows, lanes) bool, the row follows the one before it in flight. is_known: (rows,
-    lanes, NUM_AXES) bool, and no lost command still acts there. row: (rows, lanes) int, of the
+    are in the record. counts: (rows, chunks, NUM_AXES, 2) bool, what is judged; never the lead-in.
+    is_joined: (rows, chunks) bool, the row follows the one before it in flight. is_known: (rows,
+    chunks, NUM_AXES) bool, and no lost command still acts there. row: (rows, chunks) int, of the
     record, -1 where there is none. quanta: (2, NUM_AXES), the last digit of each channel.
     """
 
@@ -51,8 +51,8 @@ class Lanes(NamedTuple):
     row: np.ndarray
     quanta: np.ndarray
 
-    def selected(self, places: np.ndarray) -> "Lanes":
-        """Return some of the lanes, by their numbers."""
+    def selected(self, places: np.ndarray) -> "Chunks":
+        """Return some of the chunks, by their numbers."""
         leaves = {name: value for name, value in self._asdict().items() if name != "quanta"}
         return self._replace(**jax.tree.map(lambda leaf: leaf[:, places], leaves))
 
@@ -63,24 +63,24 @@ class Lanes(NamedTuple):
 
 
 def lead_in_of(rows: int) -> int:
-    """Return how many of a lane's rows are its lead-in."""
+    """Return how many of a chunk's rows are its lead-in."""
     return rows * LEAD_IN_S // PIECES
 
 
 def _index(exists: np.ndarray, rate: int) -> np.ndarray:
-    """Return the record's row at each place of the lanes, (rows, lanes); -1 where there is none.
+    """Return the record's row at each place of the chunks, (rows, chunks); -1 where there is none.
 
-    exists: (num_rows,) bool, rows that count; lanes hold all of them. One follows the other, but
+    exists: (num_rows,) bool, rows that count; chunks hold all of them. One follows the other, but
     where nothing counts for longer than a lead-in.
     """
-    long, lead_in = LANE_S * rate, LEAD_IN_S * rate
+    long, lead_in = CHUNK_S * rate, LEAD_IN_S * rate
     starts: list[int] = []
     rows = np.flatnonzero(exists)
     while len(rows):
         after = starts[-1] + long if starts else rows[0]
         starts.append(after if rows[0] - after < lead_in else rows[0])
         rows = rows[np.searchsorted(rows, starts[-1] + long) :]
-    starts += [len(exists)] * (-len(starts) % LANES_PADDED_TO or LANES_PADDED_TO * (not starts))
+    starts += [len(exists)] * (-len(starts) % CHUNKS_PADDED_TO or CHUNKS_PADDED_TO * (not starts))
     begin = np.array(starts)
     places = begin + np.arange(-lead_in, long)[:, None]
     return np.where((places >= 0) & (places < len(exists)) & (begin < len(exists)), places, -1)
@@ -100,14 +100,14 @@ def _quanta(found: dict[str, np.ndarray]) -> np.ndarray:
     )
 
 
-def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: float) -> Lanes:
-    """Return the lanes of a log; only ``judged`` rows of it, (num_rows,) bool, count.
+def make_chunks(log: FlightLog, scored_rows: np.ndarray, tau: np.ndarray, gravity: float) -> Chunks:
+    """Return the chunks of a log; only ``scored_rows`` rows of it, (num_rows,) bool, count.
 
     tau: (4,) s, lags that say how long lost commands are remembered.
     """
     record = make_record(log)
     is_certain = is_applied_certain(record, tau)
-    exists = (record.source_row >= 0) & judged[record.source_row]
+    exists = (record.source_row >= 0) & scored_rows[record.source_row]
     after = exists & ~record.begins
     turns, lifts = is_certain[:, :3].all(axis=1), is_certain[:, 3]
     allowed = {
@@ -139,13 +139,16 @@ def make_lanes(log: FlightLog, judged: np.ndarray, tau: np.ndarray, gravity: flo
     known = np.repeat(certain[index], SIZES, axis=-1)
     known &= ~begins[..., None]
     record = record._replace(begins=begins)
-    return Lanes(record, sensed, counts, ~begins, known, index, _quanta(found))
+    return Chunks(record, sensed, counts, ~begins, known, index, _quanta(found))
 
 
-def lanes_of(log: FlightLog, judged: np.ndarray, model: ModelParameters) -> Lanes:
-    """Return the lanes of a log, with the rows that count, (num_rows,) bool, and a model's lags."""
-    return make_lanes(
-        with_voltage(log, model), judged, np.asarray(model.tau, float), float(model.g)
+def cut_chunks(log: FlightLog, scored_rows: np.ndarray, model: ModelParameters) -> Chunks:
+    """Return the chunks of a log under a model's lags.
+
+    scored_rows: those that count, (num_rows,) bool.
+    """
+    return make_chunks(
+        with_voltage(log, model), scored_rows, np.asarray(model.tau, float), float(model.g)
     )
 
 
@@ -169,18 +172,18 @@ def at_usual_rate(log: FlightLog) -> tuple[FlightLog, np.ndarray, list[str]]:
     return replace(kept, channels={**kept.channels, "u": command}), is_kept, [note]
 
 
-def voltages_of(lanes: Lanes) -> tuple[float, float] | None:
+def voltages_of(chunks: Chunks) -> tuple[float, float] | None:
     """Return the lowest and the highest voltage that was measured, V; None without any."""
-    measured = lanes.record.battery_v[lanes.counts[..., -1, 1]]
+    measured = chunks.record.battery_v[chunks.counts[..., -1, 1]]
     return (float(measured.min()), float(measured.max())) if len(measured) else None
 
 
-def thinned(lanes: Lanes, most: int | None = None) -> Lanes:
-    """Return at most ``most`` lanes, evenly spread over a log; by default MAX_ROWS rows."""
-    rows, number = lanes.row.shape
+def thinned(chunks: Chunks, most: int | None = None) -> Chunks:
+    """Return at most ``most`` chunks, evenly spread over a log; by default MAX_ROWS rows."""
+    rows, number = chunks.row.shape
     most = (
-        most or max(MAX_ROWS // (rows - lead_in_of(rows)) // LANES_PADDED_TO, 1) * LANES_PADDED_TO
+        most or max(MAX_ROWS // (rows - lead_in_of(rows)) // CHUNKS_PADDED_TO, 1) * CHUNKS_PADDED_TO
     )
     if number <= most:
-        return lanes
-    return lanes.selected(np.linspace(0, number - 1, most).round().astype(int))
+        return chunks
+    return chunks.selected(np.linspace(0, number - 1, most).round().astype(int))
