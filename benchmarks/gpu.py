@@ -33,7 +33,12 @@ from benchmarks.learning_curve import evaluate, held_from, train
 PLAIN, ROBUST, PENDULUM = "FlyTrack-v0", "FlyTrackRobust-v0", "Pendulum-v1"
 MJX = "rigid body in MJX"
 # Environments, as powers of 2, by contestant; of some fewer, because each size is a compilation.
-POWERS = {PLAIN: (8, 10, 16, 20, 21), ROBUST: (10, 20), PENDULUM: (10, 16, 20), MJX: (16,)}
+POWERS: dict[str, tuple[int, ...]] = {
+    PLAIN: (8, 10, 16, 20, 21),
+    ROBUST: (10, 20),
+    PENDULUM: (10, 16, 20),
+    MJX: (16,),
+}
 UNROLL = 4
 TRAININGS = (("cpu", 1), ("gpu", 1), ("gpu", 16))  # recipe, seeds side by side
 STEPS, EVERY = 40_000_000, 1_000_000  # environment steps: of the training, between evaluations
@@ -231,10 +236,10 @@ def main(cpu: bool = False) -> None:
     path, parts = (None if cpu else PAGE), ["Not measured."]
     if cpu or jax.default_backend() != "cpu":
         small = replace(Config(), num_envs=64, num_steps=8, num_minibatches=4)
-        recipes, powers = (
-            ({"cpu": small, "gpu": small}, {PLAIN: (4,)}) if cpu else (RECIPES, POWERS)
-        )
-        steps, parts = (4096 if cpu else STEPS), []
+        recipes, powers, steps = RECIPES, POWERS, STEPS
+        if cpu:
+            recipes, powers, steps = {"cpu": small, "gpu": small}, {PLAIN: (4,)}, 4096
+        parts = []
         for part in (
             partial(environments, powers),
             partial(trainings, recipes),

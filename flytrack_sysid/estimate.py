@@ -264,27 +264,29 @@ def _acting(found: Linearization, free: tuple[str, ...], may_be_idle: bool) -> l
     if not np.isfinite(found.columns).all() or not np.isfinite(found.cost):
         raise FitError("the fit diverged: residuals are not finite")
     acts = np.flatnonzero(np.abs(found.columns).max(axis=(0, 2), initial=0.0))
-    names = [found.problem.names[found.places[column]] for column in acts]
+    names = [found.problem.names[found.indices[column]] for column in acts]
     idle = [name for name in free if name not in names]
     if idle and not may_be_idle:
         raise FitError(
             f"{', '.join(idle)}: nothing that the log measured depends on it; expected it fixed"
         )
-    return found.problem.index(names)
+    return found.problem.indices_of(names)
 
 
-def _polished(problem: Problem, vector: np.ndarray, places: list[int], steps: int) -> Linearization:
+def _polished(
+    problem: Problem, vector: np.ndarray, indices: list[int], steps: int
+) -> Linearization:
     """Take up to ``steps`` full steps, so that the cost's slope, not only its change, is rounding.
 
     The cost is flat at its least, so that a search which compares costs ends where the order of
     summation decides: another number of threads, another model.
     """
-    found = Linearization(problem, problem.slopes(vector, places))
+    found = Linearization(problem, problem.slopes(vector, indices))
     for _ in range(steps):
         moved = found.vector.copy()
-        moved[places] += found.step_inside()
+        moved[indices] += found.step_inside()
         moved = problem.clipped(moved)
-        later = Linearization(problem, problem.slopes(moved, places))
+        later = Linearization(problem, problem.slopes(moved, indices))
         if not later.cost <= found.cost * (1.0 + LAST_RISE):
             break
         found = later
@@ -311,15 +313,15 @@ def estimate(
         for number, steps in enumerate(LAST_STEPS):
             problem = replace(Channels.of_log(log, scored_rows, model), noise=noise)
             vector = problem.clipped(problem.start)
-            seen = problem.index([name for name in free if name in problem.names])
+            seen = problem.indices_of([name for name in free if name in problem.names])
             near = Linearization(problem, problem.slopes(vector, seen))
-            places = _acting(near, free, may_be_idle=number == 0)
-            vector, _ = refine(problem, vector, places, near)
-            found = _polished(problem, vector, places, steps)
+            indices = _acting(near, free, may_be_idle=number == 0)
+            vector, _ = refine(problem, vector, indices, near)
+            found = _polished(problem, vector, indices, steps)
             noise = problem.spread(found.vector)
-            names = tuple(problem.names[place] for place in places)
+            names = tuple(problem.names[index] for index in indices)
             model = parameters.with_values(
-                model, dict(zip(names, found.vector[places], strict=True))
+                model, dict(zip(names, found.vector[indices], strict=True))
             )
             report(number + 1, len(LAST_STEPS))
     count = int(problem.counts.sum())

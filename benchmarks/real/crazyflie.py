@@ -146,7 +146,7 @@ def measure_fold(folder: Path, policy: str, seconds: float) -> dict[str, Any]:
 
 def read_values(problem: Problem, fit: Any) -> dict[str, list[float]]:
     """Return the fitted parameters by name: value and half of the 95 % interval."""
-    pairs = zip(fit.places, fit.half_widths, strict=True)
+    pairs = zip(fit.indices, fit.half_widths, strict=True)
     return {problem.names[i]: [float(fit.vector[i]), float(half)] for i, half in pairs}
 
 
@@ -183,11 +183,11 @@ def fit_policies(
         assert windows is not None
         problem = Problem.of(thinned(cut_chunks(log, is_used, model)), model)
         vector = problem.start.copy()
-        vector[problem.index(list(start))] = list(start.values())
+        vector[problem.indices_of(list(start))] = list(start.values())
         scale = refinement.errors_at(problem, vector[None], windows).rms()[0]
         target = refinement.Target(problem, windows, scale, np.ones(scale.shape, bool))
         fields = [name for name in problem.names if name.partition(".")[0] in structure]
-        fitted = problem.index([*TAUS, *THRUST_COEFFS, *fields])
+        fitted = problem.indices_of([*TAUS, *THRUST_COEFFS, *fields])
         fit = target.fitted(vector, fitted, refinement.MAX_ROUNDS)
         half_s = half_responses(fit.vector[None], problem.like, SMALL_STEP)[0]
         times = dict(zip(STICKS, half_s.tolist(), strict=True))

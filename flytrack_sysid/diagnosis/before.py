@@ -94,7 +94,7 @@ class Estimate(NamedTuple):
     def with_effect(self, candidate: Candidate) -> "Estimate":
         """Return the estimate with an effect more."""
         line, model = self.linearization, self.model
-        gain = line.gain_of(candidate, line.columns_at(model.places))
+        gain = line.gain_of(candidate, line.columns_at(model.indices))
         if gain is None:
             fitted = self.state.fitted(model.joined_by(candidate), model.vector)
         else:
@@ -109,7 +109,7 @@ class Estimate(NamedTuple):
         the step.
         """
         gain = self.linearization.freed(
-            list(columns), self.linearization.columns_at(self.model.places)
+            list(columns), self.linearization.columns_at(self.model.indices)
         )
         return gain.step, gain.inflation * solve(gain.information, np.eye(len(columns)))
 
@@ -277,7 +277,7 @@ def promise_of(candidate: Candidate, later: Estimate, earlier: Estimate) -> floa
     if chi2 < search.PROMISING * threshold(len(change)) or not is_large(candidate, change, later):
         return 0.0
     gain = later.linearization.gain_of(
-        candidate, later.linearization.columns_at(later.model.places)
+        candidate, later.linearization.columns_at(later.model.indices)
     )
     return gain.chi2 if gain is not None else 0.0
 
@@ -289,7 +289,8 @@ def is_large(candidate: Candidate, change: np.ndarray, later: Estimate) -> bool:
     """
     problem = later.state.problem
     ways = [
-        probe.value - problem.start[problem.index([probe.field])[0]] for probe in candidate.probes
+        probe.value - problem.start[problem.indices_of([probe.field])[0]]
+        for probe in candidate.probes
     ]
     sizes = np.concatenate([np.array(ways), np.ones(len(candidate.other_fields))]) * change
     fields = [*(probe.field for probe in candidate.probes), *candidate.other_fields]
@@ -317,8 +318,8 @@ def selection_of(later: Estimate, earlier: Estimate) -> Selection:
 
 def change_between(later: Estimate, earlier: Estimate, fields: Sequence[str]) -> Change:
     """Return how parameters of both models changed."""
-    places = later.state.problem.index(fields)
-    size = later.model.vector[places] - earlier.model.vector[places]
+    indices = later.state.problem.indices_of(fields)
+    size = later.model.vector[indices] - earlier.model.vector[indices]
     margins = [Marginal(one.linearization, one.model, fields) for one in (later, earlier)]
     half = np.hypot(*(one.half_widths() for one in margins))
     covariance = margins[0].covariance() + margins[1].covariance()
@@ -344,8 +345,8 @@ def changed_values(
     """Return the values that a cause's parameters changed to; none without a clear change."""
     problem, name = later.state.problem, cause.effect
     change = change_between(later, earlier, fields)
-    places, vector = problem.index(fields), problem.start.copy()
-    vector[places] += change.size
+    indices, vector = problem.indices_of(fields), problem.start.copy()
+    vector[indices] += change.size
     factor: dict[str, Estimated] = {}  # by which the mean thrust changed
     if tuple(fields) == THRUST_COEFFS:
         ways = mean_thrust(problem)[None]
@@ -357,8 +358,8 @@ def changed_values(
     if not is_clear or not is_notable(name, problem, vector):
         return {}
     values = {}
-    for field, place, half in zip(fields, places, change.half, strict=True):
-        key, value = field.split(".")[-1], float(vector[place])
+    for field, index, half in zip(fields, indices, change.half, strict=True):
+        key, value = field.split(".")[-1], float(vector[index])
         if key in cause.parameters:
             values[key] = Estimated.around(value, float(half), cause.parameters[key].unit)
     if factor:

@@ -45,7 +45,7 @@ class Learned:
         found = []
         for term in self.law.terms:
             axis = "xyz"[
-                max(range(len(term.coefficients)), key=lambda place: abs(term.coefficients[place]))
+                max(range(len(term.coefficients)), key=lambda index: abs(term.coefficients[index]))
             ]
             found.append(
                 (_column(term.acts, term.frame, axis), _least(one.quantity for one in term.factors))

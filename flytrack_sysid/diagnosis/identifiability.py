@@ -74,7 +74,7 @@ class Question:
         alike: Iterable[str] = (),
     ):
         self.linearization, self.effect = linearization, effect
-        self.given = linearization.columns_at(model.places)
+        self.given = linearization.columns_at(model.indices)
         way, shapes = _typical_candidate(effect), BY_NAME[effect].search.shapes
         notable = BY_NAME[effect].notable
         fields = [field for field in way.other_fields if field.split(".")[1] not in shapes]
@@ -196,7 +196,7 @@ def _seen_flights(problem: Problem, vector: np.ndarray) -> tuple[FlightLog, np.n
 
     The log of the flights has the channels of the problem's log.
     """
-    model = problem.like._replace(thrust_coeffs=vector[problem.index(THRUST_COEFFS)])
+    model = problem.like._replace(thrust_coeffs=vector[problem.indices_of(THRUST_COEFFS)])
     voltages = voltages_of(problem.chunks) or _battery_range(problem.like)
     flights = flights_of(MANOEUVRES, hover_action(model, voltages), voltages=voltages)
     starts = np.stack([one.start for one in flights])
@@ -223,8 +223,8 @@ def _information_along(
     linearization: Linearization, columns: Sequence[int], ahead: Problem, vector: np.ndarray
 ) -> np.ndarray:
     """Return the information by chunk about some columns, (chunks, columns, columns)."""
-    end = len(linearization.places)
-    places = [linearization.places[column] for column in columns if column < end]
+    end = len(linearization.indices)
+    places = [linearization.indices[column] for column in columns if column < end]
     probes = [linearization.probes[column - end] for column in columns if column >= end]
     others = np.array([probe.placed_in(ahead, vector) for probe in probes]) if probes else None
     slopes = ahead.slopes(vector, places, others)
@@ -244,7 +244,7 @@ def information_of_manoeuvres(
     """
     columns = sorted(set(columns))
     log, counts = _seen_flights(problem, model.vector)
-    chunks = make_chunks(log, counts, model.vector[problem.index(TAUS)], float(problem.like.g))
+    chunks = make_chunks(log, counts, model.vector[problem.indices_of(TAUS)], float(problem.like.g))
     by_chunk = []
     # As many chunks at a time as the log has, for which programs are compiled.
     for part in _in_parts(chunks, problem.counts.shape[1]):

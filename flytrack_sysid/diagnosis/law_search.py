@@ -64,7 +64,7 @@ def moment_of_flight(problem: Problem, vector: np.ndarray, flight: FlightVariabl
     airspeed_b = np.einsum("rlji,rlj->rli", rotation, flight.vel_w - air_w)
     volts = np.concatenate([record.battery_v[:1], record.battery_v[:-1]])
     thrust = collective_thrust(flight.applied[..., 3], volts, model.thrust_coeffs)
-    full = np.radians(vector[problem.index(MAX_RATES)])
+    full = np.radians(vector[problem.indices_of(MAX_RATES)])
     rates_b = flight.applied[..., :XYZ] * full
     if "w" in problem.chunks.measured:
         gyro = problem.chunks.measured["w"]
@@ -97,7 +97,7 @@ def directions_of(term: Term, moment: Moment, rotation: np.ndarray) -> np.ndarra
 class Side(NamedTuple):
     """One side of a problem and a model: what is left, and what its free numbers may change there.
 
-    acting: the places of the model's vector that the columns in ``test`` belong to.
+    acting: the indices of the model's vector that the columns in ``test`` belong to.
     """
 
     name: str
@@ -117,7 +117,7 @@ class Side(NamedTuple):
         own = squared[:, SIDES[name]].sum(axis=1)
         # Where a number shows mostly on another side, that side has fitted it.
         is_own = (own > 0.0) & (own >= 0.5 * squared.sum(axis=1))
-        acting = tuple(place for place, does in zip(model.places, is_own, strict=True) if does)
+        acting = tuple(index for index, does in zip(model.indices, is_own, strict=True) if does)
         moment = moment_of_flight(problem, model.vector, flight)
         test = SideTest.of(name, white, slopes[is_own])
         return cls(name, problem, model.vector, moment, flight, test, acting)
@@ -206,11 +206,11 @@ def factors_of(side: Side) -> Iterator[tuple[str, tuple[Factor, ...]]]:
         ):
             yield "air", (one,)
         where = side.flight.pos_w[side.flight.is_counted]
-        for place in where[
+        for index in where[
             np.linspace(0, len(where) - 1, 2 * BUMP_PLACES + 1).astype(int)[1::2]
         ].tolist():
             for width in BUMP_WIDTHS_M:
-                yield "world", (Factor("position", "place", (*place, width)),)
+                yield "world", (Factor("position", "place", (*index, width)),)
 
 
 class Trial(NamedTuple):
@@ -258,9 +258,9 @@ def refine_shapes(side: Side, test: SideTest, start: Trial) -> Trial:
     is_free = np.array(
         [
             one.shape != "power"
-            and (one.shape, place) != ("wave", 0)  # a wave's order, which is whole
+            and (one.shape, index) != ("wave", 0)  # a wave's order, which is whole
             for one in start.term.factors
-            for place in range(len(one.numbers))
+            for index in range(len(one.numbers))
         ]
     )
     steps = np.maximum(0.2 * np.abs(numbers), 0.1)[is_free]
@@ -283,23 +283,23 @@ def refine_shapes(side: Side, test: SideTest, start: Trial) -> Trial:
     return best
 
 
-def refine_jointly(side: Side, terms: Sequence[Term], places: Iterable[int]) -> list[Term]:
-    """Refine the shapes of some terms, each beside all others; ``places`` says which."""
+def refine_jointly(side: Side, terms: Sequence[Term], indices: Iterable[int]) -> list[Term]:
+    """Refine the shapes of some terms, each beside all others; ``indices`` says which."""
     result = list(terms)
-    for place in places:
-        term = terms[place]
-        others = [side.columns(one) for one in (*result[:place], *result[place + 1 :])]
+    for index in indices:
+        term = terms[index]
+        others = [side.columns(one) for one in (*result[:index], *result[index + 1 :])]
         test = side.test.given_also(*others)
-        result[place] = refine_shapes(side, test, score_term(side, test, term)).term
+        result[index] = refine_shapes(side, test, score_term(side, test, term)).term
     return result
 
 
 def _with_numbers(term: Term, values: np.ndarray) -> Term | None:
     """Return a term with other numbers; None where one would have no width."""
-    factors, place = [], 0
+    factors, index = [], 0
     for one in term.factors:
-        numbers = tuple(values[place : place + len(one.numbers)].tolist())
-        place += len(one.numbers)
+        numbers = tuple(values[index : index + len(one.numbers)].tolist())
+        index += len(one.numbers)
         by_name = dict(zip(SHAPES[one.shape].numbers, numbers, strict=True))
         if any(not by_name[name] > TINY for name in SHAPES[one.shape].positive):
             return None
@@ -422,8 +422,8 @@ def drop_weak_terms(side: Side, held: Side, law: FittedLaw, number: int) -> Fitt
         terms = tuple(refine_jointly(side, others[weakest], range(len(others[weakest]))))
     order = np.argsort(losses)[::-1]
     if len(terms) == len(law.terms):
-        return law._replace(terms=tuple(terms[place] for place in order))
-    found = judge_law(side, held, *fit_terms(side, [terms[place] for place in order]))
+        return law._replace(terms=tuple(terms[index] for index in order))
+    found = judge_law(side, held, *fit_terms(side, [terms[index] for index in order]))
     return found if is_confirmed(side, found) else None
 
 

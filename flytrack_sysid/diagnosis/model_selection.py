@@ -87,7 +87,7 @@ def ablate(
     """
     less = without_effect(state, model, effect)
     columns = [linearization.column(field) for field in model.candidate(effect).fields]
-    own = linearization.gain(columns, linearization.columns_at(model.places, without=columns))
+    own = linearization.gain(columns, linearization.columns_at(model.indices, without=columns))
     inflation, determined = (1.0, 1) if own is None else (own.inflation, own.num_parameters)
     return Ablation(less.cost - model.cost, inflation, determined, {}, {}, less)
 
@@ -180,10 +180,10 @@ def other_groups(linearization: Linearization, model: FittedModel, effect: str) 
         more = {*candidate.fields} - own
         changed = sorted(more or own - {*candidate.fields})
         columns = [linearization.column(field) for field in changed]
-        given = linearization.columns_at(model.places, without=columns)
+        given = linearization.columns_at(model.indices, without=columns)
         price = PER_PARAMETER * len(changed)
         if not more:
-            size = (model.vector - problem.start)[problem.index(changed)]
+            size = (model.vector - problem.start)[problem.indices_of(changed)]
             is_cheaper = size @ linearization.projected(columns, given)[0] @ size < price
         else:
             gain = linearization.gain(columns, given)
@@ -218,11 +218,11 @@ def with_lags_anew(state: SearchState, model: FittedModel) -> list[FittedModel]:
     There a lag has no slope that would lead back.
     """
     problem, vector = state.problem, model.vector.copy()
-    shortest = [place for place in problem.index(TAUS) if vector[place] <= problem.low[place]]
+    shortest = [index for index in problem.indices_of(TAUS) if vector[index] <= problem.low[index]]
     shortest = [
-        place
-        for place in shortest
-        if place in model.places and problem.start[place] > vector[place]
+        index
+        for index in shortest
+        if index in model.indices and problem.start[index] > vector[index]
     ]
     if not shortest:
         return []
@@ -249,8 +249,8 @@ def separation(linearization: Linearization, model: FittedModel, effect: str) ->
     """Return how clearly a log shows an effect of a model, and tells it from others."""
     problem, own = linearization.problem, model.candidate(effect)
     columns = [linearization.column(field) for field in own.fields]
-    size = (model.vector - problem.start)[problem.index(own.fields)]
-    given = linearization.columns_at(model.places, without=columns)
+    size = (model.vector - problem.start)[problem.indices_of(own.fields)]
+    given = linearization.columns_at(model.indices, without=columns)
 
     def beside(others: list[int]) -> float:
         return float(size @ linearization.projected(columns, others)[0] @ size)
@@ -281,7 +281,7 @@ class Marginal:
 
     def __init__(self, linearization: Linearization, model: FittedModel, fields: Sequence[str]):
         columns = [linearization.column(field) for field in fields]
-        given = linearization.columns_at(model.places, without=columns)
+        given = linearization.columns_at(model.indices, without=columns)
         self.information, share = linearization.projected(columns, given)
         blocks = linearization.score_by_block
         self.scores = blocks[:, columns] - blocks[:, given] @ share
@@ -323,10 +323,10 @@ def _is_immaterial(problem: Problem, fields: Sequence[str], model: FittedModel) 
 
     Rounding causes differences as large.
     """
-    places = problem.index(fields)
-    change = model.vector[places] - problem.start[places]
+    indices = problem.indices_of(fields)
+    change = model.vector[indices] - problem.start[indices]
     if fields != THRUST_COEFFS:
-        return bool(np.all(np.abs(change) < IMMATERIAL * np.abs(problem.start[places])))
+        return bool(np.all(np.abs(change) < IMMATERIAL * np.abs(problem.start[indices])))
     record = problem.chunks.record
     thrust = np.asarray(collective_thrust(record.command[..., 3], record.battery_v, change))
     weight = float(problem.like.m) * float(problem.like.g)
@@ -340,17 +340,17 @@ def base_change(
     state: SearchState, linearization: Linearization, model: FittedModel, fields: Sequence[str]
 ) -> BaseChange | None:
     """Return how the log contradicts nominal base parameters; None where it hardly does."""
-    problem, free = state.problem, set(state.base_places)
+    problem, free = state.problem, set(state.base_indices)
     acting = [
         field
-        for field, place in zip(fields, problem.index(fields), strict=True)
-        if place in free and linearization.acting([linearization.column(field)])
+        for field, index in zip(fields, problem.indices_of(fields), strict=True)
+        if index in free and linearization.acting([linearization.column(field)])
     ]
     if not acting or _is_immaterial(problem, fields, model):
         return None
-    places = problem.index(acting)
+    indices = problem.indices_of(acting)
     marginal = Marginal(linearization, model, acting)
-    change = model.vector[places] - problem.start[places]
+    change = model.vector[indices] - problem.start[indices]
     gain = float(change @ marginal.information @ change)
     if gain / marginal.inflation < threshold(len(acting)):
         return None
@@ -417,8 +417,8 @@ def is_determined(
 ) -> tuple[SearchState, bool]:
     """Return whether the log shows that some parameter of an effect is not neutral."""
     problem = state.problem
-    places = problem.index(fields)
-    change = np.abs(model.vector[places] - problem.start[places])
+    indices = problem.indices_of(fields)
+    change = np.abs(model.vector[indices] - problem.start[indices])
     acting = [
         field.split(".")[1] not in BY_NAME[field.split(".")[0]].search.shapes for field in fields
     ]

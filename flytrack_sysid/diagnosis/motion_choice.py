@@ -136,10 +136,10 @@ class LogPart(NamedTuple):
         return build_problem(self.chunks(in_time), in_time, self.log, model, late_s)
 
 
-def _places(problem: Problem, motion_estimate: MotionEstimate) -> list[int]:
+def _indices(problem: Problem, motion_estimate: MotionEstimate) -> list[int]:
     """Return what is fitted; sensors are late only where poses would be early."""
     names = [f"{one.name}.{name}" for one in LOOK_ALIKES for name in one.ranges]
-    return problem.index(
+    return problem.indices_of(
         [
             *base_of(problem.like),
             *(name for name in names if name != IMU_LATENCY or motion_estimate.late_s < 0.0),
@@ -159,7 +159,7 @@ def _fit(seen: LogPart, motion_estimate: MotionEstimate, last: Trial | None = No
         noise = noises.first_guess(problem.chunks, problem.residuals(vector[None])[0])
     for _ in range(2 if last is None else 1):  # what is badly fitted passes for noise at first
         problem = problem.with_noise(noise)
-        vector, _ = refine(problem, problem.clipped(vector), _places(problem, motion_estimate))
+        vector, _ = refine(problem, problem.clipped(vector), _indices(problem, motion_estimate))
         noise = noises.fit_noise(problem.chunks, problem.residuals(vector[None])[0], noise)
     return Trial(motion_estimate, problem.with_noise(noise), vector)
 
@@ -170,7 +170,7 @@ def _with_later_poses(seen: LogPart, trial: Trial) -> MotionEstimate:
     later = seen.problem(motion_estimate._replace(late_s=motion_estimate.late_s + DIFFERENCE_S))
     change = (later.residuals(vector[None]) - problem.residuals(vector[None])) / DIFFERENCE_S
     linearization = Linearization(
-        problem, problem.slopes(vector, _places(problem, motion_estimate))
+        problem, problem.slopes(vector, _indices(problem, motion_estimate))
     )
     root = np.sqrt(robust_weight(linearization.white))
     column = problem.whiten(np.where(problem.counts & later.counts, change, 0.0))
@@ -271,10 +271,10 @@ def _chosen(seen: LogPart, late: Sequence[MotionEstimate]) -> MotionEstimate:
     misfits = _misfits(trials)
     for part in range(1, seen.num_parts):
         costs = _costs(trials, misfits)
-        kept = [place for place, cost in enumerate(costs) if cost < min(costs) + UNDECIDED]
+        kept = [index for index, cost in enumerate(costs) if cost < min(costs) + UNDECIDED]
         if len(kept) < 2:
             break
-        other, trials = seen._replace(part=part), [trials[place] for place in kept]
+        other, trials = seen._replace(part=part), [trials[index] for index in kept]
         again = [
             _fit_lateness(other, _fit(other, one.motion_estimate, one), rounds=1) for one in trials
         ]

@@ -172,17 +172,17 @@ def _change_of(
     own = linearization.acting(columns if is_named else linearization.columns_of(candidate))
     if not own:
         return None
-    given, (start, changes) = linearization.columns_at(model.places), seconds
+    given, (start, changes) = linearization.columns_at(model.indices), seconds
     score, information = linearization.score_by_block, linearization.by_block
     after = (start >= changes[:, None]).astype(float)
     ramp = (start - start.min()) / max(np.ptp(start), 1)
     ways = {"start": after, "end": 1.0 - after, "drift": ramp[None]}
     gains = {way: windowed_gains(score, information, given, own, one) for way, one in ways.items()}
     way = max(gains, key=lambda one: gains[one].max())
-    place = int(np.argmax(gains[way]))
-    inflation = _inflation(score, information, given, own, ways[way][place])
-    row = int(changes[place]) if way != "drift" else 0
-    return Hypothesis(candidate, way, row, float(gains[way][place]) / inflation, len(own))
+    index = int(np.argmax(gains[way]))
+    inflation = _inflation(score, information, given, own, ways[way][index])
+    row = int(changes[index]) if way != "drift" else 0
+    return Hypothesis(candidate, way, row, float(gains[way][index]) / inflation, len(own))
 
 
 def _inflation(
@@ -285,8 +285,8 @@ def spans_of(selection: Selection, test: Problem, log: FlightLog) -> dict[str, d
         if row in (ALWAYS, NEVER):
             return None
         ends = profile_of(problem, test, vector, row).ends95(selection.ablations[effect].inflation)
-        places = log_rows(problem, test, (row, *ends))
-        value, low, high = np.interp(places, np.arange(len(log)), log.time).tolist()
+        indices = log_rows(problem, test, (row, *ends))
+        value, low, high = np.interp(indices, np.arange(len(log)), log.time).tolist()
         return Estimated(value, (low, high), "s")
 
     return {

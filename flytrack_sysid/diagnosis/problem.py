@@ -183,12 +183,12 @@ class Slopes(NamedTuple):
 
     residuals: (rows, chunks, NUM_AXES, 2). columns: (num_columns, rows, chunks, NUM_AXES, 2).
 
-    places: the parameters of the first columns; ways to other vectors follow.
+    indices: the parameters of the first columns; ways to other vectors follow.
     """
 
     vector: np.ndarray
     residuals: np.ndarray
-    places: tuple[int, ...]
+    indices: tuple[int, ...]
     columns: np.ndarray
 
 
@@ -353,8 +353,8 @@ class Problem:
 
     def at_start(self, vectors: np.ndarray, fields: Sequence[str]) -> np.ndarray:
         """Return vectors, (..., parameters), with some parameters as in the given model."""
-        vectors, places = vectors.copy(), self.index(fields)
-        vectors[..., places] = self.start[places]
+        vectors, indices = vectors.copy(), self.indices_of(fields)
+        vectors[..., indices] = self.start[indices]
         return vectors
 
     def whiten(self, left: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
@@ -370,33 +370,33 @@ class Problem:
         return np.clip(vectors, self.low, self.high)
 
     def nudged(
-        self, vector: np.ndarray, places: Sequence[int], share: float = RELATIVE_STEP
+        self, vector: np.ndarray, indices: Sequence[int], share: float = RELATIVE_STEP
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return copies of a vector, each with one parameter moved, and the steps, for slopes.
 
         One-sided differences, into the bounds: an effect may be defined on one side of neutral
         only. share: of a parameter's scale.
         """
-        places = list(places)
-        step = share * self.scale[places]
-        step = np.where(vector[places] + step > self.high[places], -step, step)
-        moved = np.repeat(vector[None], len(places), axis=0)
-        moved[np.arange(len(places)), places] += step
+        indices = list(indices)
+        step = share * self.scale[indices]
+        step = np.where(vector[indices] + step > self.high[indices], -step, step)
+        moved = np.repeat(vector[None], len(indices), axis=0)
+        moved[np.arange(len(indices)), indices] += step
         return moved, step
 
     def slopes(
-        self, vector: np.ndarray, places: Sequence[int], others: np.ndarray | None = None
+        self, vector: np.ndarray, indices: Sequence[int], others: np.ndarray | None = None
     ) -> Slopes:
-        """Return a model's residuals, their slopes along places, and the way to other vectors."""
-        moved, step = self.nudged(vector, places)
+        """Return a model's residuals, their slopes along indices, and the way to other vectors."""
+        moved, step = self.nudged(vector, indices)
         others = np.zeros((0, len(vector))) if others is None else others
         found = self.residuals(np.concatenate([vector[None], moved, others]))
         away = found[1:] - found[0]
         away[: len(step)] /= step[:, None, None, None, None]
-        return Slopes(vector, found[0], tuple(places), away)
+        return Slopes(vector, found[0], tuple(indices), away)
 
-    def index(self, names: Sequence[str]) -> list[int]:
-        """Return the places of parameters in the vector."""
+    def indices_of(self, names: Sequence[str]) -> list[int]:
+        """Return the indices of parameters in the vector."""
         return [self.names.index(name) for name in names]
 
 

@@ -189,18 +189,18 @@ def placebo_errors(learnt: Windows, held_out_windows: Windows) -> np.ndarray:
 
 
 class Fit(NamedTuple):
-    """A model fitted to windows: vector, its free places, and their covariance, for 95 % intervals.
+    """A model fitted to windows: vector, free indices, and their covariance, for 95 % intervals.
 
-    covariance: (places, places), of which the square roots are halves of intervals.
+    covariance: (indices, indices), of which the square roots are halves of intervals.
     """
 
     vector: np.ndarray
-    places: tuple[int, ...]
+    indices: tuple[int, ...]
     covariance: np.ndarray
 
     @property
     def half_widths(self) -> np.ndarray:
-        """Half of the 95 % interval of each free place."""
+        """Half of the 95 % interval of each free index."""
         return np.sqrt(np.diag(self.covariance))
 
 
@@ -226,12 +226,12 @@ class Target(NamedTuple):
         robust = 2.0 * special.huber(OUTLIER, left).sum(axis=(1, 2))
         return robust + np.square(vectors - self.problem.start) @ prior_information(self.problem)
 
-    def fitted(self, vector: np.ndarray, places: Sequence[int], rounds: int) -> Fit:
+    def fitted(self, vector: np.ndarray, indices: Sequence[int], rounds: int) -> Fit:
         """Fit a model, starting from a vector, by damped Gauss-Newton with one-sided slopes."""
-        problem, at = self.problem, np.array(places, int)
+        problem, at = self.problem, np.array(indices, int)
         vector = problem.clipped(vector)
         for number in range(rounds + 1):
-            moved, step = problem.nudged(vector, places)
+            moved, step = problem.nudged(vector, indices)
             left = self.residuals(np.concatenate([vector[None], moved]))
             columns = (left[1:] - left[0]) / step[:, None, None]
             root = np.sqrt(OUTLIER / np.maximum(np.abs(left[0]), OUTLIER))
@@ -248,7 +248,7 @@ class Target(NamedTuple):
             if costs[best] > cost * (1.0 - MIN_GAIN):
                 break
             vector = ways[best]
-        return Fit(vector, tuple(places), self._covariance(information, scores))
+        return Fit(vector, tuple(indices), self._covariance(information, scores))
 
     def _ways(
         self, vector: np.ndarray, at: np.ndarray, information: np.ndarray, gradient: np.ndarray
@@ -416,7 +416,7 @@ def windows_of(log: FlightLog, rows: np.ndarray, most: int = MAX_SCORED_WINDOWS)
 def at_bounds(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> list[str]:
     """Return those parameters that are at the end of the range that is searched; shapes may be."""
     found = []
-    for place in problem.index(fields):
+    for place in problem.indices_of(fields):
         effect, _, field = problem.names[place].partition(".")
         low, high, value = problem.low[place], problem.high[place], vector[place]
         room = 1e-6 * max(abs(value), 1.0)
@@ -433,7 +433,7 @@ def widened(problem: Problem, fields: Sequence[str]) -> Problem:
     What is not negative stays so; what is one-sided stays one-sided.
     """
     low, high = problem.low.copy(), problem.high.copy()
-    for name, place in zip(fields, problem.index(fields), strict=True):
+    for name, place in zip(fields, problem.indices_of(fields), strict=True):
         effect, _, field = name.partition(".")
         if not field or field in BY_NAME[effect].max_steps:
             continue
@@ -472,7 +472,7 @@ def refine(
         return as_found
     acting = _acting(problem, _probed(problem, extended, candidates), candidates, learnt)
     found = _Refinement(
-        flight_test, learnt, base.vector, tuple(state.base_places), acting, is_explained
+        flight_test, learnt, base.vector, tuple(state.base_indices), acting, is_explained
     )
     is_at_bound = bool(at_bounds(problem, extended, found.fields_of(candidates)))
     if is_explained and not is_at_bound and not flight_test.is_surely_worse(extended):
@@ -490,7 +490,7 @@ class _Refinement(NamedTuple):
     flight_test: FlightTest
     learnt: Windows
     base: np.ndarray
-    base_places: tuple[int, ...]
+    base_indices: tuple[int, ...]
     acting: tuple[str, ...]
     is_explained: bool
 
@@ -504,29 +504,29 @@ class _Refinement(NamedTuple):
         is_short = (np.array(HORIZONS_S) <= ALWAYS_FITTED_S)[:, None]
         return Target(problem, self.learnt, scale, self.flight_test.matters | is_short)
 
-    def places(self, problem: Problem, candidates: Sequence[Candidate]) -> list[int]:
-        """Return the free places that act on the windows."""
-        own = [place for place in self.base_places if problem.names[place] != DRAIN]
-        return own + problem.index(self.fields_of(candidates))
+    def indices(self, problem: Problem, candidates: Sequence[Candidate]) -> list[int]:
+        """Return the free indices that act on the windows."""
+        own = [place for place in self.base_indices if problem.names[place] != DRAIN]
+        return own + problem.indices_of(self.fields_of(candidates))
 
     def run(self, extended: np.ndarray, as_found: Refined) -> Refined:
         """Return the refined model with the effects that held-out prediction needs."""
         problem, candidates = as_found.problem, as_found.kept
         target = self.target(problem)
-        places = self.places(problem, candidates)
-        fit = target.fitted(extended, places, MAX_ROUNDS)
+        indices = self.indices(problem, candidates)
+        fit = target.fitted(extended, indices, MAX_ROUNDS)
         probed = _probed(problem, fit.vector, candidates)
         if np.any(probed != fit.vector):  # single steps left a parameter where it has no slope
-            other = target.fitted(probed, places, MAX_ROUNDS)
+            other = target.fitted(probed, indices, MAX_ROUNDS)
             both = np.stack([fit.vector, other.vector])
             fit = (fit, other)[int(np.argmin(target.cost(target.residuals(both), both)))]
         stuck = at_bounds(problem, fit.vector, self.fields_of(candidates))
         if stuck:
             problem = widened(problem, stuck)
             target = target._replace(problem=problem)
-            fit = target.fitted(fit.vector, fit.places, MAX_ROUNDS)
+            fit = target.fitted(fit.vector, fit.indices, MAX_ROUNDS)
         flight_test = self.flight_test.seeing(fit.vector)
-        base = target.fitted(self.base, self.places(problem, ()), MAX_ROUNDS).vector
+        base = target.fitted(self.base, self.indices(problem, ()), MAX_ROUNDS).vector
         found = as_found._replace(fit=fit, base=base, problem=problem, flight_test=flight_test)
         return self._eliminate(found, target)
 
@@ -556,8 +556,8 @@ class _Refinement(NamedTuple):
                 weakest = int(np.argmin([flight_test.worst_ratio(one.vector) for one in fits]))
             kept.remove(tried[weakest])
             removed.append(tried[weakest].effect)
-            places = self.places(target.problem, kept)
-            fit = target.fitted(fits[weakest].vector, places, MAX_ROUNDS)
+            indices = self.indices(target.problem, kept)
+            fit = target.fitted(fits[weakest].vector, indices, MAX_ROUNDS)
         if not any(
             one.effect in self.acting for one in kept
         ):  # the base as single steps have it stands
@@ -567,7 +567,7 @@ class _Refinement(NamedTuple):
     def _without(self, target: Target, fit: Fit, kept: Sequence[Candidate], one: Candidate) -> Fit:
         vector = target.problem.at_start(fit.vector, one.fields)
         rest = [other for other in kept if other is not one]
-        return target.fitted(vector, self.places(target.problem, rest), REFIT_ROUNDS)
+        return target.fitted(vector, self.indices(target.problem, rest), REFIT_ROUNDS)
 
 
 def _acting(
@@ -589,8 +589,8 @@ def _is_neutral(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> 
         for name in fields
         if name.split(".")[1] not in BY_NAME[name.split(".")[0]].search.shapes
     ]
-    places = problem.index(own)
-    return bool(np.all(np.abs(vector - problem.start)[places] < NEUTRAL * problem.scale[places]))
+    indices = problem.indices_of(own)
+    return bool(np.all(np.abs(vector - problem.start)[indices] < NEUTRAL * problem.scale[indices]))
 
 
 def _probed(problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate]) -> np.ndarray:
@@ -626,7 +626,7 @@ def reduced(selection: Selection, refined: Refined) -> Selection:
         if refined.kept == model.candidates:
             return selection
         return selection._replace(
-            model=model._replace(candidates=refined.kept, places=refined.fit.places)
+            model=model._replace(candidates=refined.kept, indices=refined.fit.indices)
         )
     if refined.kept:
         kept = selection if refined.kept == model.candidates else _narrowed(selection, refined.kept)
@@ -635,7 +635,7 @@ def reduced(selection: Selection, refined: Refined) -> Selection:
     state, base = selection.state, selection.base
     # What an effect that is gone held at nominal is free again, as it was when the base was fitted.
     held = tuple(
-        one for one in state.held if state.problem.names.index(one.field) not in base.places
+        one for one in state.held if state.problem.names.index(one.field) not in base.indices
     )
     return selection._replace(state=replace(state, held=held), model=base)
 

@@ -171,16 +171,16 @@ class Gain(NamedTuple):
 class Linearization:
     """A model and, to first order, what every column would change: parameters, and ways to probes.
 
-    vector: the model. places: parameters of the first columns. probes: of further ones, whose step
+    vector: the model. indices: parameters of the first columns. probes: of further ones, whose step
     is the share of the way to the probe. columns: whitened, (blocks, columns, numbers). The slopes
     may be those of a nearby model.
     """
 
     def __init__(self, problem: Problem, slopes: Slopes, probes: Sequence[Probe] = ()):
         self.problem, self.slopes, self.noise = problem, slopes, problem.noise
-        self.places, self.probes = list(slopes.places), list(probes)
+        self.indices, self.probes = list(slopes.indices), list(probes)
         self.prior = np.concatenate(
-            [prior_information(problem)[self.places], np.full(len(self.probes), PROBE_PRIOR)]
+            [prior_information(problem)[self.indices], np.full(len(self.probes), PROBE_PRIOR)]
         )
         white = problem.whiten(np.concatenate([slopes.residuals[None], slopes.columns]))
         self.vector, self.white = slopes.vector, white[0]
@@ -193,7 +193,7 @@ class Linearization:
         self._sum_scores()
 
     def _sum_scores(self) -> None:
-        away = (self.vector - self.problem.start)[self.places]
+        away = (self.vector - self.problem.start)[self.indices]
         pull = self.prior * np.append(away, np.zeros(len(self.probes)))
         self.score = self.score_by_block.sum(axis=0) - pull
         self.cost = costs_of(self.problem, self.vector[None], self.white[None])[0]
@@ -214,21 +214,21 @@ class Linearization:
     def distance(self, vector: np.ndarray) -> float:
         """Return how far, as a chi2 to first order, a model is from where the slopes were taken."""
         change = vector - self.slopes.vector
-        places = np.array(self.places)
-        elsewhere = np.delete(change, places)
-        sloping = self.problem.index(sorted({probe.field for probe in self.probes}))
+        indices = np.array(self.indices)
+        elsewhere = np.delete(change, indices)
+        sloping = self.problem.indices_of(sorted({probe.field for probe in self.probes}))
         size = np.maximum(np.abs(vector), np.abs(self.slopes.vector))
         # Where there was no slope, first order cannot measure the distance.
         if np.any(elsewhere != 0.0) or np.any((np.abs(change) > SAME_SLOPE * size)[sloping]):
             return np.inf
-        end = len(places)
-        return float(change[places] @ self.total[:end, :end] @ change[places])
+        end = len(indices)
+        return float(change[indices] @ self.total[:end, :end] @ change[indices])
 
-    def narrowed(self, places: Sequence[int]) -> "Linearization":
-        """Return the linearization along some of the places only."""
-        kept = [self.places.index(place) for place in places]
+    def narrowed(self, indices: Sequence[int]) -> "Linearization":
+        """Return the linearization along some of the indices only."""
+        kept = [self.indices.index(index) for index in indices]
         later = copy.copy(self)
-        later.places, later.probes = list(places), []
+        later.indices, later.probes = list(indices), []
         later.prior, later.columns = self.prior[kept], self.columns[:, kept]
         later.by_block = self.by_block[:, kept][:, :, kept]
         later.score_by_block = self.score_by_block[:, kept]
@@ -237,11 +237,11 @@ class Linearization:
 
     def column(self, name: str) -> int:
         """Return the column of a parameter."""
-        return self.places.index(self.problem.names.index(name))
+        return self.indices.index(self.problem.names.index(name))
 
-    def columns_at(self, places: Sequence[int], without: Sequence[int] = ()) -> list[int]:
-        """Return the columns of places in the vector, except some columns."""
-        columns = [self.places.index(place) for place in places]
+    def columns_at(self, indices: Sequence[int], without: Sequence[int] = ()) -> list[int]:
+        """Return the columns of indices in the vector, except some columns."""
+        columns = [self.indices.index(index) for index in indices]
         return [column for column in columns if column not in without]
 
     def columns_of(self, candidate: Candidate) -> list[int]:
@@ -251,7 +251,7 @@ class Linearization:
 
     def probe_column(self, probe: Probe) -> int:
         """Return the column of the way to a probe."""
-        return len(self.places) + self.probes.index(probe)
+        return len(self.indices) + self.probes.index(probe)
 
     def acting(self, columns: Sequence[int]) -> list[int]:
         """Return the columns that change anything."""
@@ -264,11 +264,11 @@ class Linearization:
         return solve(self.total[np.ix_(columns, columns)], self.score[columns])
 
     def step_inside(self) -> np.ndarray:
-        """Return the best step along all places within bounds; parameters stuck at one stay."""
+        """Return the best step along all indices within bounds; parameters stuck at one stay."""
         return step_inside(
             self.problem,
             self.vector,
-            self.places,
+            self.indices,
             lambda free: self.step(np.flatnonzero(free).tolist()),
         )
 
@@ -353,17 +353,17 @@ class Linearization:
 def step_inside(
     problem: Problem,
     vector: np.ndarray,
-    places: Sequence[int] | np.ndarray,
+    indices: Sequence[int] | np.ndarray,
     step_along: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
-    """Return the step along places that stays within bounds; parameters stuck at one do not move.
+    """Return the step along indices that stays within bounds; parameters stuck at one do not move.
 
     step_along: the best step along those that are free, (num_places,) bool.
     """
-    places = np.array(places)
-    low, high, now = problem.low[places], problem.high[places], vector[places]
+    indices = np.array(indices)
+    low, high, now = problem.low[indices], problem.high[indices], vector[indices]
     room = AT_BOUND * np.maximum(np.abs(now), 1.0)
-    free, step = np.ones(len(places), bool), np.zeros(len(places))
+    free, step = np.ones(len(indices), bool), np.zeros(len(indices))
     while free.any():
         step[:] = 0.0
         step[free] = step_along(free)

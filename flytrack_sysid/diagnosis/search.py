@@ -39,12 +39,12 @@ STEP_SHARES, PART_OF_PROMISE = np.array([1.0, 0.5, 0.2, 0.05]), 0.25
 
 
 class FittedModel(NamedTuple):
-    """A fitted model: its effects as candidates, its vector, cost, and free places."""
+    """A fitted model: its effects as candidates, its vector, cost, and free indices."""
 
     candidates: tuple[Candidate, ...]
     vector: np.ndarray
     cost: float
-    places: tuple[int, ...]
+    indices: tuple[int, ...]
 
     @property
     def effects(self) -> set[str]:
@@ -114,16 +114,18 @@ class SearchState:
         return cls(problem.with_noise(noise), unobservable=lacking, held=held)
 
     @property
-    def base_places(self) -> list[int]:
-        """The places of the free base parameters."""
+    def base_indices(self) -> list[int]:
+        """The indices of the free base parameters."""
         held = {one.field for one in self.held}
-        return self.problem.index([name for name in base_of(self.problem.like) if name not in held])
+        return self.problem.indices_of(
+            [name for name in base_of(self.problem.like) if name not in held]
+        )
 
     @property
-    def every_place(self) -> list[int]:
-        """The places that may become free: the base, and all parameters of all effects."""
-        base, fields = self.base_places, [one.fields for one in candidates_for(self.problem)]
-        others = {place for some in fields for place in self.problem.index(some)} - {*base}
+    def all_indices(self) -> list[int]:
+        """The indices that may become free: the base, and all parameters of all effects."""
+        base, fields = self.base_indices, [one.fields for one in candidates_for(self.problem)]
+        others = {index for some in fields for index in self.problem.indices_of(some)} - {*base}
         return base + sorted(others)
 
     def with_noise(self, noise: np.ndarray) -> "SearchState":
@@ -138,7 +140,7 @@ class SearchState:
         Slopes of one that is near, within ``max_distance`` of chi2, are used again.
         """
         problem, last = self.problem, self.linearization
-        is_same = last is not None and last.places == self.every_place
+        is_same = last is not None and last.indices == self.all_indices
         if last is not None and is_same and last.distance(vector) <= max_distance:
             if last.noise is not problem.noise:
                 last = Linearization(problem, last.slopes, last.probes)
@@ -150,7 +152,7 @@ class SearchState:
             others = problem.clipped(
                 np.array([probe.placed_in(problem, vector) for probe in probes])
             )
-            found = Linearization(problem, problem.slopes(vector, self.every_place, others), probes)
+            found = Linearization(problem, problem.slopes(vector, self.all_indices, others), probes)
         return replace(self, linearization=found), found
 
     def fitted(
@@ -164,30 +166,30 @@ class SearchState:
 
         nearby, limit: as in ``refine``.
         """
-        effects = [place for one in candidates for place in self.problem.index(one.fields)]
-        places = self.base_places + effects
-        vector, cost = refine(self.problem, vector, places, nearby, limit)
-        return FittedModel(tuple(candidates), vector, cost, tuple(places))
+        effects = [index for one in candidates for index in self.problem.indices_of(one.fields)]
+        indices = self.base_indices + effects
+        vector, cost = refine(self.problem, vector, indices, nearby, limit)
+        return FittedModel(tuple(candidates), vector, cost, tuple(indices))
 
 
 def refine(
     problem: Problem,
     vector: np.ndarray,
-    places: Sequence[int],
+    indices: Sequence[int],
     nearby: Linearization | None = None,
     limit: float = np.inf,
 ) -> tuple[np.ndarray, float]:
-    """Minimise the cost along some places by Gauss-Newton; return the vector and its cost.
+    """Minimise the cost along some indices by Gauss-Newton; return the vector and its cost.
 
     Slopes are kept while little is gained: residuals cost a tenth of them. nearby: a linearization
     whose slopes serve at first. limit: of the cost; a fit that is above it after a few rounds ends
     there.
     """
-    places = list(places)
+    indices = list(indices)
     if nearby is None:
-        now = Linearization(problem, problem.slopes(vector, places))
+        now = Linearization(problem, problem.slopes(vector, indices))
     else:
-        now = nearby.narrowed(places).moved(vector)
+        now = nearby.narrowed(indices).moved(vector)
     since, is_fresh = now.cost, nearby is None
     for number in range(MAX_ROUNDS):
         if number == TRIAL_ROUNDS and now.cost > limit:
@@ -198,7 +200,7 @@ def refine(
         if gained < MIN_GAIN:
             if is_fresh or since - now.cost < STALE:
                 break
-            now = Linearization(problem, problem.slopes(now.vector, places))
+            now = Linearization(problem, problem.slopes(now.vector, indices))
             since, is_fresh = now.cost, True
     return now.vector, float(now.cost)
 
@@ -214,13 +216,13 @@ def _step(problem: Problem, now: Linearization) -> tuple[float, Linearization]:
     for first in range(0, len(STEP_SHARES), at_once):
         shares = STEP_SHARES[first : first + at_once]
         tried = np.repeat(now.vector[None], len(shares), axis=0)
-        tried[:, now.places] += shares[:, None] * step
+        tried[:, now.indices] += shares[:, None] * step
         tried = problem.clipped(tried)
         white = problem.whitened_residuals(*tried)
         costs = costs_of(problem, tried, white)
-        place = int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))
-        if now.cost - costs[place] > gained:
-            best, gained = now.moved(tried[place], white[place]), now.cost - costs[place]
+        index = int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))
+        if now.cost - costs[index] > gained:
+            best, gained = now.moved(tried[index], white[index]), now.cost - costs[index]
         if gained > PART_OF_PROMISE * promised:
             break
     return gained, best
@@ -242,7 +244,7 @@ def score_candidates(
     state: SearchState, linearization: Linearization, model: FittedModel
 ) -> list[Scored]:
     """Return all effects that a model lacks, by merit to first order, one way of each."""
-    given = linearization.columns_at(model.places)
+    given = linearization.columns_at(model.indices)
     excluded = {*state.unobservable, *state.refused}
     best: dict[str, Scored] = {}
     for candidate in candidates_for(state.problem):
@@ -273,7 +275,7 @@ def add_effect(
     candidates = model.joined_by(candidate)
     if not candidate.probes:
         vector = model.vector.copy()
-        vector[problem.index(candidate.fields)] += gain.step
+        vector[problem.indices_of(candidate.fields)] += gain.step
         return state.fitted(candidates, problem.clipped(vector), linearization, limit)
     best = state.fitted(candidates, _on_the_way(problem, model, scored), limit=limit)
     if model.cost - best.cost < KEPT_PROMISE * gain.chi2:
@@ -289,12 +291,12 @@ def _on_the_way(problem: Problem, model: FittedModel, scored: Scored) -> np.ndar
     """Return the vector at the best shares of the ways to probes, with all else moved along."""
     candidate, gain = scored
     vector = model.vector.copy()
-    vector[list(model.places)] += gain.given_step
-    vector[problem.index(candidate.other_fields)] += gain.step[len(candidate.probes) :]
+    vector[list(model.indices)] += gain.given_step
+    vector[problem.indices_of(candidate.other_fields)] += gain.step[len(candidate.probes) :]
     for probe, step in zip(candidate.probes, gain.step, strict=False):
-        place = problem.names.index(probe.field)
+        index = problem.names.index(probe.field)
         share = np.sign(step) * np.clip(np.abs(step), *SHARE_OF_WAY)
-        vector[place] += share * (probe.value - vector[place])
+        vector[index] += share * (probe.value - vector[index])
     return problem.clipped(vector)
 
 
@@ -340,9 +342,9 @@ def saturated_residuals(linearization: Linearization) -> np.ndarray:
 
     Noise is fitted to this, so that a missing effect is not mistaken for noise.
     """
-    problem, places = linearization.problem, linearization.places
+    problem, indices = linearization.problem, linearization.indices
     tried = np.repeat(linearization.vector[None], len(SATURATED_SHARES), axis=0)
-    tried[:, places] += SATURATED_SHARES[:, None] * linearization.step(range(len(places)))
+    tried[:, indices] += SATURATED_SHARES[:, None] * linearization.step(range(len(indices)))
     tried = problem.clipped(tried)
     left = problem.residuals(tried)
     return left[int(np.nanargmin(costs_of(problem, tried, problem.whiten(left))))]

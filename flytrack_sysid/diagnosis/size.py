@@ -66,8 +66,8 @@ def is_notable(name: str, problem: Problem, vector: np.ndarray) -> bool:
 
 
 def _change(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> np.ndarray:
-    places = problem.index(fields)
-    return vector[places] - problem.start[places]
+    indices = problem.indices_of(fields)
+    return vector[indices] - problem.start[indices]
 
 
 def _is_base_notable(fields: Sequence[str], problem: Problem, vector: np.ndarray) -> bool:

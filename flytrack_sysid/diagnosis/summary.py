@@ -102,8 +102,8 @@ def mean_factor(problem: Problem, vector: np.ndarray, half_n: float) -> dict[str
 
     half_n: half of the 95 % interval of the mean thrust, N. Empty where the nominal one has none.
     """
-    places, slopes = problem.index(THRUST_COEFFS), mean_thrust(problem)
-    before, after = (float(slopes @ own[places]) for own in (problem.start, vector))
+    indices, slopes = problem.indices_of(THRUST_COEFFS), mean_thrust(problem)
+    before, after = (float(slopes @ own[indices]) for own in (problem.start, vector))
     if before <= 0.0:
         return {}
     return {"mean_factor": Estimated.around(after / before, half_n / before, "1")}
@@ -120,14 +120,14 @@ def half_responses_of(
     The intervals of the extended model are to first order those of all its parameters together.
     """
     problem, fit = refined.problem, refined.fit
-    places = list(model.places if fit is None else fit.places)
-    moved, step = problem.nudged(vectors["extended"], places, SLOPE_STEP)
+    indices = list(model.indices if fit is None else fit.indices)
+    moved, step = problem.nudged(vectors["extended"], indices, SLOPE_STEP)
     found = half_responses(np.stack([*vectors.values(), *moved]), problem.like, SMALL_STEP)
     full = half_responses(np.stack(list(vectors.values())), problem.like, FULL_STEP)
     own = found[list(vectors).index("extended")]
     slopes = np.nan_to_num((found[len(vectors) :] - own) / step[:, None]).T
     if fit is None:
-        names = [problem.names[place] for place in places]
+        names = [problem.names[place] for place in indices]
         halves = Marginal(linearization, model, names).half_widths(slopes)
     else:
         halves = np.sqrt(np.diag(slopes @ fit.covariance @ slopes.T))
@@ -252,10 +252,10 @@ def _refitted_to_first_order(
 ) -> np.ndarray:
     """Return the vector with some parameters at nominal, the rest refitted to first order."""
     problem = linearization.problem
-    places, less = problem.index(fields), problem.at_start(model.vector, fields)
-    others = [place for place in model.places if place not in set(places)]
-    columns, own = linearization.columns_at(others), linearization.columns_at(places)
-    change = less[places] - model.vector[places]
+    indices, less = problem.indices_of(fields), problem.at_start(model.vector, fields)
+    others = [place for place in model.indices if place not in set(indices)]
+    columns, own = linearization.columns_at(others), linearization.columns_at(indices)
+    change = less[indices] - model.vector[indices]
     score = linearization.score[columns] - linearization.total[np.ix_(columns, own)] @ change
     less[others] += solve(linearization.total[np.ix_(columns, columns)], score)
     return problem.clipped(less)
@@ -267,8 +267,8 @@ def _as_thrust_scale(
     """Return a thrust curve as a scale of thrust if one factor explains all of its change."""
     if cause.effect != "thrust_curve":
         return cause
-    places, information = problem.index(change.fields), change.marginal.information
-    nominal, values = problem.start[places], model.vector[places]
+    indices, information = problem.indices_of(change.fields), change.marginal.information
+    nominal, values = problem.start[indices], model.vector[indices]
     along = nominal @ information
     known = float(along @ nominal)
     if known <= 0.0:
@@ -383,7 +383,7 @@ def errors_of(
     measured changes themselves, less their mean.
     """
     still = test.start.copy()
-    still[test.index(STILL)] = 0.0
+    still[test.indices_of(STILL)] = 0.0
     left = [
         _with_voltage_summed(one, test.counts)
         for one in test.residuals(np.stack([still, *vectors.values()]))
@@ -460,7 +460,7 @@ def with_refined_values(
 ) -> tuple[Cause, ...]:
     """Return causes with refined values and intervals, and which of the values are at a bound."""
     problem, fit = refined.problem, refined.fit
-    half = {} if fit is None else dict(zip(fit.places, fit.half_widths, strict=True))
+    half = {} if fit is None else dict(zip(fit.indices, fit.half_widths, strict=True))
     result = []
     for cause in causes:
         prefix = f"{cause.effect}." if cause.effect in BY_NAME else ""
@@ -477,7 +477,7 @@ def with_refined_values(
                 values[name] = Estimated.around(value, half[place], range_of(field).unit, low, high)
         fields = [field for field in fields if field.split(".")[-1] in values]
         if "mean_factor" in values and fit is not None:
-            own = [fit.places.index(place) for place in problem.index(THRUST_COEFFS)]
+            own = [fit.indices.index(place) for place in problem.indices_of(THRUST_COEFFS)]
             slopes = mean_thrust(problem)
             half_n = float(np.sqrt(slopes @ fit.covariance[np.ix_(own, own)] @ slopes))
             values |= mean_factor(problem, vector, half_n)
@@ -514,19 +514,21 @@ def changed_parameters(
 ) -> tuple[Changed, ...]:
     """Return every parameter of the extended model whose value differs from the nominal one."""
     problem, fit, vector = refined.problem, refined.fit, extended.vector
-    places = [place for place in extended.places if abs(vector[place] - problem.start[place]) > 0.0]
+    indices = [
+        place for place in extended.indices if abs(vector[place] - problem.start[place]) > 0.0
+    ]
     if fit is not None:
-        widths = dict(zip(fit.places, fit.half_widths, strict=True))
+        widths = dict(zip(fit.indices, fit.half_widths, strict=True))
     else:
         acting = [
-            place for place in places if linearization.acting([linearization.places.index(place)])
+            place for place in indices if linearization.acting([linearization.indices.index(place)])
         ]
         halves = Marginal(
             linearization, extended, [problem.names[place] for place in acting]
         ).half_widths()
         widths = dict(zip(acting, halves, strict=True))
     result = []
-    for place in places:
+    for place in indices:
         name, value, half = (
             problem.names[place],
             float(vector[place]),

@@ -59,7 +59,7 @@ class FlightVariables(NamedTuple):
 
 def flight_of(problem: Problem, model: FittedModel) -> FlightVariables:
     """Return what was flown, with the lags of a model between commands and applied action."""
-    chunks, tau = problem.chunks, model.vector[problem.index(TAUS)]
+    chunks, tau = problem.chunks, model.vector[problem.indices_of(TAUS)]
 
     def before(values: np.ndarray) -> np.ndarray:  # a step begins at the row before
         return np.concatenate([values[:1], values[:-1]])
@@ -346,7 +346,7 @@ def whitened(problem: Problem, features_w: np.ndarray, side: str) -> np.ndarray:
 
 def linearized_residuals(problem: Problem, model: FittedModel) -> tuple[np.ndarray, np.ndarray]:
     """Return a model's residuals, and their slopes along what is free, whitened."""
-    slopes = problem.slopes(model.vector, model.places)
+    slopes = problem.slopes(model.vector, model.indices)
     return problem.whiten(slopes.residuals[None])[0], problem.whiten(slopes.columns)
 
 
@@ -419,12 +419,12 @@ def is_like_drift(problem: Problem, model: FittedModel, fields: Sequence[str]) -
     """
     axes, flight = SIDES["force"], flight_of(problem, model)
     left, slopes = linearized_residuals(problem, model)
-    places = problem.index(fields)
-    own = [model.places.index(place) for place in places]
+    indices = problem.indices_of(fields)
+    own = [model.indices.index(index) for index in indices]
     test = SideTest.of("force", left, np.delete(slopes, own, axis=0))
     columns, size = (
         blocks_of(slopes[own][..., axes, :] * test.root),
-        (model.vector - problem.start)[places],
+        (model.vector - problem.start)[indices],
     )
 
     def beside(*features_w: np.ndarray) -> float:

@@ -155,13 +155,13 @@ def find_stand_ins(
     def noncentralities(one: Suspect, side: str) -> tuple[float, float]:
         """Return a suspect's noncentrality on a side, alone and beside the found dependences."""
         axes = unknown.SIDES[side]
-        own = [model.places.index(place) for place in problem.index(one.fields)]
+        own = [model.indices.index(index) for index in problem.indices_of(one.fields)]
         acting = slopes[own][..., axes, :]
         if not (problem.counts[..., axes, :].any() and np.abs(acting).max() > 0.0):
             return 0.0, 0.0
         test = unknown.SideTest.of(side, left, np.delete(slopes, own, axis=0))
         columns = blocks_of(acting * test.root)
-        size = (model.vector - problem.start)[problem.index(one.fields)]
+        size = (model.vector - problem.start)[problem.indices_of(one.fields)]
         before = test.noncentrality(columns, size)
         more = [dependence.columns for dependence in dependences if dependence.side == side]
         if more:

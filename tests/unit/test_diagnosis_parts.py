@@ -310,7 +310,7 @@ def test_a_sensor_farther_off_than_any_on_the_list_is_told_and_not_named():
 def test_what_may_be_something_unknown_is_told_with_its_size_and_not_named(state):
     problem = state.problem
     vector = problem.start.copy()
-    vector[problem.index(THRUST_COEFFS)] *= 1.146
+    vector[problem.indices_of(THRUST_COEFFS)] *= 1.146
     selection = Selection(state, None, None, {}, stand_ins=("thrust_curve", "wind", "tau_yaw"))
     thrust, lag = stand_in_notes(selection, vector)
     assert (
@@ -348,8 +348,8 @@ def test_values_at_the_end_of_their_range_are_beyond_the_list(state, field, valu
 def test_a_value_that_no_flight_depends_on_is_not_told(state):
     """A yaw that is ahead of the others by more than their delay is in time, whatever the value."""
     problem, names = state.problem, ("delay_s", "yaw_extra_s")
-    places = tuple(problem.index([f"command_delay.{name}" for name in names]))
-    fit = Fit(problem.start, places, np.diag([1e-6, 0.0]))
+    indices = tuple(problem.indices_of([f"command_delay.{name}" for name in names]))
+    fit = Fit(problem.start, indices, np.diag([1e-6, 0.0]))
     told = {name: Estimated(0.01, (0.0, 0.02), "s") for name in names}
     cause = replace(CAUSE, effect="command_delay", parameters=told)
     (found,) = with_refined_values(

@@ -57,9 +57,9 @@ FREE = ("given", "first", "second")
 def half_widths(scores, information):
     """Return half widths of intervals from scores of seconds (BLOCKS, 3) and information."""
     seen = object.__new__(Linearization)
-    seen.places, seen.total, seen.score_by_block = [0, 1, 2], information, scores
+    seen.indices, seen.total, seen.score_by_block = [0, 1, 2], information, scores
     seen.problem = SimpleNamespace(names=FREE)
-    return Marginal(seen, SimpleNamespace(places=(0, 1, 2)), FREE[1:]).half_widths()
+    return Marginal(seen, SimpleNamespace(indices=(0, 1, 2)), FREE[1:]).half_widths()
 
 
 def test_widths_cover_when_all_parameters_are_noisier_than_said():

@@ -49,7 +49,7 @@ class Logged(NamedTuple):
 def logged(log):
     chunks = cut_chunks(log, np.ones(len(log), bool), MODEL)
     state = SearchState(Problem.of(chunks, MODEL).with_noise(NOISE))
-    model = FittedModel((), state.problem.start, 0.0, tuple(state.base_places))
+    model = FittedModel((), state.problem.start, 0.0, tuple(state.base_indices))
     return Logged(state.problem, model, state.linearized(model.vector)[1])
 
 

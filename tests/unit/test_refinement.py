@@ -52,7 +52,7 @@ def test_values_are_refined_by_flights(dragged):
         "linear_drag",
         "accelerometer_bias",
     ] and not found.removed
-    half_widths = dict(zip(found.fit.places, found.fit.half_widths, strict=True))
+    half_widths = dict(zip(found.fit.indices, found.fit.half_widths, strict=True))
     for name, value in TRUE_DRAG.items():
         place = problem.names.index(f"linear_drag.{name}")
         assert abs(found.fit.vector[place] - value) < max(1.5 * half_widths[place], 0.05 * value)
