@@ -195,13 +195,18 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
             self._check("action", action, self.action_space.shape),
             self._simulation,
         )
-        found = step(simulation.compiled, self._states, action[None], simulation.packed_params)
-        self._states, observations, scenes, outcomes = found
-        self._log(scenes, NONE_BEGAN)
+        self._states, outcome = step(
+            simulation.compiled,
+            self._states,
+            action,
+            simulation.packed_params,
+            self._renderer is not None,
+        )
+        observation, reward, terminated, truncated, info, scene = outcome.to_python()
+        if scene is not None:
+            self._log([scene], NONE_BEGAN)
         self._show()
-        reward, terminated, truncated, info = outcomes.to_host()
-        info = {name: value[0] if value.ndim > 1 else value.item() for name, value in info.items()}
-        return np.array(observations)[0], reward.item(), terminated.item(), truncated.item(), info
+        return observation.copy(), reward, terminated, truncated, info
 
     def _show(self) -> None:
         """Show the state in the window, if there is one."""

@@ -7,7 +7,7 @@ has some fifty leaves and the parameters as many again.
 import math
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +19,11 @@ from flytrack_env.fusion import compute_once
 HOST_DTYPES = {"f": np.float64, "i": np.int64, "u": np.int64, "b": np.bool_}
 
 
-class Layout(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Layout:
     """Structure of a pytree, dtypes of its matrices, and the slot of each leaf.
+
+    Equal layouts are one object: every call of a compiled function hashes and compares them.
 
     Attributes:
         slots: a leaf's shape, matrix, first row, and the row after its last.
@@ -30,8 +33,12 @@ class Layout(NamedTuple):
     dtypes: tuple[Any, ...]
     slots: tuple[tuple[tuple[int, ...], int, int, int], ...]
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        forms = tuple((shape, self.dtypes[matrix]) for shape, matrix, *_ in self.slots)
+        return _layout, (self.structure, forms)
 
-@cache  # so that equal layouts are one object, which compiled functions compare at once
+
+@cache
 def _layout(structure: Any, forms: tuple[tuple[tuple[int, ...], Any], ...]) -> Layout:
     dtypes = tuple(dict.fromkeys(dtype for _, dtype in forms))
     ends, slots = [0] * len(dtypes), []
@@ -60,6 +67,20 @@ class Packed:
             for shape, matrix, first, end in self.layout.slots
         )
         leaves = [part.T.reshape(-1, *shape) for shape, part in rows]
+        return jax.tree.unflatten(self.layout.structure, leaves)
+
+    def unpack_one(self) -> Any:
+        """Return the pytree that is packed as a batch of one."""
+        return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[1:]), self.unpack())
+
+    def to_python(self) -> Any:
+        """Return the pytree that is packed as a batch of one, of Python's numbers and arrays."""
+        rows = [np.asarray(matrix)[:, 0] for matrix in self.matrices]
+        numbers = [row.tolist() for row in rows]  # at once: each conversion costs as much as this
+        leaves = [
+            rows[matrix][first:end].reshape(shape) if shape else numbers[matrix][first]
+            for shape, matrix, first, end in self.layout.slots
+        ]
         return jax.tree.unflatten(self.layout.structure, leaves)
 
     def to_host(self) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 
 from flytrack_env.env import EnvParams
 from flytrack_env.episodes import EpisodicEnvironment
+from flytrack_env.fusion import one_kernel
 from flytrack_env.gymnasium_adapter.packing import Packed, pack, pack_one
 from flytrack_env.randomness import seed_of
 from flytrack_env.registration import make
@@ -34,10 +35,6 @@ def _make_key(words: jax.Array) -> jax.Array:
     return jax.random.wrap_key_data(words, impl="threefry2x32")
 
 
-def _params_of(packed: Packed) -> EnvParams:
-    return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[1:]), packed.unpack())
-
-
 def _scene(env: EpisodicEnvironment, state: Any) -> jax.Array:
     return scene_row(env.drone(state), env.race(state))
 
@@ -52,7 +49,7 @@ def begin(
         words: of their keys, (num_envs, KEY_WORDS).
         start: as of ``options.read_start``, the same for all.
     """
-    unpacked = _params_of(params)
+    unpacked = params.unpack_one()
 
     def begin_one(words: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
         seed = seed_of(_make_key(words))
@@ -68,23 +65,38 @@ def begin(
     return pack(states), observations, scenes
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=(0, 4))
 def step(
-    env: EpisodicEnvironment, states: Packed, actions: jax.Array, params: Packed
-) -> tuple[Packed, jax.Array, jax.Array, Packed]:
-    """Step a batch without auto-reset.
+    env: EpisodicEnvironment, state: Packed, action: jax.Array, params: Packed, has_scene: bool
+) -> tuple[Packed, Packed]:
+    """Step one environment without auto-reset, as one kernel where it can be.
 
-    Return states, observations, scenes, and (rewards, terminated, truncated, info).
+    Args:
+        state: a batch of one, as the results are.
+
+    Returns:
+        The state, and (observation, reward, terminated, truncated, info, scene); the scene is None
+        unless it is needed.
     """
-    unpacked = _params_of(params)
 
-    def step_one(state: Any, action: jax.Array) -> tuple[Any, ...]:
-        observation, state, reward, terminated, info = env.step_env(None, state, action, unpacked)
-        outcome = reward, terminated, env.is_truncated(state, unpacked), info
-        return state, observation, _scene(env, state), outcome
+    @one_kernel
+    def step_one(state: Packed, action: jax.Array, params: Packed) -> tuple[Packed, Packed]:
+        unpacked = params.unpack_one()
+        observation, after, reward, terminated, info = env.step_env(
+            None, state.unpack_one(), action, unpacked
+        )
+        scene = _scene(env, after) if has_scene else None
+        outcome = (
+            observation,
+            reward,
+            terminated,
+            env.is_truncated(after, unpacked),
+            info,
+            scene,
+        )
+        return pack_one(after), pack_one(outcome)
 
-    after, observations, scenes, outcomes = jax.vmap(step_one)(states.unpack(), actions)
-    return pack(after), observations, scenes, pack(outcomes)
+    return step_one(state, action, params)
 
 
 @partial(jax.jit, static_argnums=(0, 7))
@@ -110,7 +122,7 @@ def step_batch(
             before.
     """
     key = jax.random.fold_in(_make_key(words), count)
-    outcome = env.step_batch(key, states.unpack(), actions, _params_of(params), has_ended)
+    outcome = env.step_batch(key, states.unpack(), actions, params.unpack_one(), has_ended)
     observations, after, rewards, terminated, truncated, info = outcome
     final_observations = info["final_observation"] if has_ended is None else None
     info = {name: value for name, value in info.items() if name not in NOT_INFO}
