@@ -192,12 +192,13 @@ def voltages_of(chunks: Chunks) -> tuple[float, float] | None:
     return (float(measured.min()), float(measured.max())) if len(measured) else None
 
 
-def thinned(chunks: Chunks, most: int | None = None) -> Chunks:
-    """Return at most ``most`` chunks, evenly spread over a log; by default MAX_ROWS rows."""
+def thinned(chunks: Chunks, max_chunks: int | None = None) -> Chunks:
+    """Return at most ``max_chunks`` chunks, evenly spread over a log; MAX_ROWS rows by default."""
     rows, num_chunks = chunks.row.shape
-    most = (
-        most or max(MAX_ROWS // (rows - lead_in_of(rows)) // CHUNKS_PADDED_TO, 1) * CHUNKS_PADDED_TO
+    max_chunks = (
+        max_chunks
+        or max(MAX_ROWS // (rows - lead_in_of(rows)) // CHUNKS_PADDED_TO, 1) * CHUNKS_PADDED_TO
     )
-    if num_chunks <= most:
+    if num_chunks <= max_chunks:
         return chunks
-    return chunks.selected(np.linspace(0, num_chunks - 1, most).round().astype(int))
+    return chunks.selected(np.linspace(0, num_chunks - 1, max_chunks).round().astype(int))

@@ -418,14 +418,14 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
         *summary.unseen_at_rest_notes(vetted.rejected),
         *notes_of(selection, linearization, parts.log),
     ]
-    rest = summary.with_lost_causes(unexplained, named.lost)
-    rest = replace(rest, flagged=rest.flagged or bool(beyond))
+    all_unexplained = summary.with_lost_causes(unexplained, named.lost)
+    all_unexplained = replace(all_unexplained, flagged=all_unexplained.flagged or bool(beyond))
     return Diagnosis(
-        verdict=summary.verdict_of(causes, rest),
+        verdict=summary.verdict_of(causes, all_unexplained),
         causes=causes,
         negligible=named.negligible,
         beyond=beyond,
-        unexplained=rest,
+        unexplained=all_unexplained,
         not_identifiable=summary.not_identifiable(
             selection.state,
             linearization,

@@ -39,7 +39,7 @@ MAX_RIVALS = 3
 NEARLY, NEAR_SHARE, PROBE_SHARE = 60.0, 0.15, 0.25
 CLEARLY_CHEAPER = 0.5  # of cost and price: swaps that save less would go back and forth
 IMMATERIAL = 0.01  # of a lag or a drain
-IMMATERIAL_THRUST = 0.003  # of the weight, rms over what was flown
+IMMATERIAL_THRUST = 0.003  # of the weight, rms over the flown rows
 HOPELESS = 0.01  # of the cost, above the limit to first order: not worth a fit
 
 

@@ -100,7 +100,7 @@ def windowed_gains(
     free = information[:, given][:, :, given].sum(axis=0)
     across = np.tensordot(
         weights, information[:, given][:, :, changing], axes=1
-    )  # (hypotheses, given, own)
+    )  # (hypotheses, given, changing)
     unprojected = np.tensordot(weights**2, information[:, changing][:, :, changing], axes=1)
     share = solve(free, np.moveaxis(across, 0, 1).reshape(len(given), -1))
     share = np.moveaxis(share.reshape(len(given), len(weights), len(changing)), 1, 0)

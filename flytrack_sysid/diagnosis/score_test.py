@@ -23,7 +23,7 @@ from flytrack_sysid.diagnosis.problem import (
 )
 from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS, neutral_value, range_of
 
-FALSE_POSITIVE_RATE = 1e-4  # of each effect: it is named though it is absent
+FALSE_POSITIVE_RATE = 1e-4  # that an absent effect is named, for each effect
 # A direction cannot be told from others that explain all but this share of it.
 MIN_INDEPENDENT_FRACTION = 1e-7
 AT_BOUND = 1e-9

@@ -114,7 +114,7 @@ def apply_vetoes(selection: Selection, test: Problem) -> tuple[Selection, dict[s
 
 
 def examined(selection: Selection) -> Selection:
-    """Return the selection with its unexplained rest, and the names that stand in for that."""
+    """Return the selection with its unexplained part, and the names that stand in for it."""
     problem, model = selection.state.problem, selection.model
     unexplained, dependences = unknown.find_unexplained(problem, model, selection.base.vector)
     selection = selection._replace(unexplained=unexplained, stand_ins=())
