@@ -1,10 +1,10 @@
-"""Before and after: of all that a model lacks, only what has changed since an earlier log is named.
+"""Before and after: name only what has changed since an earlier log.
 
-No model of a real drone is complete. What it lacks is in the log before and in the log after alike,
-and laws that stand in for it are found in both. So each law is fitted to either log, beside the
-same others, and names a change where the estimates differ by more than both are uncertain, and by a
-size that matters. Uncertainty is judged from how much seconds of a log disagree, which counts what
-the model lacks.
+No model of a real drone is complete. The parts that it lacks act in the earlier and in the later
+log, and laws that stand in for them are found in both. So each law is fitted to either log, beside
+the same other laws. It names a change if the estimates differ by more than the uncertainty of both,
+and by a notable size. Uncertainty is estimated from the disagreement between seconds of a log,
+which includes the effect of the parts that the model lacks.
 """
 
 from collections.abc import Callable, Sequence
@@ -47,10 +47,10 @@ from flytrack_sysid.log_motion import check_same_origin
 from flytrack_sysid.parameters import THRUST_COEFFS
 
 MAX_EFFECTS = 4
-# Sticks that are farther from where they were lately, in sum; the time constant of lately, and for
-# how long what follows does not count.
+# Sticks jump if the sum of their distances from their low-pass exceeds JUMP. JUMP_S is the time
+# constant of the low-pass; AFTERMATH_S is how long the rows after a jump do not count.
 JUMP, JUMP_S, AFTERMATH_S = 0.5, 0.05, 0.2
-WORSE = 1.5  # times what was left unexplained before: so much more is new
+WORSE = 1.5  # times what was left unexplained before: more than this is new
 Logs = FlightLog | Sequence[FlightLog]
 
 
@@ -61,7 +61,10 @@ def _logs(logs: Logs) -> Sequence[FlightLog]:
 class Change(NamedTuple):
     """The change of parameters from the earlier log to the later one.
 
-    half: half of the 95 % interval of each change. chi2: of all changes.
+    Attributes:
+        size: of each change.
+        half: half of the 95 % interval of each change.
+        chi2: of all changes.
     """
 
     size: np.ndarray
@@ -70,7 +73,14 @@ class Change(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """A model fitted to one log, by likelihood; base: the same without effects."""
+    """A model fitted to one log, by likelihood.
+
+    Attributes:
+        state: of the search.
+        base: the model without effects.
+        model: the fitted one.
+        linearization: of the model, along everything.
+    """
 
     state: search.SearchState
     base: search.FittedModel
@@ -92,7 +102,7 @@ class Estimate(NamedTuple):
         return cls(state, base, base, linearization)
 
     def with_effect(self, candidate: Candidate) -> "Estimate":
-        """Return the estimate with an effect more."""
+        """Return the estimate with one more effect."""
         line, model = self.linearization, self.model
         gain = line.gain_of(candidate, line.columns_at(model.indices))
         if gain is None:
@@ -103,9 +113,9 @@ class Estimate(NamedTuple):
         return Estimate(state, self.base, fitted, linearization)
 
     def step(self, columns: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Return to first order the step along columns beside the model, and its covariance.
+        """Return the first-order step along columns beside the model, and its covariance.
 
-        The covariance is as much larger than the information's inverse as seconds disagree after
+        The covariance is the inverse of the information times the inflation of the scores after
         the step.
         """
         gain = self.linearization.freed(
@@ -122,12 +132,19 @@ def diagnose_change(
     report: Callable[[int, int], None] = lambda done, stages: None,
     motion: Motion | None = None,
 ) -> Diagnosis:
-    """Return the diagnosis of a log, in which causes are what changed since a log before.
+    """Return the diagnosis of a log, in which causes are changes since an earlier log.
 
-    before: of the same craft, as the model knows it. The rest as in ``diagnose``. Values of causes
-    are those of the model, changed as the estimates changed. What the model lacks in both logs is
-    in the extended model's other parameters, and is no cause; unexplained is only what was not so
-    before.
+    Values of causes are those of the model plus the change of the estimates. What the model lacks
+    in both logs is in the extended model's other parameters, and is no cause. Only what
+    was not unexplained in the earlier log is unexplained.
+
+    Args:
+        after: the later log, or several.
+        before: the earlier log, or several, of the same craft as described by the model.
+        model: as in ``diagnose``.
+        held_out: as in ``diagnose``, of the later log.
+        report: as in ``diagnose``.
+        motion: as in ``diagnose``.
 
     Raises:
         DiagnosisError: as ``diagnose``, of either log.
@@ -139,46 +156,47 @@ def diagnose_change(
         model = nominal_parameters() if model is None else model
         later = Estimate.of(parts)
         earlier = Estimate.of(calm(split(before, model, None, parts.motion_estimate.motion)))
-        alike: dict[str, tuple[str, ...]] = {}
+        equivalents: dict[str, tuple[str, ...]] = {}
         report(1, 3)
         while len(later.model.candidates) < MAX_EFFECTS:
             change = next_change(later, earlier)
             if change is None:
                 break
-            best, alike[change[0].candidate.effect] = change
+            best, equivalents[change[0].candidate.effect] = change
             later, earlier = best.later, best.earlier
         report(2, 3)
         selection = selection_of(later, earlier)
         test = held_out_under(selection, parts.test)
-        judged = refined_within_range(selection, {}, test, parts)
-        found = summarize(judged, parts._replace(test=test))
-        # A change is named by its steps and size; the extended model has it only if flights gain by
-        # it.
+        vetted = refined_within_range(selection, {}, test, parts)
+        diagnosis = summarize(vetted, parts._replace(test=test))
+        # Steps and sizes name a change; the extended model has it only if it improves flights.
         effects = effect_causes(selection, test, later.linearization)
-        base = [one for one in found.causes if one.effect not in later.model.effects]
+        base = [one for one in diagnosis.causes if one.effect not in later.model.effects]
         named = [*effects, *base]
         causes = tuple(one for cause in named for one in changed_cause(cause, later, earlier))
         report(3, 3)
     drifts = {one.effect: one.equivalent for one in base if DRIFT in one.equivalent}
-    causes = tuple(replace(one, equivalent=(drifts | alike).get(one.effect, ())) for one in causes)
-    same = {one.effect for one in named} - {one.effect for one in causes}
+    causes = tuple(
+        replace(one, equivalent=(drifts | equivalents).get(one.effect, ())) for one in causes
+    )
+    unchanged = {one.effect for one in named} - {one.effect for one in causes}
     return replace(
-        found,
-        nominal=model._replace(motion=found.extended.motion),
-        verdict=verdict_of(causes, found.unexplained),
+        diagnosis,
+        nominal=model._replace(motion=diagnosis.extended.motion),
+        verdict=verdict_of(causes, diagnosis.unexplained),
         causes=causes,
         warnings=(
-            *found.warnings,
-            *(f"{name}: as in the log before, so no change" for name in sorted(same)),
+            *diagnosis.warnings,
+            *(f"{name}: as in the log before, so no change" for name in sorted(unchanged)),
         ),
     )
 
 
 def calm(parts: Split) -> Split:
-    """Return a split in which only rows count before which the sticks did not jump.
+    """Return a split in which only rows count that do not follow a jump of the sticks.
 
-    Where they do, motors end, and how a controller shares what there is among the axes only a loop
-    says.
+    After a jump, motors saturate, and only a loop says how a controller shares the thrust among the
+    axes.
     """
     if acts(parts.train.like.effects, "respond"):
         return parts
@@ -195,14 +213,18 @@ def _calm(problem: Problem) -> Problem:
     rows = max(round(AFTERMATH_S / step_s), 1)
     follows = signal.lfilter(np.ones(rows), [1.0], is_jump.astype(float), axis=0) > 0.5
     quiet = counts & ~follows[..., None, None]
-    quiet[..., -1, :] = counts[..., -1, :]  # a battery does not mind
+    quiet[..., -1, :] = counts[..., -1, :]  # jumps do not affect the battery
     return replace(problem, chunks=problem.chunks._replace(counts=quiet))
 
 
 class Refit(NamedTuple):
     """Both logs refitted with one more effect.
 
-    merit: chi2 gained on the later log, less that gained on the earlier one and a price.
+    Attributes:
+        candidate: the effect.
+        later: the estimate from the later log.
+        earlier: the estimate from the earlier log.
+        merit: chi2 gained on the later log, less that gained on the earlier one and a price.
     """
 
     candidate: Candidate
@@ -214,58 +236,72 @@ class Refit(NamedTuple):
 def next_change(later: Estimate, earlier: Estimate) -> tuple[Refit, tuple[str, ...]] | None:
     """Return the effect whose change explains the logs best, and others that do so nearly as well.
 
-    Those that are promising to first order are refitted. None where none changed enough.
+    Effects that are promising to first order are refitted. Return None if none changed enough.
     """
-    promise = {one: promise_of(one, later, earlier) for one in candidates_for(later.state.problem)}
-    ways: dict[tuple[str, ...], Candidate] = {}
-    for one in sorted(
-        (one for one in promise if promise[one] > 0.0), key=lambda one: -promise[one]
-    ):
-        ways.setdefault(one.fields, one)
-    refitted = [(one, later.with_effect(one)) for one in [*ways.values()][: search.MAX_REFITTED]]
-    worth = {
-        one: later.model.cost - more.model.cost - search.PER_PARAMETER * len(one.fields)
-        for one, more in refitted
+    promises = {
+        candidate: promise_of(candidate, later, earlier)
+        for candidate in candidates_for(later.state.problem)
     }
-    found: list[Refit] = []
-    for one, more in sorted(refitted, key=lambda pair: -worth[pair[0]]):
-        best = max((own.merit for own in found), default=0.0)
-        if worth[one] <= max(
+    by_fields: dict[tuple[str, ...], Candidate] = {}
+    for candidate in sorted(
+        (candidate for candidate in promises if promises[candidate] > 0.0),
+        key=lambda candidate: -promises[candidate],
+    ):
+        by_fields.setdefault(candidate.fields, candidate)
+    refitted = [
+        (candidate, later.with_effect(candidate))
+        for candidate in [*by_fields.values()][: search.MAX_REFITTED]
+    ]
+    later_gains = {
+        candidate: later.model.cost
+        - later_refit.model.cost
+        - search.PER_PARAMETER * len(candidate.fields)
+        for candidate, later_refit in refitted
+    }
+    refits: list[Refit] = []
+    for candidate, later_refit in sorted(refitted, key=lambda pair: -later_gains[pair[0]]):
+        best = max((refit.merit for refit in refits), default=0.0)
+        if later_gains[candidate] <= max(
             best - EQUIVALENT, 0.0
-        ):  # what the log before gains only takes from it
+        ):  # the gain on the earlier log only reduces the merit
             break
-        less = earlier.with_effect(one)
-        merit = worth[one] - (earlier.model.cost - less.model.cost)
-        if merit > 0.0 and change_between(more, less, one.fields).chi2 > threshold(len(one.fields)):
-            found.append(Refit(one, more, less, merit))
-    if not found:
+        earlier_refit = earlier.with_effect(candidate)
+        merit = later_gains[candidate] - (earlier.model.cost - earlier_refit.model.cost)
+        if merit > 0.0 and change_between(
+            later_refit, earlier_refit, candidate.fields
+        ).chi2 > threshold(len(candidate.fields)):
+            refits.append(Refit(candidate, later_refit, earlier_refit, merit))
+    if not refits:
         return None
-    best_one = max(found, key=lambda own: own.merit)
-    close = {own.candidate.effect for own in found if own.merit > best_one.merit - EQUIVALENT}
-    return best_one, tuple(sorted(close - {best_one.candidate.effect}))
+    best_refit = max(refits, key=lambda refit: refit.merit)
+    close = {
+        refit.candidate.effect for refit in refits if refit.merit > best_refit.merit - EQUIVALENT
+    }
+    return best_refit, tuple(sorted(close - {best_refit.candidate.effect}))
 
 
 def promise_of(candidate: Candidate, later: Estimate, earlier: Estimate) -> float:
     """Return the first-order gain of an effect on the later log; 0 unless its change is promising.
 
-    A change shows between the logs, and in the log after against the model.
+    A promising change shows between the logs, and in the later log against the model.
     """
-    both = later, earlier
+    estimates = later, earlier
     if candidate.effect in later.state.unobservable or not all(
-        one.model.lacks(candidate) for one in both
+        estimate.model.lacks(candidate) for estimate in estimates
     ):
         return 0.0
-    ways = [one.linearization.columns_of(candidate) for one in both]
+    columns = [estimate.linearization.columns_of(candidate) for estimate in estimates]
     if any(
-        len(one.linearization.acting(way)) < len(way) for one, way in zip(both, ways, strict=True)
+        len(estimate.linearization.acting(columns_of_log)) < len(columns_of_log)
+        for estimate, columns_of_log in zip(estimates, columns, strict=True)
     ):
         return 0.0
     (step, covariance), (step_before, covariance_before) = (
-        later.step(ways[0]),
-        earlier.step(ways[1]),
+        later.step(columns[0]),
+        earlier.step(columns[1]),
     )
     change = step - step_before
-    # What the model does not have at all cannot become less.
+    # An effect that the model does not have cannot become smaller.
     if any(
         probe.is_one_way and share <= 0.0
         for probe, share in zip(candidate.probes, step, strict=False)
@@ -285,39 +321,46 @@ def promise_of(candidate: Candidate, later: Estimate, earlier: Estimate) -> floa
 def is_large(candidate: Candidate, change: np.ndarray, later: Estimate) -> bool:
     """Return whether a change is notable in any of a candidate's parameters.
 
-    change: of probed parameters as a share of the way to the probe, of others in their units.
+    Args:
+        candidate: the effect.
+        change: of probed parameters as a share of the way to the probe, of others in their units.
+        later: the estimate from the later log.
     """
     problem = later.state.problem
-    ways = [
+    to_probes = [
         probe.value - problem.start[problem.indices_of([probe.field])[0]]
         for probe in candidate.probes
     ]
-    sizes = np.concatenate([np.array(ways), np.ones(len(candidate.other_fields))]) * change
+    sizes = np.concatenate([np.array(to_probes), np.ones(len(candidate.other_fields))]) * change
     fields = [*(probe.field for probe in candidate.probes), *candidate.other_fields]
     notable = BY_NAME[candidate.effect].notable
-    sized = dict(zip((field.split(".")[1] for field in fields), np.abs(sizes), strict=True))
-    return any(sized.get(name, 0.0) >= least for name, least in notable.items())
+    size_by_name = dict(zip((field.split(".")[1] for field in fields), np.abs(sizes), strict=True))
+    return any(
+        size_by_name.get(name, 0.0) >= notable_size for name, notable_size in notable.items()
+    )
 
 
 def selection_of(later: Estimate, earlier: Estimate) -> Selection:
     """Return the model of the later log as a selection.
 
-    Its unexplained part is what was not unexplained, or much less, in the earlier log.
+    Its unexplained part is what was explained, or much smaller, in the earlier log.
     """
     state, model = later.state, later.model
     ablations = ablate_all(state, model, later.linearization)
-    rest, past = (
-        find_unexplained(one.state.problem, one.model, one.base.vector)[0].shares
-        for one in (later, earlier)
+    present, past = (
+        find_unexplained(estimate.state.problem, estimate.model, estimate.base.vector)[0].shares
+        for estimate in (later, earlier)
     )
-    most = max(past.values(), default=0.0)
-    shares = {name: size for name, size in rest.items() if size > WORSE * past.get(name, most)}
+    largest = max(past.values(), default=0.0)
+    shares = {
+        name: size for name, size in present.items() if size > WORSE * past.get(name, largest)
+    }
     names = tuple(dict.fromkeys(name.split(": ", 1)[1] for name in shares))
     return Selection(state, later.base, model, ablations, Unexplained(bool(shares), names, shares))
 
 
 def change_between(later: Estimate, earlier: Estimate, fields: Sequence[str]) -> Change:
-    """Return how parameters of both models changed."""
+    """Return the change of parameters between both models."""
     indices = later.state.problem.indices_of(fields)
     size = later.model.vector[indices] - earlier.model.vector[indices]
     margins = [Marginal(one.linearization, one.model, fields) for one in (later, earlier)]
@@ -327,14 +370,16 @@ def change_between(later: Estimate, earlier: Estimate, fields: Sequence[str]) ->
 
 
 def changed_cause(cause: Cause, later: Estimate, earlier: Estimate) -> list[Cause]:
-    """Return a cause with the values that it changed to; nothing where it is as it was before.
+    """Return a cause with its new values; an empty list if it did not change.
 
-    Of a loop's settings, those that changed.
+    Of a loop's settings, only the changed ones are returned.
     """
-    effect = [one for one in later.model.candidates if one.effect == cause.effect]
+    candidates = [
+        candidate for candidate in later.model.candidates if candidate.effect == cause.effect
+    ]
     base = THRUST_COEFFS if cause.effect == "thrust_scale" else BASE_CAUSES.get(cause.effect, ())
     values: dict[str, Estimated] = {}
-    for fields in effect[0].groups if effect else [base]:
+    for fields in candidates[0].groups if candidates else [base]:
         values |= changed_values(cause, fields, later, earlier)
     return [replace(cause, parameters=values)] if values else []
 
@@ -342,16 +387,16 @@ def changed_cause(cause: Cause, later: Estimate, earlier: Estimate) -> list[Caus
 def changed_values(
     cause: Cause, fields: Sequence[str], later: Estimate, earlier: Estimate
 ) -> dict[str, Estimated]:
-    """Return the values that a cause's parameters changed to; none without a clear change."""
+    """Return the new values of a cause's parameters; none without a clear change."""
     problem, name = later.state.problem, cause.effect
     change = change_between(later, earlier, fields)
     indices, vector = problem.indices_of(fields), problem.start.copy()
     vector[indices] += change.size
     factor: dict[str, Estimated] = {}  # by which the mean thrust changed
     if tuple(fields) == THRUST_COEFFS:
-        ways = mean_thrust(problem)[None]
+        weights = mean_thrust(problem)[None]
         margins = [Marginal(one.linearization, one.model, fields) for one in (later, earlier)]
-        half_n = float(np.hypot(*(one.half_widths(ways)[0] for one in margins)))
+        half_n = float(np.hypot(*(one.half_widths(weights)[0] for one in margins)))
         factor = mean_factor(problem, vector, half_n)
     is_clear = np.any(np.abs(change.size) > change.half) and change.chi2 > threshold(len(fields))
     is_clear |= any(not one.ci95[0] <= 1.0 <= one.ci95[1] for one in factor.values())

@@ -1,4 +1,4 @@
-"""Diagnose a model from a log: what is wrong, why, how certainly, and what correcting it gains."""
+"""Diagnose a model from a log: causes, their certainty, and what correcting them gains."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -73,11 +73,17 @@ class DiagnosisError(ValueError):
 
 
 class Split(NamedTuple):
-    """A log, its held-out rows, (num_rows,) bool, and the problems to learn from and to judge by.
+    """A log, split into rows to learn from and held-out rows.
 
-    log: with all clocks together. logged: as it was, maybe more rows. as_logged: the chunks of both
-    problems with poses as logged; empty where these were in time. motion_estimate: how late they
-    were.
+    Attributes:
+        logged: the log as it was; it may have more rows.
+        motion_estimate: the motion, and how late poses were.
+        log: with all channels on one clock.
+        held_out: rows of ``log``, (num_rows,) bool.
+        train: the problem to learn from.
+        test: the problem of the held-out rows.
+        as_logged: the chunks of both problems with poses as logged; empty if these were in time.
+        warnings: for the reader.
     """
 
     logged: FlightLog
@@ -103,25 +109,25 @@ def diagnose(
     Args:
         log: one or several, taken together.
         model: the simulator's nominal one if None; causes are differences from it.
-        held_out: (num_rows,) bool, rows to judge by and not to learn from; the last of every four
+        held_out: rows for testing and not for learning, (num_rows,) bool; the last of every four
             blocks of at most 5 s if None.
         report: called with stages done and to do.
-        motion: how the log moves within a step, whatever the model says; if None, continuously
-            where the log is measured, else by the sensors or by likelihood.
+        motion: the motion of the log within a step, whatever the model says; if None, continuous
+            if the log is measured, else chosen by the sensors or by likelihood.
         show: called with the first look, before the search.
 
     Raises:
         DiagnosisError: a log with neither gyro nor attitude; ``held_out`` of another shape.
     """
-    # Matrices are small: threads of BLAS wait for each other longer than they work.
+    # Matrices are small: BLAS threads wait for each other longer than they compute.
     with threadpool_limits(1, "blas"), jax.enable_x64(True):
         parts = split(log, model, held_out, motion)
         report(1, len(STAGES))
         state, base = begun(parts)
         show(FirstLook.of(state, base))
         selection = select(*extended(state, base, base))
-        # Drones, and who is late, are told by their clocks; two simulator's steps only by what they
-        # leave. A measured log is continuous, and never gets here.
+        # Timestamps identify continuous motion and late poses; the two discrete integrators differ
+        # only in their residuals. A measured log is continuous, and never gets here.
         motion_estimate = parts.motion_estimate
         if not (
             motion_estimate.is_sure
@@ -139,14 +145,14 @@ def diagnose(
         report(3, len(STAGES))
         vetted = refined_within_range(selection, rejected, test, parts)
         report(4, len(STAGES))
-        found = summarize(vetted, parts._replace(test=test))
+        diagnosis = summarize(vetted, parts._replace(test=test))
         nominal = nominal_parameters() if model is None else model
-        found = replace(found, nominal=nominal._replace(motion=found.extended.motion))
-        found = with_late_poses(
-            found, parts.motion_estimate, (selection.state.problem, test), parts.as_logged
+        diagnosis = replace(diagnosis, nominal=nominal._replace(motion=diagnosis.extended.motion))
+        diagnosis = with_late_poses(
+            diagnosis, parts.motion_estimate, (selection.state.problem, test), parts.as_logged
         )
         report(5, len(STAGES))
-    return found
+    return diagnosis
 
 
 def first_look(
@@ -155,13 +161,13 @@ def first_look(
     held_out: np.ndarray | None = None,
     motion: Motion | None = None,
 ) -> FirstLook:
-    """Return what ``diagnose`` shows first, and nothing else; arguments and errors are its own."""
+    """Return only the first look of ``diagnose``; arguments and errors are the same."""
     with threadpool_limits(1, "blas"), jax.enable_x64(True):
         return FirstLook.of(*begun(split(log, model, held_out, motion)))
 
 
 def begun(parts: Split) -> tuple[SearchState, FittedModel]:
-    """Return the search before it: the noise of the rows to learn from, and the base."""
+    """Return the state before the search, with the noise of the training rows, and the base."""
     state = SearchState.start(parts.log, parts.train)
     return with_noise_of(state, state.fitted((), state.problem.start))
 
@@ -172,7 +178,7 @@ def split(
     held_out: np.ndarray | None,
     motion: Motion | None,
 ) -> Split:
-    """Return a log, or several joined, split into rows to learn from and rows to judge by.
+    """Return a log, or several joined, split into rows to learn from and held-out rows.
 
     Raises:
         DiagnosisError: as ``diagnose``.
@@ -180,13 +186,13 @@ def split(
     warnings = [] if isinstance(log, FlightLog) else unused_channels(log)
     log = log if isinstance(log, FlightLog) else joined(log)
     check_log(log)
-    out = held_out_rows(log, HELD_OUT_EVERY) if held_out is None else np.asarray(held_out)
-    if out.shape != (len(log),) or out.dtype != bool:
+    mask = held_out_rows(log, HELD_OUT_EVERY) if held_out is None else np.asarray(held_out)
+    if mask.shape != (len(log),) or mask.dtype != bool:
         raise DiagnosisError(
-            f"held_out: found {out.dtype} of shape {out.shape}, expected bool of ({len(log)},)"
+            f"held_out: found {mask.dtype} of shape {mask.shape}, expected bool of ({len(log)},)"
         )
     logged, (log, is_kept, notes) = log, on_one_clock(log)
-    warnings, out = [*warnings, *notes], out[is_kept]
+    warnings, mask = [*warnings, *notes], mask[is_kept]
     warnings += motion_notes(log, model, motion, "chosen by likelihood")
     motion = required_motion(log, motion)
     model = nominal_parameters() if model is None else model
@@ -196,28 +202,28 @@ def split(
     reductions: list[Callable[[FlightLog], tuple[FlightLog, np.ndarray, list[str]]]] = [
         partial(with_causal_commands, model=model)
     ]
-    if motion is Motion.CONTINUOUS:  # two steps of a simulator are not one step of twice the length
+    if motion is Motion.CONTINUOUS:  # two steps of a simulator are not one step twice as long
         reductions.append(at_usual_rate)
     for reduce in reductions:
         log, is_kept, notes = reduce(log)
-        warnings, out = [*warnings, *notes], out[is_kept]
-    motion_estimate = estimate_motion(log, model, ~out, motion)
+        warnings, mask = [*warnings, *notes], mask[is_kept]
+    motion_estimate = estimate_motion(log, model, ~mask, motion)
     model = model._replace(motion=motion_estimate.motion)
     corrected, is_known = read_poses(log, motion_estimate.late_s)
-    corrected, out = corrected.select(is_known), out[is_known]
-    every, judged_by = (cut_chunks(corrected, rows, model) for rows in (~out, out))
-    warnings += thinning_warning(every, thinned(every))
+    corrected, mask = corrected.select(is_known), mask[is_known]
+    train_chunks, test_chunks = (cut_chunks(corrected, rows, model) for rows in (~mask, mask))
+    warnings += thinning_warning(train_chunks, thinned(train_chunks))
     same_rows = log.select(is_known)
     as_logged = tuple(
         thinned(cut_chunks(same_rows, rows, model))
-        for rows in (~out, out)
+        for rows in (~mask, mask)
         if motion_estimate.late_s
     )
     train, test = (
         build_problem(thinned(chunks), corrected, log, model, motion_estimate.late_s)
-        for chunks in (every, judged_by)
+        for chunks in (train_chunks, test_chunks)
     )
-    return Split(logged, motion_estimate, corrected, out, train, test, as_logged, tuple(warnings))
+    return Split(logged, motion_estimate, corrected, mask, train, test, as_logged, tuple(warnings))
 
 
 def held_out_under(selection: Selection, test: Problem) -> Problem:
@@ -230,10 +236,10 @@ class VettedModel(NamedTuple):
     """A selection after its vetoes and its refinement.
 
     Attributes:
-        selection: what is left.
-        rejected: the veto of each effect that is gone.
-        refused: effects that are gone since they fit best at the end of what is searched.
-        refined: how free flight judges the selection.
+        selection: without the rejected and the refused effects.
+        rejected: the veto of each rejected effect.
+        refused: effects removed because they fit best at the end of the search range.
+        refined: the refinement by free flight.
     """
 
     selection: Selection
@@ -245,64 +251,72 @@ class VettedModel(NamedTuple):
 def vetoed_in_time(selection: Selection, parts: Split) -> tuple[Selection, dict[str, Veto]]:
     """Return a selection with its changes within the log, after its vetoes, and these by effect.
 
-    A change may hide behind an effect that held-out rows contradict, so it is looked for again
-    without that.
+    A change may hide behind an effect that held-out rows contradict. So changes are searched for
+    again without this effect.
     """
     selection = with_changes(selection, parts.test, parts.log)
     selection, rejected = apply_vetoes(selection, held_out_under(selection, parts.test))
     if contradicted_on_held_out in rejected.values():
         later = with_changes(selection, parts.test, parts.log)
         if later is not selection:
-            selection, again = apply_vetoes(later, held_out_under(later, parts.test))
+            selection, further = apply_vetoes(later, held_out_under(later, parts.test))
             rejected = {
-                name: one for name, one in rejected.items() if one is not contradicted_on_held_out
+                name: veto
+                for name, veto in rejected.items()
+                if veto is not contradicted_on_held_out
             }
-            rejected |= again
+            rejected |= further
     return selection, rejected
 
 
 def refined_within_range(
     selection: Selection, rejected: Mapping[str, Veto], test: Problem, parts: Split
 ) -> VettedModel:
-    """Return a selection and its refinement, without effects that end where the search does.
+    """Return a selection and its refinement, without effects that end at a search bound.
 
-    A law that fits best beyond anything known stands in for another one, and bends the values of
-    the rest.
+    A law that fits best beyond the known range stands in for another one, and biases the values of
+    the other effects.
     """
     refused: tuple[Cause, ...] = ()
     while True:
         refined = refined_by_prediction(selection, parts)
-        stuck = summary.causes_at_end(selection, refined, test)
-        if not stuck:
+        at_bound = summary.causes_at_end(selection, refined, test)
+        if not at_bound:
             return VettedModel(selection, rejected, refused, refined)
-        selection, again = apply_vetoes(reject(selection, [one.effect for one in stuck]), test)
-        rejected, refused = {**rejected, **again}, (*refused, *stuck)
+        selection, further = apply_vetoes(
+            reject(selection, [cause.effect for cause in at_bound]), test
+        )
+        rejected, refused = {**rejected, **further}, (*refused, *at_bound)
 
 
 def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
     """Return which effects of a selected model predict held-out flights better than its base does.
 
-    Flights are of the part of the log in which the effects act that do so at its end. Those that
-    ended before are kept.
+    Flights are from the last part of the log, in which the same effects act as at its end. Effects
+    that ended before are kept.
     """
-    model, last = selection.model, at_end(selection, selection.model)
+    model, last_model = selection.model, at_end(selection, selection.model)
     since = np.arange(len(parts.log)) >= first_row_as_at_end(selection, parts.test)
     log, is_explained = parts.log.select(since), not selection.unexplained.flagged
     refined = refine(
-        selection.state, selection.base, last, log, parts.held_out[since], is_explained
+        selection.state, selection.base, last_model, log, parts.held_out[since], is_explained
     )
-    kept = (one for one in model.candidates if one in refined.kept or one not in last.candidates)
+    kept = (
+        candidate
+        for candidate in model.candidates
+        if candidate in refined.kept or candidate not in last_model.candidates
+    )
     return refined._replace(kept=tuple(kept))
 
 
 class NamedModel(NamedTuple):
-    """What a refined model is named by, and the model.
+    """A refined model and its causes.
 
     Attributes:
         selection: reduced to the effects that the refinement kept.
         linearization: of its model.
-        extended: the model with refined values, all effects of the log in it.
-        found: causes that matter, those beyond the list among them.
+        extended: the model with refined values and all effects of the log.
+        found: causes that matter, including those at a search bound.
         negligible: as in ``Diagnosis``.
         lost: causes that held-out rows contradict.
     """
@@ -320,8 +334,8 @@ def name_causes(vetted: VettedModel, parts: Split) -> NamedModel:
     test, refined = parts.test, vetted.refined
     selection = reduced(vetted.selection, refined)
     model = selection.model
-    # Intervals are of the model itself: those of ground_effect were a third too short with slopes
-    # of a model nearby.
+    # Intervals need the slopes of the model itself: with those of a nearby model, intervals of
+    # ground_effect were a third too short.
     state, linearization = selection.state.linearized(model.vector, max_distance=0.0)
     selection = selection._replace(state=state)
     effects = summary.effect_causes(selection, test, linearization)
@@ -330,23 +344,23 @@ def name_causes(vetted: VettedModel, parts: Split) -> NamedModel:
         name for name, veto in vetted.rejected.items() if veto is contradicted_on_held_out
     ]
     extended = model if refined.fit is None else model._replace(vector=refined.fit.vector)
-    found = summary.with_refined_values([*effects, *in_base], refined, extended.vector)
+    causes = summary.with_refined_values([*effects, *in_base], refined, extended.vector)
     spans = spans_of(selection, test, parts.log)
-    found = tuple(replace(one, **spans.get(one.effect, {})) for one in found)
+    causes = tuple(replace(named, **spans.get(named.effect, {})) for named in causes)
 
     def without(cause: Cause) -> np.ndarray:
         if refined.fit is None:
             return summary.vector_without(cause, selection, linearization)
         return refined.vector_without(cause.effect)
 
-    found, negligible = split_by_size(
-        found, state.problem, extended.vector, refined.flight_errors, without
+    causes, negligible = split_by_size(
+        causes, state.problem, extended.vector, refined.flight_errors, without
     )
     return NamedModel(
         selection=selection,
         linearization=linearization,
         extended=extended,
-        found=found,
+        found=causes,
         negligible=negligible,
         lost=(*contradicted, *lost_in_base),
     )
@@ -357,8 +371,8 @@ def learn_rest(
 ) -> tuple[Learned | None, np.ndarray]:
     """Return the law of what is left unexplained, if one is found, and the vector with it.
 
-    A law that acts for a part of the log is not looked for beside an effect that does, nor one
-    beside another that the given model has.
+    No law is searched for beside an effect that acts for a part of the log, nor beside a law that
+    the given model has.
     """
     selection, problem = named.selection, named.selection.state.problem
     changing = [one.effect for one in problem.windows]
@@ -373,7 +387,7 @@ def learn_rest(
 
 
 def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
-    """Return the diagnosis of a refined model, in float64; so is the nominal model in it."""
+    """Return the diagnosis of a refined model; it and its nominal model are in float64."""
     test, refined = parts.test, vetted.refined
     named = name_causes(vetted, parts)
     selection, linearization = named.selection, named.linearization
@@ -404,14 +418,14 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
         *summary.unseen_at_rest_notes(vetted.rejected),
         *notes_of(selection, linearization, parts.log),
     ]
-    rest = summary.with_lost_causes(unexplained, named.lost)
-    rest = replace(rest, flagged=rest.flagged or bool(beyond))
+    all_unexplained = summary.with_lost_causes(unexplained, named.lost)
+    all_unexplained = replace(all_unexplained, flagged=all_unexplained.flagged or bool(beyond))
     return Diagnosis(
-        verdict=summary.verdict_of(causes, rest),
+        verdict=summary.verdict_of(causes, all_unexplained),
         causes=causes,
         negligible=named.negligible,
         beyond=beyond,
-        unexplained=rest,
+        unexplained=all_unexplained,
         not_identifiable=summary.not_identifiable(
             selection.state,
             linearization,
@@ -440,9 +454,9 @@ def check_log(log: FlightLog) -> None:
     if not len(log):
         raise DiagnosisError(f"{log.source}: found 0 rows, expected some seconds of flight")
     if "w" not in log and "q" not in log:
-        found = ", ".join(log.channels)
+        channels = ", ".join(log.channels)
         raise DiagnosisError(
-            f"{log.source}: found channels {found}, expected w (gyro) or q (attitude) at least"
+            f"{log.source}: found channels {channels}, expected w (gyro) or q (attitude) at least"
         )
 
 
@@ -458,9 +472,11 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
     if len(logs) == 1:
         return logs[0]
     check_same_origin(*logs)
-    voltages = [one.stated_voltage_v for one in logs]
+    voltages = [flight_log.stated_voltage_v for flight_log in logs]
     if len(set(voltages)) > 1:
-        shown = ", ".join(f"{Path(one.source).name}: {one.stated_voltage_v}" for one in logs)
+        shown = ", ".join(
+            f"{Path(flight_log.source).name}: {flight_log.stated_voltage_v}" for flight_log in logs
+        )
         raise LogError(
             f"{', '.join(STATED_VOLTAGES)}: found {shown}; expected logs of one pack in one command"
         )
@@ -482,9 +498,10 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
 
 def unused_channels(logs: Sequence[FlightLog]) -> list[str]:
     """Return a warning for each channel that some logs have and others lack."""
-    every = sorted({name for log in logs for name in log.channels})
+    all_names = sorted({name for log in logs for name in log.channels})
     lacking = {
-        name: [Path(log.source).name for log in logs if name not in log.channels] for name in every
+        name: [Path(log.source).name for log in logs if name not in log.channels]
+        for name in all_names
     }
     return [
         f"channel {name} is not used: {', '.join(files)} has none"
@@ -493,11 +510,11 @@ def unused_channels(logs: Sequence[FlightLog]) -> list[str]:
     ]
 
 
-def thinning_warning(every: Chunks, kept: Chunks) -> list[str]:
-    """Return a warning where a log is so long that only some of its chunks are learnt from."""
-    if kept.num_judged == every.num_judged:
+def thinning_warning(chunks: Chunks, kept: Chunks) -> list[str]:
+    """Return a warning if a log is so long that only some of its chunks are learnt from."""
+    if kept.num_judged == chunks.num_judged:
         return []
     return [
-        f"only {kept.num_judged} of {every.num_judged} rows were learnt from, spread evenly: "
+        f"only {kept.num_judged} of {chunks.num_judged} rows were learnt from, spread evenly: "
         "more would need too much memory"
     ]

@@ -1,7 +1,7 @@
 """The first look at a log: the refitted base, and what each effect would gain to first order.
 
-It takes seconds, and nothing in it is confirmed: the search, which refits every candidate, rivals,
-held-out rows, free flight and what no cause explains come later.
+It takes seconds, and nothing in it is confirmed. The search with refits of every candidate, rivals,
+held-out rows, free flight and the unexplained part come later.
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,13 @@ NOT_CHECKED = (
 
 
 class Likely(NamedTuple):
-    """An effect's gain to first order, in minus twice the log likelihood, and what names it."""
+    """The first-order gain of an effect.
+
+    Attributes:
+        effect: its name.
+        gain: in minus twice the log likelihood.
+        threshold: the gain from which the effect is named.
+    """
 
     effect: str
     gain: float
@@ -30,7 +36,7 @@ class Likely(NamedTuple):
 
 
 class FirstLook(NamedTuple):
-    """What a log says of a model at first sight.
+    """The first look at a log.
 
     Attributes:
         base: causes of the base that differ from the model, with their parameters.
@@ -45,17 +51,17 @@ class FirstLook(NamedTuple):
         """Return the first look of a search that has fitted the base and the noise."""
         state, linearization = state.linearized(base.vector)
         changes = base_changes(state, linearization, base)
-        found = {
+        base_estimates = {
             name: estimates(linearization, base, change.fields) for name, change in changes.items()
         }
         scored = (
             Likely(one.candidate.effect, one.gain.robust, threshold(one.gain.num_parameters))
             for one in score_candidates(state, linearization, base)
         )
-        return cls(found, tuple(one for one in scored if one.gain > one.threshold))
+        return cls(base_estimates, tuple(one for one in scored if one.gain > one.threshold))
 
     def text(self) -> str:
-        """Return it as lines of text."""
+        """Return the first look as lines of text."""
         base = [
             f"{parameter} = {one.value:.4g}" + f" {one.unit}" * (one.unit != "1")
             for values in self.base.values()

@@ -1,7 +1,7 @@
-"""What a log could not have shown or told apart, and what to fly to settle it.
+"""Effects that a log cannot show or tell apart, and the manoeuvres that would show them.
 
-All manoeuvres are flown by the fitted model and seen by the log's sensors with their noise. The
-Fisher information that each would add to the log's decides which one to advise.
+All manoeuvres are flown by the fitted model and measured by the log's sensors with their noise. The
+advised manoeuvre is chosen by the Fisher information that each would add to the log's.
 """
 
 import copy
@@ -37,23 +37,26 @@ from flytrack_sysid.record import UPRIGHT
 from flytrack_sysid.script_file import Script, ScriptError, script_of
 
 DETECTED = 30.0  # noncentrality from which a log shows an effect nearly always
-SEPARATE = 20.0  # noncentrality beside a rival from which it tells the two apart
-LOOKS_ALIKE = 0.1  # of an effect's noncentrality: what is left of it beside a look-alike
+SEPARATE = 20.0  # noncentrality beside a rival from which a log tells the two apart
+LOOKS_ALIKE = 0.1  # of an effect's noncentrality: a look-alike leaves less than this
 ROUNDING = 1e-6  # of DETECTED
 BASE_ONLY = ("thrust_scale",)  # no log tells it from the free thrust curve: a cause of the base
 CHUNKS_PER_MANOEUVRE = int(FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S) // CHUNK_S
 PRIOR_SHARE = 1e-2  # of what shows an effect: less comes from the log's own prior
-# Of the best share: a manoeuvre that comes so near is as good, and an easier one comes first.
+# Of the best share: manoeuvres this close to the best are equally good; the easiest is chosen.
 NEARLY_BEST = 0.8
 PLENTY = 30.0  # shares: thirty times what shows an effect
 
 
 def _typical_candidate(effect: str) -> Candidate:
-    """Return the way to look for an effect that is nearest to its notable size."""
+    """Return the candidate of an effect whose probes are nearest to its notable size."""
 
-    def distance(way: Candidate) -> float:
+    def distance(candidate: Candidate) -> float:
         notable = BY_NAME[effect].notable
-        return sum(abs(np.log(one.value / notable[one.field.split(".")[1]])) for one in way.probes)
+        return sum(
+            abs(np.log(probe.value / notable[probe.field.split(".")[1]]))
+            for probe in candidate.probes
+        )
 
     return min(candidates_of(BY_NAME[effect]), key=distance)
 
@@ -61,9 +64,15 @@ def _typical_candidate(effect: str) -> Candidate:
 class Question:
     """How well a log shows an effect, also beside effects that look alike.
 
-    linearization: the log's, at the fitted model, along everything (``SearchState.linearized``).
-    fields: the effect's parameters, columns: theirs in the linearization, sizes: notable ones, in
-    steps along these.
+    Attributes:
+        linearization: the log's, at the fitted model, along everything
+            (``SearchState.linearized``).
+        effect: its name.
+        given: the columns of the model's free parameters.
+        fields: the effect's parameters.
+        columns: of the fields in the linearization.
+        sizes: notable sizes of the fields, in steps along the columns.
+        alike: the columns of each look-alike.
     """
 
     def __init__(
@@ -75,17 +84,17 @@ class Question:
     ):
         self.linearization, self.effect = linearization, effect
         self.given = linearization.columns_at(model.indices)
-        way, shapes = _typical_candidate(effect), BY_NAME[effect].search.shapes
+        candidate, shapes = _typical_candidate(effect), BY_NAME[effect].search.shapes
         notable = BY_NAME[effect].notable
-        fields = [field for field in way.other_fields if field.split(".")[1] not in shapes]
-        # The columns of probes come first, in shares of the way to them.
+        fields = [field for field in candidate.other_fields if field.split(".")[1] not in shapes]
+        # The columns of probes come first; their steps are shares of the way to them.
         self.columns = [
-            *map(linearization.probe_column, way.probes),
+            *map(linearization.probe_column, candidate.probes),
             *map(linearization.column, fields),
         ]
-        self.fields = [*(one.field for one in way.probes), *fields]
-        ways = np.array([*(one.value for one in way.probes), *np.ones(len(fields))])
-        self.sizes = np.array([notable[field.split(".")[1]] for field in self.fields]) / ways
+        self.fields = [*(probe.field for probe in candidate.probes), *fields]
+        steps = np.array([*(probe.value for probe in candidate.probes), *np.ones(len(fields))])
+        self.sizes = np.array([notable[field.split(".")[1]] for field in self.fields]) / steps
         self.alike = [Question(linearization, model, other).columns for other in alike]
 
     def noncentralities(
@@ -93,42 +102,49 @@ class Question:
     ) -> np.ndarray:
         """Return the noncentrality of each parameter at its notable size.
 
-        All that is free and ``beside`` are projected out. information: added to the log's.
+        All other free parameters are projected out.
+
+        Args:
+            beside: columns that are projected out as well.
+            information: added to the log's.
         """
-        line = copy.copy(self.linearization)
-        line.total = line.total + information
+        joint = copy.copy(self.linearization)
+        joint.total = joint.total + information
         given = self.given + [column for column in beside if column not in self.given]
-        found = np.zeros(len(self.columns))
-        for number, column in enumerate(self.columns):
-            own = line.projected([column], [one for one in given if one != column])[0][0, 0]
-            own -= line.prior[column]  # which does not come from the log
-            found[number] = max(float(own), 0.0) * self.sizes[number] ** 2
-        return found
+        result = np.zeros(len(self.columns))
+        for index, column in enumerate(self.columns):
+            value = joint.projected([column], [free for free in given if free != column])[0][0, 0]
+            value -= joint.prior[column]  # the prior does not come from the log
+            result[index] = max(float(value), 0.0) * self.sizes[index] ** 2
+        return result
 
     def shares(self, information: np.ndarray | float = 0.0) -> np.ndarray:
         """Return how well the effect would show at its notable size, ascending; 1 or more suffices.
 
-        Noncentrality of each of its parameters over DETECTED, and beside each look-alike over
-        SEPARATE. information: added to the log's.
+        The shares are the noncentrality of each parameter over DETECTED, and the noncentrality
+        beside each look-alike over SEPARATE.
+
+        Args:
+            information: added to the log's.
         """
         beside = [self.noncentralities(columns, information) / SEPARATE for columns in self.alike]
         return np.sort(np.concatenate([self.noncentralities((), information) / DETECTED, *beside]))
 
 
 def unit_of(effect: str, field: str | None = None) -> str:
-    """Return the unit of an effect's parameter, the first notable one if None."""
+    """Return the unit of an effect's parameter; that of the first notable one if None."""
     return BY_NAME[effect].ranges[field or next(iter(BY_NAME[effect].notable))].unit
 
 
 def unseen_effects(
     state: SearchState, linearization: Linearization, model: FittedModel
 ) -> dict[str, NotIdentifiable]:
-    """Return effects that the log could not have shown, by name; what to fly is still to be said.
+    """Return effects that the log cannot show, by name, without the manoeuvre to fly.
 
     Sizes are infinite where no size would show.
     """
     result: dict[str, NotIdentifiable] = {}
-    for effect in (one.name for one in SEARCHED):
+    for effect in (searched.name for searched in SEARCHED):
         if effect in model.effects or effect in BASE_ONLY:
             continue
         if effect in state.unobservable:
@@ -149,7 +165,7 @@ def unseen_effects(
 
 
 def _look_alikes(state: SearchState, model: FittedModel, question: Question) -> tuple[str, ...]:
-    """Return effects beside which this one hardly shows any more."""
+    """Return effects beside which this one hardly shows."""
     sizes = question.noncentralities()
     result = []
     for other in SEARCHED:
@@ -173,8 +189,8 @@ def _flown(
 
 
 def _absent_channels(chunks: Chunks) -> list[str]:
-    """Return the channels of states that the log of these chunks did not have."""
-    record, turned, moved = (
+    """Return the channels of states that the log of these chunks does not have."""
+    record, has_turns, has_velocity = (
         chunks.record,
         chunks.counts[..., 0, 1].any(),
         chunks.counts[..., 3, 1].any(),
@@ -182,8 +198,8 @@ def _absent_channels(chunks: Chunks) -> list[str]:
     present = {
         "w": "w" in chunks.measured,
         "a": "f" in chunks.measured,
-        "q": bool(turned or np.any(record.quat != UPRIGHT)),
-        "v": bool(moved),
+        "q": bool(has_turns or np.any(record.quat != UPRIGHT)),
+        "v": bool(has_velocity),
         "p": bool(record.pos_w.any()),
         "v_bat": voltages_of(chunks) is not None,
         "uprev": bool(record.is_applied_known.any()),
@@ -192,17 +208,17 @@ def _absent_channels(chunks: Chunks) -> list[str]:
 
 
 def _seen_flights(problem: Problem, vector: np.ndarray) -> tuple[FlightLog, np.ndarray]:
-    """Return all manoeuvres as flown by a model, and which rows count, (num_rows,) bool.
+    """Return a log of all manoeuvres flown by a model, and the rows that count, (num_rows,) bool.
 
-    The log of the flights has the channels of the problem's log.
+    The log has the channels of the problem's log.
     """
     model = problem.like._replace(thrust_coeffs=vector[problem.indices_of(THRUST_COEFFS)])
     voltages = voltages_of(problem.chunks) or _battery_range(problem.like)
     flights = flights_of(MANOEUVRES, hover_action(model, voltages), voltages=voltages)
-    starts = np.stack([one.start for one in flights])
-    commands = np.stack([one.command for one in flights])
+    starts = np.stack([flight.start for flight in flights])
+    commands = np.stack([flight.command for flight in flights])
     states = np.asarray(_flown(vector, problem.like, starts, commands))
-    # A flight stands still once it leaves the envelope.
+    # A flight keeps its last state once it leaves the envelope.
     inside = np.logical_and.accumulate(is_inside(states, SCRIPT_HEIGHTS, ANY_VOLTAGE), axis=1)
     last = np.maximum.accumulate(np.where(inside, np.arange(states.shape[1]), 0), axis=1)
     states = np.take_along_axis(states, last[..., None], axis=1)
@@ -211,12 +227,12 @@ def _seen_flights(problem: Problem, vector: np.ndarray) -> tuple[FlightLog, np.n
 
 
 def _in_parts(chunks: Chunks, size: int) -> Iterator[Chunks]:
-    """Return chunks so many at a time, the last ones filled with chunks that count for nothing."""
-    number = chunks.counts.shape[1]
-    for begin in range(0, number, size):
-        places = np.arange(begin, begin + size)
-        part = chunks.selected(np.minimum(places, number - 1))
-        yield part._replace(counts=part.counts & (places < number)[:, None, None])
+    """Yield ``size`` chunks at a time, the last ones padded with chunks that do not count."""
+    num_chunks = chunks.counts.shape[1]
+    for first in range(0, num_chunks, size):
+        indices = np.arange(first, first + size)
+        part = chunks.selected(np.minimum(indices, num_chunks - 1))
+        yield part._replace(counts=part.counts & (indices < num_chunks)[:, None, None])
 
 
 def _information_along(
@@ -224,11 +240,11 @@ def _information_along(
 ) -> np.ndarray:
     """Return the information by chunk about some columns, (chunks, columns, columns)."""
     end = len(linearization.indices)
-    places = [linearization.indices[column] for column in columns if column < end]
+    indices = [linearization.indices[column] for column in columns if column < end]
     probes = [linearization.probes[column - end] for column in columns if column >= end]
     others = np.array([probe.placed_in(ahead, vector) for probe in probes]) if probes else None
-    slopes = ahead.slopes(vector, places, others)
-    # A model leaves no residuals of its own flight, and no outliers.
+    slopes = ahead.slopes(vector, indices, others)
+    # A flight of the model itself has no residuals, and no outliers.
     slopes = slopes._replace(residuals=np.zeros_like(slopes.residuals))
     by_block = Linearization(ahead, slopes, probes).by_block
     return by_block.reshape(-1, ahead.counts.shape[1], *by_block.shape[1:]).sum(axis=0)
@@ -239,8 +255,9 @@ def information_of_manoeuvres(
 ) -> dict[str, np.ndarray]:
     """Return the information about columns that each manoeuvre would add, shaped like ``total``.
 
-    Fisher information at the fitted model, with the noise and the channels of the problem's log;
-    eight flights of 2.5 s each. 0 for other columns. Inside ``jax.enable_x64(True)``.
+    This is the Fisher information at the fitted model, with the noise and the channels of the
+    problem's log, of eight flights of 2.5 s each. It is 0 for other columns. Call it inside
+    ``jax.enable_x64(True)``.
     """
     columns = sorted(set(columns))
     log, counts = _seen_flights(problem, model.vector)
@@ -250,26 +267,26 @@ def information_of_manoeuvres(
     for part in _in_parts(chunks, problem.counts.shape[1]):
         ahead = Problem.of(part, problem.like).with_noise(problem.noise)
         by_chunk.append(_information_along(linearization, columns, ahead, model.vector))
-    every = np.concatenate(by_chunk)[: len(MANOEUVRES) * CHUNKS_PER_MANOEUVRE]
+    added = np.concatenate(by_chunk)[: len(MANOEUVRES) * CHUNKS_PER_MANOEUVRE]
     result = {}
-    for name, own in zip(MANOEUVRES, np.split(every, len(MANOEUVRES)), strict=True):
+    for name, of_manoeuvre in zip(MANOEUVRES, np.split(added, len(MANOEUVRES)), strict=True):
         result[name] = np.zeros_like(linearization.total)
-        result[name][np.ix_(columns, columns)] = own.sum(axis=0)
+        result[name][np.ix_(columns, columns)] = of_manoeuvre.sum(axis=0)
     return result
 
 
 def _best_manoeuvre(shares: Mapping[str, np.ndarray]) -> str:
     """Return the easiest manoeuvre whose shares are plenty, or about as large as those of the best.
 
-    The best has the largest worst share; where the worst shows in no manoeuvre, the next one
+    The best has the largest worst share. If the worst one shows in no manoeuvre, the next one
     decides.
     """
-    floored = {name: np.where(own < PRIOR_SHARE, 0.0, own) for name, own in shares.items()}
-    best = max(floored.values(), key=lambda own: own.tolist())
+    floored = {name: np.where(values < PRIOR_SHARE, 0.0, values) for name, values in shares.items()}
+    best = max(floored.values(), key=lambda values: values.tolist())
     return next(
         name
-        for name, own in floored.items()
-        if np.all(own >= np.minimum(NEARLY_BEST * best, PLENTY))
+        for name, values in floored.items()
+        if np.all(values >= np.minimum(NEARLY_BEST * best, PLENTY))
     )
 
 
@@ -281,10 +298,14 @@ def advise(
 ) -> dict[str, str]:
     """Return for each wanted effect the manoeuvre that would show it best, of ``MANOEUVRES``.
 
-    problem: the log's, with its noise. linearization: of the model, along everything
-    (``SearchState.linearized``). wanted: effect -> effects that look alike in this log, maybe none.
-    The best is returned even where it would not do (``Question.shares`` below 1). Inside
+    The best is returned even if it does not suffice (``Question.shares`` below 1). Call it inside
     ``jax.enable_x64(True)``.
+
+    Args:
+        problem: the log's, with its noise.
+        model: the fitted one.
+        linearization: of the model, along everything (``SearchState.linearized``).
+        wanted: effect -> effects that look alike in this log, maybe none.
     """
     if not wanted:
         return {}
@@ -301,13 +322,18 @@ def advise(
 
 
 class NextFlight(NamedTuple):
-    """A script, and the effects that each of its manoeuvres is for."""
+    """The flights to fly next.
+
+    Attributes:
+        script: of the flights.
+        reasons: manoeuvre -> the effects that it would settle.
+    """
 
     script: Script
     reasons: Mapping[str, tuple[str, ...]]
 
     def describe(self) -> str:
-        """Return lines on what is in it, why, and how to fly the same on a real drone."""
+        """Return lines on the manoeuvres, their reasons, and how to fly them on a real drone."""
         lines = [f"{len(self.script.kinds)} flights, {SECONDS_PER_MANOEUVRE:g} s of each manoeuvre"]
         for name, effects in self.reasons.items():
             lines += [f"{name}: to settle {', '.join(effects)}", f"    {MANOEUVRES[name].how}"]
@@ -315,7 +341,7 @@ class NextFlight(NamedTuple):
 
 
 def _reasons(path: Path, content: Any) -> dict[str, tuple[str, ...]]:
-    """Return manoeuvre -> effects that a diagnosis names, in the order of ``MANOEUVRES``."""
+    """Return manoeuvre -> effects from a diagnosis, in the order of ``MANOEUVRES``."""
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         found = content.get("schema") if isinstance(content, dict) else type(content).__name__
         raise ScriptError(f"{path}: schema: found {found!r}, expected {SCHEMA}")
@@ -325,8 +351,10 @@ def _reasons(path: Path, content: Any) -> dict[str, tuple[str, ...]]:
             f"{path}: not_identifiable: found {type(listed).__name__}, expected a list"
         )
     wanted: dict[str, list[str]] = {name: [] for name in MANOEUVRES}
-    for number, one in enumerate(listed):
-        effect, fly = (one.get(key) if isinstance(one, dict) else None for key in ("effect", "fly"))
+    for number, item in enumerate(listed):
+        effect, fly = (
+            item.get(key) if isinstance(item, dict) else None for key in ("effect", "fly")
+        )
         place = f"{path}: not_identifiable[{number}]"
         if not isinstance(effect, str):
             raise ScriptError(f"{place}: effect: found {effect!r}, expected a name")
@@ -345,14 +373,14 @@ def _battery_range(model: ModelParameters) -> tuple[float, float]:
 
 
 def _voltages(path: Path, content: dict[str, Any], model: ModelParameters) -> tuple[float, float]:
-    """Return the voltages that a diagnosis has seen, else those of the model's battery."""
+    """Return the range of voltages in a diagnosis, else that of the model's battery."""
     data = content.get("data")
     found = data.get("voltages") if isinstance(data, dict) else None
     if found is None:
         return _battery_range(model)
     numbers = (
         found
-        if isinstance(found, list) and all(isinstance(one, int | float) for one in found)
+        if isinstance(found, list) and all(isinstance(number, int | float) for number in found)
         else []
     )
     if len(numbers) != 2 or not 0.0 < numbers[0] <= numbers[1] < np.inf:
@@ -363,10 +391,10 @@ def _voltages(path: Path, content: dict[str, Any], model: ModelParameters) -> tu
 
 
 def next_flight(path: str | Path, model: ModelParameters, seed: int = 0) -> NextFlight:
-    """Return the flights that a ``diagnosis.json`` asks for, starting at a model's hover action.
+    """Return the flights that a ``diagnosis.json`` advises, starting at a model's hover action.
 
     Raises:
-        ScriptError: a file that cannot be read or is no diagnosis, or that asks for no flight.
+        ScriptError: a file that cannot be read or is no diagnosis, or that advises no flight.
     """
     path = Path(path)
     try:

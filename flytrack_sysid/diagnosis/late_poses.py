@@ -1,4 +1,4 @@
-"""Late poses as a cause: by how much the log was corrected, the interval, and what it gains."""
+"""Late poses as a cause: the correction of the log, its interval, and its gain."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,37 +24,43 @@ def gain_of(problem: Problem, as_logged: Chunks, vector: np.ndarray) -> float:
     """
     counts = problem.counts & as_logged.counts
 
-    def cost(one: Problem) -> float:
-        scored = replace(one, chunks=one.chunks._replace(counts=counts)).with_noise(problem.noise)
+    def cost(variant: Problem) -> float:
+        scored = replace(variant, chunks=variant.chunks._replace(counts=counts)).with_noise(
+            problem.noise
+        )
         return robust_square(scored.whitened_residuals(vector)[0])
 
     return cost(replace(problem.with_chunks(as_logged), late=None)) - cost(problem)
 
 
 def with_late_poses(
-    found: Diagnosis,
+    diagnosis: Diagnosis,
     motion_estimate: MotionEstimate,
     problems: Sequence[Problem],
     logged: Sequence[Chunks],
 ) -> Diagnosis:
-    """Return a diagnosis of corrected poses with how late they were, as a cause where it matters.
+    """Return a diagnosis of corrected poses with their lateness, as a cause if it matters.
 
-    problems: learnt from and judged by; logged: the chunks of each as logged.
+    Args:
+        diagnosis: of corrected poses.
+        motion_estimate: with the lateness.
+        problems: of the rows to learn from, and of the held-out rows.
+        logged: the chunks of each problem, as logged.
     """
     before_s, late_s, sigma_s = (
-        latency_of(found.nominal),
+        latency_of(diagnosis.nominal),
         min(motion_estimate.late_s, BOUNDS.high),
         motion_estimate.sigma_s,
     )
     if not late_s and not before_s:
-        return found
-    base = found.base.with_effects(MocapLatency(np.float32(before_s)))
-    extended = found.extended.with_effects(MocapLatency(np.float32(late_s)))
-    found = replace(found, base=base, extended=extended)
+        return diagnosis
+    base = diagnosis.base.with_effects(MocapLatency(np.float32(before_s)))
+    extended = diagnosis.extended.with_effects(MocapLatency(np.float32(late_s)))
+    diagnosis = replace(diagnosis, base=base, extended=extended)
     name, unit = "mocap_latency.latency_s", BOUNDS.unit
     latency = Estimated.around(late_s, TWO_SIDED_95 * sigma_s, unit, BOUNDS.low)
     if abs(late_s - before_s) <= STANDARD_ERRORS * sigma_s:
-        return found
+        return diagnosis
     gains = [gain_of(*pair, vector_of(extended)) for pair in zip(problems, logged, strict=True)]
     size = float((late_s - before_s) / max(sigma_s, 1e-6)) ** 2
     cause = Cause(
@@ -69,12 +75,12 @@ def with_late_poses(
         beyond=f"latency_s at least {late_s:.3g} s" if motion_estimate.late_s > BOUNDS.high else "",
     )
     changed = Changed(name, before_s, late_s, latency.ci95, unit, bool(cause.beyond))
-    found = replace(found, changed=(*found.changed, changed))
+    diagnosis = replace(diagnosis, changed=(*diagnosis.changed, changed))
     if abs(late_s - before_s) < EFFECT.notable["latency_s"]:
-        return replace(found, negligible=(cause, *found.negligible))
+        return replace(diagnosis, negligible=(cause, *diagnosis.negligible))
     if cause.beyond:
-        rest = replace(found.unexplained, flagged=True)
-        found = replace(found, beyond=(cause, *found.beyond), unexplained=rest)
+        unexplained = replace(diagnosis.unexplained, flagged=True)
+        diagnosis = replace(diagnosis, beyond=(cause, *diagnosis.beyond), unexplained=unexplained)
     else:
-        found = replace(found, causes=(cause, *found.causes))
-    return replace(found, verdict=verdict_of(found.causes, found.unexplained))
+        diagnosis = replace(diagnosis, causes=(cause, *diagnosis.causes))
+    return replace(diagnosis, verdict=verdict_of(diagnosis.causes, diagnosis.unexplained))

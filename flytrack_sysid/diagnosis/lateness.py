@@ -2,15 +2,15 @@
 
 Position, velocity and attitude are then on another clock than the gyro.
 
-The replay is fed with corrected poses, interpolated at the time of each row. What is judged are the
-poses as they were logged: interpolation smooths noise, which would change the likelihood by more
-than one motion differs from another. So the modelled changes of a level are delayed as the sensor
-delays them, and what interpolation changed is added as a constant:
+The replay is fed with corrected poses, interpolated at the time of each row. The scored residuals
+are those of the poses as logged: interpolation smooths noise, which would change the likelihood by
+more than one motion differs from another. So the modelled changes of a level are delayed as the
+sensor delays them, and the change due to interpolation is added as a constant:
 
     residual = change as logged - delay(change as corrected - residual as corrected)
 
-The delay is linear between rows where a simulator moves, as that of the effect ``mocap_latency``
-is, and cubic where a drone does.
+The delay interpolates linearly between rows for a simulator's motion, as the effect
+``mocap_latency`` does, and cubically for a drone's.
 """
 
 from typing import NamedTuple
@@ -26,52 +26,56 @@ from flytrack_sysid.log import FlightLog
 from flytrack_sysid.record import Record, fill_gaps, record_of
 
 POSES = ("p", "v", "q")
-TAPS = (1, 0, -1, -2)  # rows of which a delayed value is made, from the row itself
-NEAR = 0.25  # of a step: rows so near in time are one
+TAPS = (1, 0, -1, -2)  # rows that make up a delayed value, relative to its own row
+NEAR = 0.25  # of a step: rows this close in time are the same row
 SAME = 1e-6  # of a step
 
 
 class Late(NamedTuple):
-    """How level residuals of corrected chunks become those of what was logged.
+    """Map from level residuals of corrected chunks to those of the poses as logged.
 
-    weights: (rows, chunks, taps) of the modelled changes. constant: (rows, chunks, NUM_AXES), rad
-    and m/s.
+    Attributes:
+        weights: of the modelled changes, (rows, chunks, taps).
+        constant: added to the residuals (rad and m/s), (rows, chunks, NUM_AXES).
     """
 
     weights: np.ndarray
     constant: np.ndarray
 
-    def residuals(self, left: np.ndarray) -> np.ndarray:
-        """Return the log's residuals from those of corrected chunks.
+    def residuals(self, corrected: np.ndarray) -> np.ndarray:
+        """Return the residuals of poses as logged.
 
-        left: (models, rows, chunks, NUM_AXES, 2).
+        Args:
+            corrected: the residuals of corrected chunks, (models, rows, chunks, NUM_AXES, 2).
         """
-        found = left.copy()
-        found[..., :-1, 1] = _delayed(left[..., :-1, 1], self.weights, -3) + self.constant[..., :-1]
-        return found
+        result = corrected.copy()
+        result[..., :-1, 1] = (
+            _delayed(corrected[..., :-1, 1], self.weights, -3) + self.constant[..., :-1]
+        )
+        return result
 
 
 def latency_of(model: ModelParameters) -> float:
-    """Return how late a model says that poses are, s."""
+    """Return the lateness of poses in a model (s)."""
     return float(model.effect("mocap_latency").latency_s)
 
 
 def read_poses(log: FlightLog, late_s: float) -> tuple[FlightLog, np.ndarray]:
-    """Return a log with late poses moved in time, and where they are known, (num_rows,) bool."""
+    """Return a log with late poses corrected, and where they are known, (num_rows,) bool."""
     if not late_s:
         return log, np.ones(len(log), bool)
     return read_later(log, [name for name in POSES if name in log], late_s)
 
 
 def _delayed(changes: np.ndarray, weights: np.ndarray, axis: int) -> np.ndarray:
-    """Return the sum of changes in nearby rows, (..., axes), with weights (rows, ..., taps)."""
+    """Return the sum of changes (..., axes) in nearby rows, with weights (rows, ..., taps)."""
     return sum(
-        np.roll(changes, -tap, axis) * weights[..., [place]] for place, tap in enumerate(TAPS)
+        np.roll(changes, -tap, axis) * weights[..., [index]] for index, tap in enumerate(TAPS)
     )
 
 
 def _weights(share: np.ndarray, motion: Motion) -> np.ndarray:
-    """Return the weights of a delay by shares of a step, (..., taps)."""
+    """Return the weights (..., taps) of a delay by shares of a step."""
     if motion is not Motion.CONTINUOUS:
         zero = np.zeros_like(share)
         return np.stack([zero, 1.0 - share, share, zero], axis=-1)
@@ -81,38 +85,47 @@ def _weights(share: np.ndarray, motion: Motion) -> np.ndarray:
 
 
 def _changes(record: Record) -> np.ndarray:
-    """Return the turn, rad, and velocity change, m/s, since the row before, (num_rows, 6).
+    """Return the turn (rad) and velocity change (m/s) since the row before, (num_rows, 6).
 
     Both are in the world frame.
     """
     quat = Rotation.from_quat(record.quat, scalar_first=True)
     before = Rotation.from_quat(np.roll(record.quat, 1, axis=0), scalar_first=True)
-    faster = record.vel_w - np.roll(record.vel_w, 1, axis=0)
-    changes = np.concatenate([(quat * before.inv()).as_rotvec(), faster], axis=1)
+    velocity_change = record.vel_w - np.roll(record.vel_w, 1, axis=0)
+    changes = np.concatenate([(quat * before.inv()).as_rotvec(), velocity_change], axis=1)
     return np.where(record.begins[:, None], 0.0, changes)
 
 
 def scored_as_logged(
     chunks: Chunks, corrected: FlightLog, logged: FlightLog, late_s: float, motion: Motion
 ) -> tuple[Chunks, Late]:
-    """Return chunks of a corrected log that are judged where poses were logged, and their lateness.
+    """Return chunks of a corrected log that are scored where poses were logged, and their lateness.
 
-    late_s: of the logged poses; ``corrected`` has them in time and may lack some of the rows.
+    Args:
+        chunks: of the corrected log.
+        corrected: the log with poses in time; it may lack some of the rows.
+        logged: the log with late poses.
+        late_s: lateness of the logged poses.
+        motion: of the log.
     """
-    seen, moved = fill_gaps(logged), fill_gaps(corrected)
+    filled, moved = fill_gaps(logged), fill_gaps(corrected)
     record, step_s = record_of(moved), float(np.median(np.diff(moved.log.time)))
-    far = 2.0 * (np.ptp(logged.time) + late_s + 1.0)  # segments one after the other, well apart
-    clock = seen.log.time + far * logged.segment[seen.behind]
-    own = moved.log.time + far * corrected.segment[moved.behind]
-    place = np.searchsorted(clock, own - NEAR * step_s) + int(np.floor(late_s / step_s + SAME))
-    place = np.clip(place, 0, len(clock) - 1)
-    run = np.cumsum(seen.log.is_start())
-    is_logged = (seen.source_row[place] >= 0) & (np.abs(clock[place] - own - late_s) < 2.0 * step_s)
-    is_logged &= run[place] == run[np.searchsorted(clock, own - NEAR * step_s)]
-    weights = _weights((own + late_s - clock[place]) / step_s, motion)
-    constant = _changes(record_of(seen))[place] - _delayed(_changes(record), weights, 0)
+    gap_s = 2.0 * (np.ptp(logged.time) + late_s + 1.0)  # segments one after the other, well apart
+    logged_s = filled.log.time + gap_s * logged.segment[filled.behind]
+    corrected_s = moved.log.time + gap_s * corrected.segment[moved.behind]
+    nearest = np.searchsorted(logged_s, corrected_s - NEAR * step_s) + int(
+        np.floor(late_s / step_s + SAME)
+    )
+    nearest = np.clip(nearest, 0, len(logged_s) - 1)
+    run = np.cumsum(filled.log.is_start())
+    is_logged = (filled.source_row[nearest] >= 0) & (
+        np.abs(logged_s[nearest] - corrected_s - late_s) < 2.0 * step_s
+    )
+    is_logged &= run[nearest] == run[np.searchsorted(logged_s, corrected_s - NEAR * step_s)]
+    weights = _weights((corrected_s + late_s - logged_s[nearest]) / step_s, motion)
+    constant = _changes(record_of(filled))[nearest] - _delayed(_changes(record), weights, 0)
     constant = np.pad(np.where(record.begins[:, None], 0.0, constant), ((0, 0), (0, NUM_AXES - 6)))
-    index = np.where(chunks.row < len(own), chunks.row, -1)
+    index = np.where(chunks.row < len(corrected_s), chunks.row, -1)
     is_inside = index >= 0
     counts = chunks.counts.copy()
     counts[..., :-1, 1] &= (is_logged[index] & is_inside)[..., None]

@@ -1,4 +1,4 @@
-"""Select effects: drop those not needed, swap rivals, and replace base changes by one effect."""
+"""Select effects: drop unneeded ones, swap rivals, and replace base changes by one effect."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -30,28 +30,30 @@ from flytrack_sysid.diagnosis.search import (
 )
 from flytrack_sysid.parameters import TAUS, THRUST_COEFFS
 
-EQUIVALENT = 10.0  # of chi2: a rival that explains so nearly as much cannot be told apart
-# of chi2: where less than EQUIVALENT is expected, it hardly ever is as much
+EQUIVALENT = 10.0  # of chi2: a rival that explains less by no more than this cannot be told apart
+# Of chi2: where a difference below EQUIVALENT is expected, chance hardly ever makes it this large.
 EQUIVALENT_BY_CHANCE = 30.0
 MAX_RIVALS = 3
-# Rivals are refitted where first order says that they come within so much chi2, or within a share
-# of the gain: first order is less exact for large changes, and least for effects that are looked
-# for at probes.
+# Rivals are refitted where first order puts them within NEARLY of chi2, or within a share of the
+# gain: first order is less exact for large changes, and least exact for effects with probes.
 NEARLY, NEAR_SHARE, PROBE_SHARE = 60.0, 0.15, 0.25
-CLEARLY_CHEAPER = 0.5  # of cost and price: swaps for less would go back and forth
+CLEARLY_CHEAPER = 0.5  # of cost and price: swaps that save less would go back and forth
 IMMATERIAL = 0.01  # of a lag or a drain
-IMMATERIAL_THRUST = 0.003  # of the weight, rms over what was flown
+IMMATERIAL_THRUST = 0.003  # of the weight, rms over the flown rows
 HOPELESS = 0.01  # of the cost, above the limit to first order: not worth a fit
 
 
 class Ablation(NamedTuple):
-    """One effect of a model against doing without it and against its rivals.
+    """One effect of a model, compared with the model without it and with its rivals.
 
-    gain: of chi2 over the model without it, refitted. inflation: of that gain's variance.
-    num_parameters: of its parameters, those that the log determines. rivals: effect -> how much
-    worse the model is with that one instead, of chi2; the better ones are refitted, and those are
-    in ``swaps``, with the effect itself in another group of its parameters. without: the model
-    without the effect.
+    Attributes:
+        gain: of chi2 over the model without the effect, refitted.
+        inflation: of that gain's variance.
+        num_parameters: of its parameters, those that the log determines.
+        rivals: effect -> how much worse (chi2) the model is with that one instead.
+        swaps: effect -> the refitted model with that one instead, of the better rivals, and of the
+            effect itself with another group of its parameters.
+        without: the refitted model without the effect.
     """
 
     gain: float
@@ -68,36 +70,48 @@ class Ablation(NamedTuple):
 
     @property
     def margin(self) -> float:
-        """By how much the gain exceeds what chance brings about."""
+        """The robust gain less the gain that chance would reach."""
         return self.robust - threshold(self.num_parameters)
 
 
 def without_effect(state: SearchState, model: FittedModel, effect: str) -> FittedModel:
     """Return the model without an effect, refitted."""
     vector = state.problem.at_start(model.vector, model.candidate(effect).fields)
-    return state.fitted([one for one in model.candidates if one.effect != effect], vector)
+    return state.fitted(
+        [candidate for candidate in model.candidates if candidate.effect != effect], vector
+    )
 
 
 def ablate(
     state: SearchState, model: FittedModel, linearization: Linearization, effect: str
 ) -> Ablation:
-    """Return what an effect of a model is worth, without rivals.
+    """Return the ablation of an effect of a model, without rivals.
 
-    linearization: of the model, along everything.
+    Args:
+        state: of the search.
+        model: with the effect.
+        linearization: of the model, along everything.
+        effect: its name.
     """
-    less = without_effect(state, model, effect)
+    reduced = without_effect(state, model, effect)
     columns = [linearization.column(field) for field in model.candidate(effect).fields]
-    own = linearization.gain(columns, linearization.columns_at(model.indices, without=columns))
-    inflation, determined = (1.0, 1) if own is None else (own.inflation, own.num_parameters)
-    return Ablation(less.cost - model.cost, inflation, determined, {}, {}, less)
+    effect_gain = linearization.gain(
+        columns, linearization.columns_at(model.indices, without=columns)
+    )
+    inflation, determined = (
+        (1.0, 1) if effect_gain is None else (effect_gain.inflation, effect_gain.num_parameters)
+    )
+    return Ablation(reduced.cost - model.cost, inflation, determined, {}, {}, reduced)
 
 
 def ablate_all(
     state: SearchState, model: FittedModel, linearization: Linearization
 ) -> dict[str, Ablation]:
-    """Return what every effect of a model is worth, and its rivals in its place."""
-    alone = [ablate(state, model, linearization, one.effect) for one in model.candidates]
-    return with_rivals(state, model, linearization, alone)
+    """Return the ablation of every effect of a model, with its rivals."""
+    ablations = [
+        ablate(state, model, linearization, candidate.effect) for candidate in model.candidates
+    ]
+    return with_rivals(state, model, linearization, ablations)
 
 
 def with_rivals(
@@ -106,11 +120,18 @@ def with_rivals(
     linearization: Linearization,
     ablations: Sequence[Ablation],
 ) -> dict[str, Ablation]:
-    """Return ablations, in the order of the model's effects, with their rivals, by effect."""
-    effects = (one.effect for one in model.candidates)
+    """Return ablations with their rivals, by effect.
+
+    Args:
+        state: of the search.
+        model: with the effects.
+        linearization: of the model, along everything.
+        ablations: without rivals, in the order of the model's effects.
+    """
+    effects = (ablation.effect for ablation in model.candidates)
     return {
-        effect: _with_rivals(state, model, linearization, effect, one)
-        for effect, one in zip(effects, ablations, strict=True)
+        effect: _with_rivals(state, model, linearization, effect, ablation)
+        for effect, ablation in zip(effects, ablations, strict=True)
     }
 
 
@@ -121,32 +142,35 @@ def _with_rivals(
     effect: str,
     ablation: Ablation,
 ) -> Ablation:
-    """Return the ablation of an effect with what its rivals are worth in its place."""
-    less, gain, limit = ablation.without, ablation.gain, model.cost + NEARLY
-    # Slopes with the effect serve without it: rivals that come near are refitted.
-    nearby = linearization.moved(less.vector)
+    """Return the ablation of an effect with the models that have its rivals instead."""
+    reduced, gain, limit = ablation.without, ablation.gain, model.cost + NEARLY
+    # Slopes of the model with the effect are good enough without it: near rivals are refitted.
+    nearby = linearization.moved(reduced.vector)
     rivals: dict[str, float] = {}
     swaps: dict[str, FittedModel] = {}
     ranked = [
-        one for one in score_candidates(state, nearby, less) if one.candidate.effect != effect
+        scored
+        for scored in score_candidates(state, nearby, reduced)
+        if scored.candidate.effect != effect
     ]
-    for number, one in enumerate(ranked):
-        rival = one.candidate.effect
-        rivals[rival] = gain - one.gain.chi2
-        share = PROBE_SHARE if one.candidate.probes else NEAR_SHARE
+    for number, scored in enumerate(ranked):
+        rival = scored.candidate.effect
+        rivals[rival] = gain - scored.gain.chi2
+        share = PROBE_SHARE if scored.candidate.probes else NEAR_SHARE
         if number < MAX_RIVALS and rivals[rival] < max(NEARLY, share * gain):
-            swaps[rival] = add_effect(state, nearby, less, one, limit)
+            swaps[rival] = add_effect(state, nearby, reduced, scored, limit)
             rivals[rival] = swaps[rival].cost - model.cost
-    # Without the effect the rest may have moved so far that slopes say nothing of a rival like it.
+    # Without the effect, the other parameters may have moved so far that slopes do not show a rival
+    # like it.
     beside = separation(linearization, model, effect).beside
-    for one in ranked:
-        rival = one.candidate.effect
+    for scored in ranked:
+        rival = scored.candidate.effect
         if rival not in swaps and beside.get(rival, np.inf) < EQUIVALENT:
-            swaps[rival] = with_candidate(state, model, effect, one.candidate, limit)
+            swaps[rival] = with_candidate(state, model, effect, scored.candidate, limit)
             rivals[rival] = swaps[rival].cost - model.cost
-    for other in other_groups(linearization, model, effect):
+    for group in other_groups(linearization, model, effect):
         swaps[effect] = min(
-            with_candidate(state, model, effect, other, limit),
+            with_candidate(state, model, effect, group, limit),
             swaps.get(effect, model),
             key=price,
         )
@@ -156,33 +180,46 @@ def _with_rivals(
 def with_candidate(
     state: SearchState, model: FittedModel, effect: str, other: Candidate, limit: float
 ) -> FittedModel:
-    """Return the model with a candidate in an effect's place, refitted from where it is.
+    """Return the model with a candidate instead of an effect, refitted from the model's vector.
 
-    limit: as in ``search.refine``.
+    Args:
+        state: of the search.
+        model: with the effect.
+        effect: to replace.
+        other: the candidate.
+        limit: as in ``search.refine``.
     """
-    candidates = [other if one.effect == effect else one for one in model.candidates]
+    candidates = [
+        other if candidate.effect == effect else candidate for candidate in model.candidates
+    ]
     dropped = {*model.candidate(effect).fields} - {*other.fields}
     vector = state.problem.at_start(model.vector, sorted(dropped))
     return state.fitted(candidates, vector, limit=limit)
 
 
 def other_groups(linearization: Linearization, model: FittedModel, effect: str) -> list[Candidate]:
-    """Return an effect with more, fewer or other parameters that are cheaper to first order.
+    """Return candidates of an effect with more, fewer or other parameters, cheaper to first order.
 
-    Others are included if they gain something beside the effect's own.
+    Other parameters are returned if they gain enough beside the effect's own.
     """
-    problem, now = linearization.problem, model.candidate(effect)
-    own, result = set(now.fields), []
-    ways = {one.fields: one for one in candidates_for(problem) if one.effect == effect}
-    less = [tuple(field for field in now.fields if field not in group) for group in now.groups]
-    ways |= {fields: now._replace(fields=fields) for fields in less if fields}
-    for candidate in ways.values():
-        more = {*candidate.fields} - own
-        changed = sorted(more or own - {*candidate.fields})
+    problem, current = linearization.problem, model.candidate(effect)
+    current_fields, result = set(current.fields), []
+    by_fields = {
+        alternative.fields: alternative
+        for alternative in candidates_for(problem)
+        if alternative.effect == effect
+    }
+    smaller_groups = [
+        tuple(field for field in current.fields if field not in group) for group in current.groups
+    ]
+    by_fields |= {fields: current._replace(fields=fields) for fields in smaller_groups if fields}
+    for candidate in by_fields.values():
+        added = {*candidate.fields} - current_fields
+        changed = sorted(added or current_fields - {*candidate.fields})
         columns = [linearization.column(field) for field in changed]
         given = linearization.columns_at(model.indices, without=columns)
         price = PER_PARAMETER * len(changed)
-        if not more:
+        if not added:
             size = (model.vector - problem.start)[problem.indices_of(changed)]
             is_cheaper = size @ linearization.projected(columns, given)[0] @ size < price
         else:
@@ -199,12 +236,12 @@ def select_effects(
     """Return the model with unneeded effects removed and better ones swapped in, and ablations."""
     while True:
         state, linearization = state.linearized(model.vector)
-        alone = [ablate(state, model, linearization, one.effect) for one in model.candidates]
-        weakest = min(alone, key=lambda one: one.margin, default=None)
+        ablated = [ablate(state, model, linearization, one.effect) for one in model.candidates]
+        weakest = min(ablated, key=lambda one: one.margin, default=None)
         if weakest is not None and weakest.margin < 0.0:
             model = weakest.without
             continue
-        ablations = with_rivals(state, model, linearization, alone)
+        ablations = with_rivals(state, model, linearization, ablated)
         swaps = [swap for one in ablations.values() for swap in one.swaps.values()]
         best = min((*swaps, *with_lags_anew(state, model)), key=price, default=model)
         if price(best) >= price(model) - CLEARLY_CHEAPER:
@@ -213,9 +250,9 @@ def select_effects(
 
 
 def with_lags_anew(state: SearchState, model: FittedModel) -> list[FittedModel]:
-    """Return the model fitted again from nominal lags if any ended where it is shortest.
+    """Return the model refitted from nominal lags, if any lag ended at its lower bound.
 
-    There a lag has no slope that would lead back.
+    There a lag has no slope that leads back.
     """
     problem, vector = state.problem, model.vector.copy()
     shortest = [index for index in problem.indices_of(TAUS) if vector[index] <= problem.low[index]]
@@ -236,9 +273,12 @@ def price(model: FittedModel) -> float:
 
 
 class Separation(NamedTuple):
-    """An effect's noncentrality lambda, and what is left of it beside each rival, to first order.
+    """How clearly a log shows an effect, to first order.
 
-    lambda: squared norm of its signature with all else that is free projected out.
+    Attributes:
+        noncentrality: lambda, the squared norm of the effect's signature with all other free
+            parameters projected out.
+        beside: rival -> what is left of the noncentrality with that rival projected out, too.
     """
 
     noncentrality: float
@@ -246,10 +286,10 @@ class Separation(NamedTuple):
 
 
 def separation(linearization: Linearization, model: FittedModel, effect: str) -> Separation:
-    """Return how clearly a log shows an effect of a model, and tells it from others."""
-    problem, own = linearization.problem, model.candidate(effect)
-    columns = [linearization.column(field) for field in own.fields]
-    size = (model.vector - problem.start)[problem.indices_of(own.fields)]
+    """Return how clearly a log shows an effect of a model, alone and beside its rivals."""
+    problem, effect_candidate = linearization.problem, model.candidate(effect)
+    columns = [linearization.column(field) for field in effect_candidate.fields]
+    size = (model.vector - problem.start)[problem.indices_of(effect_candidate.fields)]
     given = linearization.columns_at(model.indices, without=columns)
 
     def beside(others: list[int]) -> float:
@@ -258,19 +298,23 @@ def separation(linearization: Linearization, model: FittedModel, effect: str) ->
     rivals: dict[str, float] = {}
     for candidate in candidates_for(problem):
         if candidate.effect not in model.effects:
-            left = beside(given + linearization.acting(linearization.columns_of(candidate)))
-            rivals[candidate.effect] = min(left, rivals.get(candidate.effect, np.inf))
+            noncentrality = beside(
+                given + linearization.acting(linearization.columns_of(candidate))
+            )
+            rivals[candidate.effect] = min(noncentrality, rivals.get(candidate.effect, np.inf))
     return Separation(beside(given), rivals)
 
 
-def equivalents(ablation: Ablation, own: Separation) -> tuple[str, ...]:
+def equivalents(ablation: Ablation, effect_separation: Separation) -> tuple[str, ...]:
     """Return rivals that a log cannot tell from an effect: equal fit, or a difference by chance."""
 
     def is_equivalent(rival: str, worse: float) -> bool:
-        is_lost = own.beside.get(rival, own.noncentrality) < EQUIVALENT
-        return worse < EQUIVALENT or (is_lost and worse < EQUIVALENT_BY_CHANCE)
+        is_hidden = (
+            effect_separation.beside.get(rival, effect_separation.noncentrality) < EQUIVALENT
+        )
+        return worse < EQUIVALENT or (is_hidden and worse < EQUIVALENT_BY_CHANCE)
 
-    ranked = sorted(ablation.rivals.items(), key=lambda pair: pair[1])
+    ranked = sorted(ablation.rivals.items(), key=lambda item: item[1])
     return tuple(
         rival for rival, worse in ranked if rival in ablation.swaps and is_equivalent(rival, worse)
     )
@@ -291,27 +335,34 @@ class Marginal:
         """Return the parameters' covariance, that of the information times its inflation."""
         return self.inflation * solve(self.information, np.eye(len(self.information)))
 
-    def half_widths(self, ways: np.ndarray | None = None) -> np.ndarray:
+    def half_widths(self, weights: np.ndarray | None = None) -> np.ndarray:
         """Return half of each parameter's 95 % interval, or of weighted sums of parameters.
 
-        ways: the weights of the sums, (num_sums, parameters).
+        The standard deviation is that of the information or, if larger, the sandwich estimate from
+        the scores of blocks. The interval is of Student's t for the number of blocks.
 
-        Its standard deviation is that of the information or, where it is larger, the sandwich
-        estimate from the scores of blocks; Student's t for so many blocks.
+        Args:
+            weights: of the sums, (num_sums, parameters); each parameter by itself if None.
         """
-        ways = np.eye(len(self.information)) if ways is None else ways
-        covariance = solve(self.information, ways.T).T
+        weights = np.eye(len(self.information)) if weights is None else weights
+        covariance = solve(self.information, weights.T).T
         used = self.scores[np.abs(self.scores).sum(axis=1) > 0.0]
-        number = max(len(used), 2)
-        spread = used.T @ used * number / (number - 1)
+        count = max(len(used), 2)
+        spread = used.T @ used * count / (count - 1)
         variance = np.maximum(
-            np.diag(covariance @ ways.T), np.diag(covariance @ spread @ covariance.T)
+            np.diag(covariance @ weights.T), np.diag(covariance @ spread @ covariance.T)
         )
-        return np.sqrt(variance) * stats.t.ppf(0.975, number - 1)
+        return np.sqrt(variance) * stats.t.ppf(0.975, count - 1)
 
 
 class BaseChange(NamedTuple):
-    """Base parameters that differ from nominal: names, information, chi2 of the difference."""
+    """Base parameters that differ from nominal.
+
+    Attributes:
+        fields: their names.
+        marginal: the information about them.
+        gain: chi2 of the difference.
+    """
 
     fields: list[str]
     marginal: Marginal
@@ -321,7 +372,7 @@ class BaseChange(NamedTuple):
 def _is_immaterial(problem: Problem, fields: Sequence[str], model: FittedModel) -> bool:
     """Return whether a lag, drain or thrust curve differs by too little to matter.
 
-    Rounding causes differences as large.
+    Rounding causes differences of that size.
     """
     indices = problem.indices_of(fields)
     change = model.vector[indices] - problem.start[indices]
@@ -339,7 +390,7 @@ def _is_immaterial(problem: Problem, fields: Sequence[str], model: FittedModel) 
 def base_change(
     state: SearchState, linearization: Linearization, model: FittedModel, fields: Sequence[str]
 ) -> BaseChange | None:
-    """Return how the log contradicts nominal base parameters; None where it hardly does."""
+    """Return how the log contradicts nominal base parameters; None unless it clearly does."""
     problem, free = state.problem, set(state.base_indices)
     acting = [
         field
@@ -360,12 +411,12 @@ def base_change(
 def base_changes(
     state: SearchState, linearization: Linearization, model: FittedModel
 ) -> dict[str, BaseChange]:
-    """Return the causes of the base that the log shows, by name."""
-    found = {
+    """Return the changes of the base that the log shows, by name of the cause."""
+    changes = {
         name: base_change(state, linearization, model, fields)
         for name, fields in BASE_CAUSES.items()
     }
-    return {name: one for name, one in found.items() if one is not None}
+    return {name: change for name, change in changes.items() if change is not None}
 
 
 def explain_base_by_effect(
@@ -373,11 +424,11 @@ def explain_base_by_effect(
 ) -> tuple[SearchState, FittedModel | None]:
     """Return a model with one more effect and nominal base parameters, if it explains as much.
 
-    A delay of all commands, say, looks like four longer lags.
+    For example, a delay of all commands looks like four longer lags.
     """
     state, linearization = state.linearized(model.vector)
     changes = base_changes(state, linearization, model).values()
-    changed = tuple(field for one in changes for field in one.fields)
+    changed = tuple(field for change in changes for field in change.fields)
     lags = tuple(field for field in changed if field in TAUS)
     for fields in dict.fromkeys((changed, lags)):
         if fields:
@@ -390,24 +441,24 @@ def explain_base_by_effect(
 def _best_instead(
     state: SearchState, model: FittedModel, fields: Sequence[str]
 ) -> tuple[SearchState, FittedModel | None]:
-    """Return the best model with base parameters held and at most one more effect, if better."""
+    """Return the best model with base parameters held and at most one more effect, if cheaper."""
     given, problem, held = state, state.problem, state.held
     state = replace(state, held=(*held, *(HeldParameter(field, "") for field in fields)))
-    less = state.fitted(model.candidates, problem.at_start(model.vector, fields))
-    state, nearby = state.linearized(less.vector)
+    reduced = state.fitted(model.candidates, problem.at_start(model.vector, fields))
+    state, nearby = state.linearized(reduced.vector)
     limit = model.cost + PER_PARAMETER * len(fields)
-    best = less if less.cost < limit else None
-    for one in score_candidates(state, nearby, less)[:MAX_REFITTED]:
-        hopeless = limit + less.cost * HOPELESS
-        if less.cost - one.gain.chi2 > hopeless and not one.candidate.probes:
+    best = reduced if reduced.cost < limit else None
+    for one in score_candidates(state, nearby, reduced)[:MAX_REFITTED]:
+        max_cost = limit + reduced.cost * HOPELESS
+        if reduced.cost - one.gain.chi2 > max_cost and not one.candidate.probes:
             continue
-        trial = add_effect(state, nearby, less, one, hopeless)
+        trial = add_effect(state, nearby, reduced, one, max_cost)
         cost = trial.cost + PER_PARAMETER * one.candidate.num_priced
         if cost < limit:
             state, determined = is_determined(state, trial, one.candidate.fields)
             best, limit = (trial, cost) if determined else (best, limit)
     if best is None:
-        return given, None  # and its slopes, of the model without anything held
+        return given, None  # this state keeps its slopes, of the model without anything held
     effect = "".join(one.effect for one in best.candidates if one not in model.candidates)
     return replace(state, held=(*held, *(HeldParameter(field, effect) for field in fields))), best
 

@@ -1,18 +1,19 @@
-"""How a log moves: by which motion, and how late its poses are against its gyro.
+"""Choose the motion of a log, and estimate how late its poses are against its gyro.
 
 A motion is a simulator's step, or the continuous motion of a drone. Half a step of another motion
-looks like clocks that are half a step apart, so both are chosen together, where the sensors do not
-show the motion by themselves (``motion_of_sensors``). The correlation of gyro
-and attitude says how late poses are under each motion. Each is fitted so with the base and the few
-effects that can pass for half a step (delays, drag, scales), on some seconds of the log, the
-lateness of the likely ones along with it, and the likelihoods of what was logged are compared.
-Unlike named effects, motions are not nested, so that a small difference decides. Poses are never
-early: where they seem to be, gyro and accelerometer are late.
+looks like clocks that are half a step apart. So both are chosen together, if the sensors do not
+show the motion by themselves (``motion_of_sensors``). The correlation of gyro and attitude gives
+the lateness of poses under each motion. Each motion is fitted with that lateness on some seconds of
+the log, with the base and the few effects that can pass for half a step (delays, drag, scales). For
+the likely motions, the lateness is fitted as well. Then the likelihoods of the logged poses are
+compared. Unlike named effects, motions are not nested, so that a small difference decides. Poses
+are never early: where they seem to be, gyro and accelerometer are late.
 
-A simulator's step with poses that are late by half a step is a drone whose poses are on time, but
-for the curvature within a step, which a model that lacks something fits worse than it differs. So
-who seems on time as a drone is a drone. (On Betaflight, whose rate loop the model lacks, the
-likelihoods chose a simulator's step with poses 4.5 ms late for 4 of 5 flights.)
+A simulator's step with poses late by half a step equals a drone with poses on time, except for the
+curvature within a step. The misfit of an incomplete model is larger than this difference. So a log
+whose poses seem on time under continuous motion is taken for a drone's. (On Betaflight, whose rate
+loop the model lacks, the likelihoods chose a simulator's step with poses 4.5 ms late for 4 of 5
+flights.)
 """
 
 from collections.abc import Sequence
@@ -36,17 +37,16 @@ from flytrack_sysid.log import FlightLog, usual_step
 from flytrack_sysid.log_motion import required_motion
 from flytrack_sysid.parameters import base_of
 
-CLEAR = 10.0  # of minus twice the log likelihood, by which a simulator's step has to win
-# Of it, which poses that are not on time have to gain: effects that are not fitted here change it
-# by so much.
+CLEAR = 10.0  # of minus twice the log likelihood: a simulator's step has to be better by this
+# Of the same: the gain that late poses need. Effects that are not fitted here change it by as much.
 LATE = 60.0
-NEAR = 300.0  # of it: within so much of the best, lateness is fitted before one is chosen
-UNDECIDED = 60.0  # of it: while the second best is so near, more of the log is asked
-MAX_CHUNKS = 4  # at a time, evenly spread: twenty seconds decide mostly
-# What a correlation has to say: smaller offsets are within its bias, or its standard errors up to a
-# bound.
+NEAR = 300.0  # of the same: trials this close to the best have their lateness fitted
+UNDECIDED = 60.0  # of the same: while the second best is this close, more of the log is used
+MAX_CHUNKS = 4  # at a time, evenly spread: twenty seconds mostly suffice
+# The least offset that a correlation shows: smaller ones are within its bias, or within its
+# standard errors, up to a bound.
 ON_TIME_S, STANDARD_ERRORS, UNCERTAIN_S = 0.7e-3, 3.0, 1.5e-3
-MIN_LATENCY_S = 0.5e-3  # of a fitted lateness: a smaller one changes nothing
+MIN_LATENCY_S = 0.5e-3  # of a fitted lateness: a smaller one has no effect
 DIFFERENCE_S, MAX_STEP_S = 2e-4, 3e-3  # for slopes; of a step of the fit
 ROUNDS = 2
 IMU_LATENCY = "imu_latency.latency_s"
@@ -69,12 +69,14 @@ LOOK_ALIKES: tuple[Effect, ...] = tuple(
 
 
 class MotionEstimate(NamedTuple):
-    """How a log moves, and how late its poses are.
+    """The motion of a log, and how late its poses are.
 
-    late_s: the poses against the gyro, 0 if on time. sigma_s: the standard error of ``late_s``.
-    is_sure: the motion was given, or is what the sensors show.
-
-    While a motion is chosen, ``late_s`` is negative where the gyro and the accelerometer are late.
+    Attributes:
+        motion: a simulator's step, or continuous.
+        late_s: lateness of the poses against the gyro, 0 if on time. While a motion is chosen, it
+            is negative where the gyro and the accelerometer are late.
+        sigma_s: standard error of ``late_s``.
+        is_sure: the motion was given, or is shown by the sensors.
     """
 
     motion: Motion
@@ -84,7 +86,7 @@ class MotionEstimate(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """A motion and a lateness, and what was fitted under them."""
+    """A motion and a lateness, and the noise and the model fitted under them."""
 
     motion_estimate: MotionEstimate
     problem: Problem
@@ -106,11 +108,14 @@ def build_problem(
 
 
 class LogPart(NamedTuple):
-    """Rows of a log to learn from, a model to start from, and the part of the chunks that is used.
+    """Rows of a log to learn from, and the part of the chunks that is used.
 
-    scored_rows: (num_rows,) bool.
-
-    num_parts: of some chunks each.
+    Attributes:
+        log: with poses as logged.
+        scored_rows: the rows to learn from, (num_rows,) bool.
+        model: to start from.
+        part: the part that is used.
+        num_parts: the number of parts, of some chunks each.
     """
 
     log: FlightLog
@@ -120,14 +125,18 @@ class LogPart(NamedTuple):
     num_parts: int = 1
 
     def chunks(self, log: FlightLog) -> Chunks:
-        """Return the chunks of this part; in ``log`` poses may be at other times."""
+        """Return the chunks of this part.
+
+        Args:
+            log: the log; its poses may be at other times.
+        """
         chunks = cut_chunks(log, self.scored_rows, self.model)
         return chunks.selected(
             np.arange(self.part, chunks.row.shape[1], self.num_parts)[:MAX_CHUNKS]
         )
 
     def problem(self, motion_estimate: MotionEstimate) -> Problem:
-        """Return the problem of a log that moves so."""
+        """Return the problem of this part under a motion and a lateness."""
         model, late_s = (
             self.model._replace(motion=motion_estimate.motion),
             max(motion_estimate.late_s, 0.0),
@@ -137,8 +146,8 @@ class LogPart(NamedTuple):
 
 
 def _indices(problem: Problem, motion_estimate: MotionEstimate) -> list[int]:
-    """Return what is fitted; sensors are late only where poses would be early."""
-    names = [f"{one.name}.{name}" for one in LOOK_ALIKES for name in one.ranges]
+    """Return the indices that are fitted; the sensors' latency only if poses would be early."""
+    names = [f"{effect.name}.{name}" for effect in LOOK_ALIKES for name in effect.ranges]
     return problem.indices_of(
         [
             *base_of(problem.like),
@@ -147,9 +156,9 @@ def _indices(problem: Problem, motion_estimate: MotionEstimate) -> list[int]:
     )
 
 
-def _fit(seen: LogPart, motion_estimate: MotionEstimate, last: Trial | None = None) -> Trial:
-    """Return a fit, from that of another motion or a similar lateness if there is one."""
-    problem = seen.problem(motion_estimate)
+def _fit(log_part: LogPart, motion_estimate: MotionEstimate, last: Trial | None = None) -> Trial:
+    """Return a fit, started from that of another motion or a similar lateness if there is one."""
+    problem = log_part.problem(motion_estimate)
     vector = (problem.start if last is None else last.vector).copy()
     if last is None or last.motion_estimate.motion is not motion_estimate.motion:
         latency = problem.names.index(IMU_LATENCY)
@@ -157,28 +166,28 @@ def _fit(seen: LogPart, motion_estimate: MotionEstimate, last: Trial | None = No
     noise = None if last is None else last.problem.noise
     if noise is None:
         noise = noises.first_guess(problem.chunks, problem.residuals(vector[None])[0])
-    for _ in range(2 if last is None else 1):  # what is badly fitted passes for noise at first
+    for _ in range(2 if last is None else 1):  # a bad first fit makes the noise too large
         problem = problem.with_noise(noise)
         vector, _ = refine(problem, problem.clipped(vector), _indices(problem, motion_estimate))
         noise = noises.fit_noise(problem.chunks, problem.residuals(vector[None])[0], noise)
     return Trial(motion_estimate, problem.with_noise(noise), vector)
 
 
-def _with_later_poses(seen: LogPart, trial: Trial) -> MotionEstimate:
-    """Return the lateness that fits better, all else refitted, to first order."""
+def _with_later_poses(log_part: LogPart, trial: Trial) -> MotionEstimate:
+    """Return the lateness that fits best to first order, with all other parameters refitted."""
     motion_estimate, problem, vector = trial
-    later = seen.problem(motion_estimate._replace(late_s=motion_estimate.late_s + DIFFERENCE_S))
+    later = log_part.problem(motion_estimate._replace(late_s=motion_estimate.late_s + DIFFERENCE_S))
     change = (later.residuals(vector[None]) - problem.residuals(vector[None])) / DIFFERENCE_S
     linearization = Linearization(
         problem, problem.slopes(vector, _indices(problem, motion_estimate))
     )
     root = np.sqrt(robust_weight(linearization.white))
     column = problem.whiten(np.where(problem.counts & later.counts, change, 0.0))
-    own, rest = blocks_of(column * root)[:, 0], linearization.columns * blocks_of(root)[:, None]
-    across = np.einsum("bpn,bn->p", rest, own)
+    late, given = blocks_of(column * root)[:, 0], linearization.columns * blocks_of(root)[:, None]
+    across = np.einsum("bpn,bn->p", given, late)
     share = solve(linearization.total, across)
-    information = float(np.sum(own**2) - across @ share)
-    score = -float(np.sum(own * blocks_of(linearization.white * root))) - float(
+    information = float(np.sum(late**2) - across @ share)
+    score = -float(np.sum(late * blocks_of(linearization.white * root))) - float(
         share @ linearization.score
     )
     step_s = np.clip(score / information, -MAX_STEP_S, MAX_STEP_S)
@@ -187,30 +196,37 @@ def _with_later_poses(seen: LogPart, trial: Trial) -> MotionEstimate:
     )
 
 
-def _fit_lateness(seen: LogPart, trial: Trial, rounds: int = ROUNDS) -> Trial:
-    """Return the trial with the lateness of its poses fitted, down to none."""
+def _fit_lateness(log_part: LogPart, trial: Trial, rounds: int = ROUNDS) -> Trial:
+    """Return the trial with the lateness of its poses fitted, not below 0."""
     for _ in range(rounds):
         if trial.motion_estimate.late_s <= 0.0:
             break
-        motion_estimate = _with_later_poses(seen, trial)
-        trial = _fit(seen, motion_estimate._replace(late_s=max(motion_estimate.late_s, 0.0)), trial)
+        motion_estimate = _with_later_poses(log_part, trial)
+        trial = _fit(
+            log_part, motion_estimate._replace(late_s=max(motion_estimate.late_s, 0.0)), trial
+        )
     return trial
 
 
 def _misfits(trials: Sequence[Trial]) -> list[float]:
-    """Return minus twice the log likelihoods of the rows that all trials judge."""
+    """Return minus twice the log likelihoods of the rows that all trials score."""
     counts = np.logical_and.reduce([trial.problem.counts for trial in trials])
     misfits = []
     for _, problem, vector in trials:
-        chunks, left = problem.chunks._replace(counts=counts), problem.residuals(vector[None])[0]
+        chunks, residuals = (
+            problem.chunks._replace(counts=counts),
+            problem.residuals(vector[None])[0],
+        )
         misfits.append(
-            noises.total_misfit(chunks, left, noises.fit_noise(chunks, left, problem.noise))
+            noises.total_misfit(
+                chunks, residuals, noises.fit_noise(chunks, residuals, problem.noise)
+            )
         )
     return misfits
 
 
 def _costs(trials: Sequence[Trial], misfits: Sequence[float]) -> list[float]:
-    """Return the misfits and what it costs that a sensor is late."""
+    """Return the misfits plus the price of a late sensor."""
     return [
         misfit + LATE * bool(trial.motion_estimate.late_s)
         for trial, misfit in zip(trials, misfits, strict=True)
@@ -220,66 +236,75 @@ def _costs(trials: Sequence[Trial], misfits: Sequence[float]) -> list[float]:
 def estimate_motion(
     log: FlightLog, model: ModelParameters, scored_rows: np.ndarray, motion: Motion | None = None
 ) -> MotionEstimate:
-    """Return how a log moves, likeliest on judged rows, (num_rows,) bool, in float64.
+    """Return the likeliest motion and lateness of a log, in float64.
 
-    model: where the search starts. motion: the only one that is tried, if given, or if the sensors
-    are sure of one. A drone's where the log hardly tells.
+    The motion is continuous where the log hardly decides.
+
+    Args:
+        log: with poses as logged.
+        model: where the search starts.
+        scored_rows: the rows that decide, (num_rows,) bool.
+        motion: the only one that is tried; if None, the one that the sensors clearly show, else
+            all.
     """
     motion = motion_of_sensors(log) if motion is None else motion
     motions, apparent = tuple(Motion) if motion is None else (motion,), apparent_lateness(log)
-    late = {one: MotionEstimate(one) for one in motions}
+    estimates = {candidate: MotionEstimate(candidate) for candidate in motions}
     if apparent is not None:
         offset_s, sigma_s = apparent
         # Rates of a simulator's step are those in its middle.
         half_s = 0.5 * float(np.median(usual_step(log)))
-        is_small = max(ON_TIME_S, min(STANDARD_ERRORS * sigma_s, UNCERTAIN_S))
-        for one in motions:
-            late_s = offset_s if one is Motion.CONTINUOUS else offset_s + half_s
-            if abs(late_s) > is_small:
-                late[one] = MotionEstimate(one, late_s, sigma_s)
-    if motion is not None and late[motion].late_s <= 0.0:
+        min_offset_s = max(ON_TIME_S, min(STANDARD_ERRORS * sigma_s, UNCERTAIN_S))
+        for candidate in motions:
+            late_s = offset_s if candidate is Motion.CONTINUOUS else offset_s + half_s
+            if abs(late_s) > min_offset_s:
+                estimates[candidate] = MotionEstimate(candidate, late_s, sigma_s)
+    if motion is not None and estimates[motion].late_s <= 0.0:
         return MotionEstimate(motion, is_sure=True)
-    if apparent is not None and [one for one in motions if late[one] == MotionEstimate(one)] == [
-        Motion.CONTINUOUS
-    ]:
+    if apparent is not None and [
+        candidate for candidate in motions if estimates[candidate] == MotionEstimate(candidate)
+    ] == [Motion.CONTINUOUS]:
         return MotionEstimate(Motion.CONTINUOUS)
-    seen = LogPart(log, scored_rows & _known_around(log, list(late.values())), model)
-    num_parts = max(cut_chunks(log, seen.scored_rows, model).row.shape[1] // MAX_CHUNKS, 1)
-    found = _chosen(seen._replace(num_parts=num_parts), list(late.values()))
-    is_late = found.late_s > max(MIN_LATENCY_S, STANDARD_ERRORS * found.sigma_s)
-    found = found if is_late else MotionEstimate(found.motion)
-    return found._replace(is_sure=motion is not None)
+    log_part = LogPart(log, scored_rows & _known_around(log, list(estimates.values())), model)
+    num_parts = max(cut_chunks(log, log_part.scored_rows, model).row.shape[1] // MAX_CHUNKS, 1)
+    estimate = _chosen(log_part._replace(num_parts=num_parts), list(estimates.values()))
+    is_late = estimate.late_s > max(MIN_LATENCY_S, STANDARD_ERRORS * estimate.sigma_s)
+    estimate = estimate if is_late else MotionEstimate(estimate.motion)
+    return estimate._replace(is_sure=motion is not None)
 
 
-def _known_around(log: FlightLog, motion_estimate: Sequence[MotionEstimate]) -> np.ndarray:
+def _known_around(log: FlightLog, estimates: Sequence[MotionEstimate]) -> np.ndarray:
     """Return the rows at which poses are known for each lateness and a few fit steps around it."""
-    room = ROUNDS * MAX_STEP_S + DIFFERENCE_S
-    late_s = [one.late_s for one in motion_estimate if one.late_s > 0.0]
-    ends = (min(0.0, min(late_s) - room), max(late_s) + room) if late_s else (0.0,)
+    reach_s = ROUNDS * MAX_STEP_S + DIFFERENCE_S
+    late_s = [estimate.late_s for estimate in estimates if estimate.late_s > 0.0]
+    ends = (min(0.0, min(late_s) - reach_s), max(late_s) + reach_s) if late_s else (0.0,)
     return np.logical_and.reduce([read_poses(log, end_s)[1] for end_s in ends])
 
 
-def _chosen(seen: LogPart, late: Sequence[MotionEstimate]) -> MotionEstimate:
-    """Return the likeliest of several; those that come near the best are fitted further."""
-    first = _fit(seen, late[0])
-    trials = [first, *(_fit(seen, motion_estimate, first) for motion_estimate in late[1:])]
+def _chosen(log_part: LogPart, estimates: Sequence[MotionEstimate]) -> MotionEstimate:
+    """Return the likeliest estimate; those close to the best are fitted further."""
+    first = _fit(log_part, estimates[0])
+    trials = [first, *(_fit(log_part, motion_estimate, first) for motion_estimate in estimates[1:])]
     misfits = _misfits(trials)
     trials = [
-        _fit_lateness(seen, trial) if misfit < min(misfits) + NEAR else trial
+        _fit_lateness(log_part, trial) if misfit < min(misfits) + NEAR else trial
         for trial, misfit in zip(trials, misfits, strict=True)
     ]
     misfits = _misfits(trials)
-    for part in range(1, seen.num_parts):
+    for part in range(1, log_part.num_parts):
         costs = _costs(trials, misfits)
         kept = [index for index, cost in enumerate(costs) if cost < min(costs) + UNDECIDED]
         if len(kept) < 2:
             break
-        other, trials = seen._replace(part=part), [trials[index] for index in kept]
-        again = [
-            _fit_lateness(other, _fit(other, one.motion_estimate, one), rounds=1) for one in trials
+        other_part, trials = log_part._replace(part=part), [trials[index] for index in kept]
+        refitted = [
+            _fit_lateness(
+                other_part, _fit(other_part, previous.motion_estimate, previous), rounds=1
+            )
+            for previous in trials
         ]
-        misfits = list(np.array(misfits)[kept] + _misfits(again))
-        trials = [_both(*pair) for pair in zip(trials, again, strict=True)]
+        misfits = list(np.array(misfits)[kept] + _misfits(refitted))
+        trials = [_both(*pair) for pair in zip(trials, refitted, strict=True)]
     costs = _costs(trials, misfits)
     for trial, cost in zip(trials, costs, strict=True):
         if trial.motion_estimate.motion is Motion.CONTINUOUS and cost <= min(costs) + CLEAR:
@@ -288,13 +313,13 @@ def _chosen(seen: LogPart, late: Sequence[MotionEstimate]) -> MotionEstimate:
 
 
 def _both(first: Trial, second: Trial) -> Trial:
-    """Return the second trial with the lateness that both say."""
-    one_s, sigma_s = first.motion_estimate.late_s, first.motion_estimate.sigma_s
-    other_s, other_sigma_s = second.motion_estimate.late_s, second.motion_estimate.sigma_s
-    if one_s <= 0.0:
+    """Return the second trial with the weighted mean of both latenesses."""
+    first_s, sigma_s = first.motion_estimate.late_s, first.motion_estimate.sigma_s
+    second_s, second_sigma_s = second.motion_estimate.late_s, second.motion_estimate.sigma_s
+    if first_s <= 0.0:
         return second
-    weights = np.array([sigma_s, other_sigma_s]) ** -2.0
-    late_s = float(weights @ [one_s, other_s] / weights.sum())
+    weights = np.array([sigma_s, second_sigma_s]) ** -2.0
+    late_s = float(weights @ [first_s, second_s] / weights.sum())
     sigma_s = float(weights.sum() ** -0.5)
     return second._replace(
         motion_estimate=first.motion_estimate._replace(late_s=late_s, sigma_s=sigma_s)
@@ -302,18 +327,18 @@ def _both(first: Trial, second: Trial) -> Trial:
 
 
 def likelier_motion(problem: Problem, vector: np.ndarray) -> Motion:
-    """Return the motion with the least misfit of a fitted model, its own unless clearly beaten.
+    """Return the motion with the least misfit of a fitted model; its own unless clearly worse.
 
-    Before the search, what the model lacks may fit another simulator's step better than the true
-    one. Of 18 plants (benchmarks.beyond, seed 43) this was chosen on one, and only there another
-    won afterwards.
+    Before the search, an incomplete model may fit another simulator's step better than the true
+    one. This happened on one of 18 plants (benchmarks.beyond, seed 43), and only there another
+    motion was better afterwards.
     """
 
     def misfit(motion: Motion) -> float:
         moving = replace(problem, like=problem.like._replace(motion=motion))
-        left = moving.residuals(vector[None])[0]
-        noise = noises.fit_noise(problem.chunks, left, problem.noise)
-        return noises.total_misfit(problem.chunks, left, noise) - CLEAR * (
+        residuals = moving.residuals(vector[None])[0]
+        noise = noises.fit_noise(problem.chunks, residuals, problem.noise)
+        return noises.total_misfit(problem.chunks, residuals, noise) - CLEAR * (
             motion is problem.like.motion
         )
 
@@ -323,9 +348,11 @@ def likelier_motion(problem: Problem, vector: np.ndarray) -> Motion:
 def motion_of(log: FlightLog, model: ModelParameters) -> Motion:
     """Return continuous for a measured log, else the likeliest motion.
 
-    model: where the search starts.
-
     Without gyro and attitude a log shows no turns, and the model's own motion is returned.
+
+    Args:
+        log: with poses as logged.
+        model: where the search starts.
     """
     if (required := required_motion(log)) is not None:
         return required

@@ -17,12 +17,13 @@ from flytrack_sysid.diagnosis.score_test import solve
 from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
 from flytrack_sysid.plausibility import GRAVITY
 
-# Where the attitude that turns the force of a step lies between those before and after it, as a
-# share. How many standard errors the sensors' share is off all but one of these, and may be off
-# that one, where they are sure; and what it is known to at best, without any noise.
+# The attitude that rotates the force of a step, as a share of the turn from the attitude before the
+# step to that after it. The sensors identify a motion if their share is more than SURE_ERRORS
+# standard errors from all others and less than NEAR_ERRORS from it. Without any noise, the share is
+# known to MIN_ERROR.
 ATTITUDE_SHARE = {Motion.HANDOUT: 0.0, Motion.CONTINUOUS: 0.5, Motion.SEMI_IMPLICIT: 1.0}
 SURE_ERRORS, NEAR_ERRORS, MIN_ERROR = 5.0, 4.0, 0.02
-PIECE_S, MIN_PIECE_S, MIN_PIECES = 0.5, 0.2, 20  # of flight, over which force is summed up
+PIECE_S, MIN_PIECE_S, MIN_PIECES = 0.5, 0.2, 20  # of flight, over which force is summed
 
 
 def apparent_lateness(log: FlightLog) -> tuple[float, float] | None:
@@ -35,27 +36,33 @@ def apparent_lateness(log: FlightLog) -> tuple[float, float] | None:
 
 
 def attitude_share(log: FlightLog, late_s: float) -> tuple[float, float] | None:
-    """Return which attitude turned the measured force into velocity, and its standard error.
+    """Return which attitude rotated the measured force, and its standard error.
 
-    The attitude of a step as a share of the turn from the one before to the one after it.
+    The attitude of a step is a share of the turn from the one before to the one after it.
 
-    late_s: the poses against the gyro and the accelerometer; within a step, what fits better. None
-    without these sensors, or too few pieces.
+    Args:
+        log: with attitude, velocity, force and rates.
+        late_s: lateness of the poses against the gyro and the accelerometer; of the whole numbers
+            of steps around it, the one that fits better is used.
+
+    Returns:
+        The share and its standard error; None without these sensors, or with too few pieces.
     """
     if not all(name in log for name in ("q", "v", "f", "w")):
         return None
     steps = max(late_s, 0.0) / float(np.median(usual_step(log)))
     fits = [_share_of(log, late) for late in {int(np.floor(steps)), int(np.ceil(steps))}]
-    return min((one for one in fits if one is not None), default=(0.0, None))[1]
+    return min((fit for fit in fits if fit is not None), default=(0.0, None))[1]
 
 
 def _share_of(log: FlightLog, late_rows: int) -> tuple[float, tuple[float, float]] | None:
-    """Return what is left unexplained, and ``attitude_share`` of poses late by whole rows.
+    """Return the unexplained squares, and ``attitude_share``, of poses late by whole rows.
 
-    Changes of velocity less those by the measured lift at half of the turn are explained, in pieces
-    of half a second, by the rest of the turn; by lift that is late, as of a sensor that reads at
-    the end of a step; by offset, scale and place of the accelerometer; and across the lift, where a
-    drone feels less than the sensor's noise, by offset, tilt and drag, and by a steady force.
+    The regression explains changes of velocity, less those by the measured lift at half of the
+    turn, in pieces of half a second. Its causes are the rest of the turn; lift that is late, as of
+    a sensor that reads at the end of a step; offset, scale and position of the accelerometer;
+    across the lift, where a drone feels less than the sensor's noise, offset, tilt and drag; and a
+    steady force.
     """
     step_s, usual_s = np.diff(log.time)[:, None], float(np.median(usual_step(log)))
     row = np.maximum(np.arange(1, len(log)) - late_rows, 0)
@@ -82,46 +89,51 @@ def _share_of(log: FlightLog, late_rows: int) -> tuple[float, tuple[float, float
         axis=-1,
     )
     force_w = z * lift - np.array([0.0, 0.0, GRAVITY])
-    left = np.diff(log["v"], axis=0) - force_w * step_s
+    residuals = np.diff(log["v"], axis=0) - force_w * step_s
     is_whole = (step_s[:, 0] < GAP_STEPS * usual_s) & ~log.is_start()[1:]
     is_whole[:late_rows] = False
     gram, scores, squares = [], [], 0.0
     for start, end in _pieces(is_whole, usual_s):
-        own = np.cumsum((causes * step_s[..., None])[start:end], axis=0)
-        rest = np.cumsum(left[start:end], axis=0)
-        own, rest = own - own.mean(axis=0), rest - rest.mean(axis=0)
-        gram.append(np.einsum("ric,rid->cd", own, own))
-        scores.append(np.einsum("ric,ri->c", own, rest))
-        squares += float(np.sum(rest**2))
+        regressors = np.cumsum((causes * step_s[..., None])[start:end], axis=0)
+        targets = np.cumsum(residuals[start:end], axis=0)
+        regressors, targets = regressors - regressors.mean(axis=0), targets - targets.mean(axis=0)
+        gram.append(np.einsum("ric,rid->cd", regressors, regressors))
+        scores.append(np.einsum("ric,ri->c", regressors, targets))
+        squares += float(np.sum(targets**2))
     if len(gram) < MIN_PIECES:
         return None
     information, score = np.sum(gram, axis=0), np.sum(scores, axis=0)
-    found = solve(information, score)
-    errors = solve(information, (np.array(scores) - np.array(gram) @ found).T)[0]
-    share = 0.5 + float(found[0]), float(np.sqrt(errors @ errors))
-    return squares - float(score @ found), share
+    coefficients = solve(information, score)
+    errors = solve(information, (np.array(scores) - np.array(gram) @ coefficients).T)[0]
+    share = 0.5 + float(coefficients[0]), float(np.sqrt(errors @ errors))
+    return squares - float(score @ coefficients), share
 
 
 def _pieces(is_whole: np.ndarray, step_s: float) -> list[tuple[int, int]]:
-    """Return the pieces of whole steps in a row, (num_steps,) bool, as first and last + 1."""
+    """Return pieces of consecutive whole steps, as first and last + 1.
+
+    Args:
+        is_whole: the steps without a gap, (num_steps,) bool.
+        step_s: the usual step.
+    """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_whole, [False]]).astype(int)))
-    long, short = round(PIECE_S / step_s), round(MIN_PIECE_S / step_s)
+    piece_steps, min_steps = round(PIECE_S / step_s), round(MIN_PIECE_S / step_s)
     cuts = (
-        (start, min(start + long, last))
+        (start, min(start + piece_steps, last))
         for first, last in edges.reshape(-1, 2)
-        for start in range(first, last, long)
+        for start in range(first, last, piece_steps)
     )
-    return [(start, end) for start, end in cuts if end - start >= short]
+    return [(start, end) for start, end in cuts if end - start >= min_steps]
 
 
 def motion_of_sensors(log: FlightLog) -> Motion | None:
-    """Return the motion that the sensors show, without any model; None where they are not sure."""
+    """Return the motion that the sensors show, without any model; None if they do not decide."""
     apparent = apparent_lateness(log)
-    found = attitude_share(log, 0.0 if apparent is None else apparent[0])
-    if found is None:
+    measured = attitude_share(log, 0.0 if apparent is None else apparent[0])
+    if measured is None:
         return None
-    share, sigma = found[0], max(found[1], MIN_ERROR)
-    off = {motion: abs(share - own) for motion, own in ATTITUDE_SHARE.items()}
-    nearest, second = sorted(off, key=lambda motion: off[motion])[:2]
-    is_sure = off[nearest] < NEAR_ERRORS * sigma and off[second] > SURE_ERRORS * sigma
+    share, sigma = measured[0], max(measured[1], MIN_ERROR)
+    distance = {motion: abs(share - expected) for motion, expected in ATTITUDE_SHARE.items()}
+    nearest, second = sorted(distance, key=lambda motion: distance[motion])[:2]
+    is_sure = distance[nearest] < NEAR_ERRORS * sigma and distance[second] > SURE_ERRORS * sigma
     return nearest if is_sure else None

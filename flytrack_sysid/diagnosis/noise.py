@@ -9,10 +9,10 @@ measures. The model of their residuals is
     direct  = d + white                       sensor noise
     level   = e + white                       sensor noise; e begins unknown
 
-and a Kalman filter turns it into innovations, white and of variance 1. Its gains depend on the
-noise alone, so that it is one linear map for residuals and their slopes. It needs no windows: where
-nothing wanders, a level counts from the first row to the last; where much wanders, only its
-increments do.
+and a Kalman filter turns residuals into innovations, white and of variance 1. Its gains depend on
+the noise alone, so that it is one linear map for residuals and their slopes. It needs no windows:
+without wander, a level counts from the first row to the last; with much wander, only its increments
+count.
 """
 
 from functools import cached_property, partial
@@ -35,21 +35,25 @@ MIN_DISTURBANCE_RATIO = (
     1e-3  # of a disturbance and of a wander, over the noise: smaller ones are neglected
 )
 TAU_RANGE_S = (0.02, 5.0)
-# Levenberg damping: at first, its growth after a bad step, its decrease after a good one.
+# Levenberg damping: the first, its factor after a bad step, and its factor after a good step.
 FIRST_DAMPING, MORE, LESS = 1e-2, 10.0, 0.2
 MAX_ROUNDS = 12
 ENOUGH = 1.0  # of minus twice the log likelihood: the error of one parameter
 # Sizes of the compiled programs: rows of chunks, and models, at a time.
 NUM_ROWS, NUM_CHUNKS, NUM_MODELS = 200, 8, 8
-OUTLIER = 4.0  # innovations beyond count by their size, not its square
+OUTLIER = 4.0  # innovations beyond this count by their size, not by its square
 
 
 class Noise(NamedTuple):
     """Noise by axis, each (NUM_AXES,).
 
-    direct, level: standard deviations of the sensors. wander: of e in a second, as a random walk.
-    disturbance: standard deviation of d, unit of the direct channel. tau: its time constant, s.
-    coupling: 0 where it is the direct sensor's alone, 1 where the drone feels it.
+    Attributes:
+        direct: standard deviation of the direct sensor.
+        level: standard deviation of the level's sensor.
+        wander: standard deviation of the change of e in a second, as a random walk.
+        disturbance: standard deviation of d (unit of the direct channel).
+        tau: time constant of d (s).
+        coupling: of d: 0 if only the direct sensor has it, 1 if it moves the drone.
     """
 
     direct: jax.Array
@@ -63,9 +67,15 @@ class Noise(NamedTuple):
 class Gains(NamedTuple):
     """The filter of a noise at every row, (..., NUM_AXES) each; direct channels before levels.
 
-    keep, push: share of the disturbance that is left after a step, and what it adds to the error of
-    the level. direct_d, direct_e, level_d, level_e: gains of an innovation. direct_scale,
-    level_scale: one over the standard deviations of the innovations.
+    Attributes:
+        keep: share of the disturbance that is left after a step.
+        push: what a step adds to the error of the level, over the disturbance (s).
+        direct_d: gain from a direct innovation to the disturbance.
+        direct_e: gain from a direct innovation to the error of the level.
+        direct_scale: one over the standard deviation of a direct innovation.
+        level_d: gain from a level's innovation to the disturbance.
+        level_e: gain from a level's innovation to the error of the level.
+        level_scale: one over the standard deviation of a level's innovation.
     """
 
     keep: Any
@@ -79,7 +89,13 @@ class Gains(NamedTuple):
 
 
 class Variances(NamedTuple):
-    """Covariance of the filter's state: error of the level, with the disturbance, disturbance."""
+    """Covariance of the filter's state.
+
+    Attributes:
+        level: variance of the level's error.
+        across: covariance of the level's error and the disturbance.
+        disturbance: variance of the disturbance.
+    """
 
     level: Any
     across: Any
@@ -87,10 +103,12 @@ class Variances(NamedTuple):
 
 
 class Conditions(NamedTuple):
-    """What the filter needs to know of rows besides their residuals; floats.
+    """Inputs of the filter at rows besides their residuals; floats.
 
-    step_s: (..., 1), since the row before. is_known: (..., NUM_AXES), 1 where the row continues a
-    flight and no lost command acts. counts: (..., NUM_AXES, 2), 1 for what is judged.
+    Attributes:
+        step_s: time since the row before, (..., 1).
+        is_known: 1 where the row continues a flight and no lost command acts, (..., NUM_AXES).
+        counts: 1 for scored residuals, (..., NUM_AXES, 2).
     """
 
     step_s: Any
@@ -101,7 +119,14 @@ class Conditions(NamedTuple):
 def gains_of_row(
     noise: "Noise", variances: Variances, row: Conditions, keep: Any
 ) -> tuple[Variances, Gains]:
-    """Return the covariance after a row, and the gains at it; keep: exp(-step / tau)."""
+    """Return the covariance after a row, and the gains at it.
+
+    Args:
+        noise: of all axes.
+        variances: the covariance before the row.
+        row: its conditions.
+        keep: exp(-step / tau).
+    """
     joined, new = row.is_known, 1.0 - row.is_known
     stationary = noise.disturbance * noise.disturbance
     push = noise.coupling * row.step_s
@@ -117,7 +142,7 @@ def gains_of_row(
     level_size = e + noise.level * noise.level
     inverse = row.counts[..., 1] / level_size
     level_d, level_e = across * inverse, e * inverse
-    later = Variances(e - level_e * e, across - level_e * across, d - level_d * across)
+    updated = Variances(e - level_e * e, across - level_e * across, d - level_d * across)
     gains = Gains(
         keep=joined * keep,
         push=joined * push,
@@ -128,11 +153,17 @@ def gains_of_row(
         level_e=level_e,
         level_scale=jax.lax.rsqrt(level_size),
     )
-    return later, gains
+    return updated, gains
 
 
 class Filtered(NamedTuple):
-    """State of the filter: summed changes of the level, its error, and the disturbance."""
+    """State of the filter.
+
+    Attributes:
+        level: summed changes of the level.
+        error: of the level.
+        disturbance: the disturbance.
+    """
 
     level: Any
     error: Any
@@ -144,17 +175,25 @@ def innovations_of_row(
 ) -> tuple[Filtered, Any, Any]:
     """Return the state after a row, and its innovations, direct and level.
 
-    residuals: (..., NUM_AXES, 2).
+    Args:
+        state: before the row.
+        residuals: of the row, (..., NUM_AXES, 2).
+        gain: of the row.
+        counts: 1 for scored residuals, (..., NUM_AXES, 2).
     """
     level = state.level + residuals[..., 1]
     disturbance = gain.keep * state.disturbance
     error = state.error + gain.push * disturbance
-    direct = (residuals[..., 0] - disturbance) * counts[..., 0]
-    disturbance = disturbance + gain.direct_d * direct
-    error = error + gain.direct_e * direct
-    off = (level - error) * counts[..., 1]
-    later = Filtered(level, error + gain.level_e * off, disturbance + gain.level_d * off)
-    return later, direct * gain.direct_scale, off * gain.level_scale
+    direct_innovation = (residuals[..., 0] - disturbance) * counts[..., 0]
+    disturbance = disturbance + gain.direct_d * direct_innovation
+    error = error + gain.direct_e * direct_innovation
+    level_innovation = (level - error) * counts[..., 1]
+    updated = Filtered(
+        level,
+        error + gain.level_e * level_innovation,
+        disturbance + gain.level_d * level_innovation,
+    )
+    return updated, direct_innovation * gain.direct_scale, level_innovation * gain.level_scale
 
 
 def conditions_of(chunks: Chunks) -> Conditions:
@@ -199,52 +238,54 @@ class Whitener:
 
     @cached_property
     def _parts(self) -> dict[int, dict[int, tuple[Gains, jax.Array]]]:
-        """The gains and what counts, by first chunk and first row."""
-        nothing = jnp.zeros((NUM_CHUNKS, NUM_AXES))
-        found: dict[int, dict[int, tuple[Gains, jax.Array]]] = {}
+        """The gains and counts, by first chunk and first row."""
+        zeros = jnp.zeros((NUM_CHUNKS, NUM_AXES))
+        gains_by_part: dict[int, dict[int, tuple[Gains, jax.Array]]] = {}
         for chunk, parts in cut_to_size(conditions_of(self._chunks)).items():
-            state, found[chunk] = Variances(nothing, nothing, nothing), {}
+            state, gains_by_part[chunk] = Variances(zeros, zeros, zeros), {}
             for begin, rows in parts.items():
                 state, gains = _gains_of_rows(self._log_noise, state, rows)
-                found[chunk][begin] = gains, rows.counts
-        return found
+                gains_by_part[chunk][begin] = gains, rows.counts
+        return gains_by_part
 
     def __call__(self, residuals: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
-        """Return residuals (models, rows, chunks, axes, 2) as innovations of variance 1.
+        """Return residuals as innovations of variance 1; they are 0 where nothing counts.
 
-        They are 0 where nothing counts. axes: which of ``NUM_AXES`` they are.
+        Args:
+            residuals: (models, rows, chunks, axes, 2).
+            axes: the axes of the residuals, of ``NUM_AXES``.
         """
         num_models, (num_rows, num_chunks) = len(residuals), self._chunks.row.shape
-        filled = -num_models % NUM_MODELS, -num_rows % NUM_ROWS, -num_chunks % NUM_CHUNKS
-        size = np.add((num_models, num_rows, num_chunks), filled)
+        padding = -num_models % NUM_MODELS, -num_rows % NUM_ROWS, -num_chunks % NUM_CHUNKS
+        size = np.add((num_models, num_rows, num_chunks), padding)
         values = np.zeros((size[1], size[0], size[2], NUM_AXES, 2))
         chosen = values[:num_rows, :num_models, :num_chunks, axes]
         chosen[...] = np.moveaxis(residuals, 0, 1)
-        nothing = jnp.zeros((NUM_MODELS, NUM_CHUNKS, NUM_AXES))
+        zeros = jnp.zeros((NUM_MODELS, NUM_CHUNKS, NUM_AXES))
         for (chunk, parts), model in product(self._parts.items(), range(0, size[0], NUM_MODELS)):
-            state = Filtered(nothing, nothing, nothing)
+            state = Filtered(zeros, zeros, zeros)
             for begin, (gains, counts) in parts.items():
-                place = (
+                part = (
                     slice(begin, begin + NUM_ROWS),
                     slice(model, model + NUM_MODELS),
                     slice(chunk, chunk + NUM_CHUNKS),
                 )
-                state, values[place] = _whiten_rows(state, gains, counts, values[place])
+                state, values[part] = _whiten_rows(state, gains, counts, values[part])
         return np.moveaxis(chosen, 0, 1)
 
 
 def cut_to_size(tree: Any) -> dict[int, dict[int, Any]]:
     """Return leaves (rows, chunks, ...) in parts of one size, by first chunk and first row.
 
-    So one program serves logs of any length and rate. What fills parts up is 0.
+    Parts are padded with 0, so that one program serves logs of any length and rate.
     """
     num_rows, num_chunks = jax.tree.leaves(tree)[0].shape[:2]
-    fill = [(0, -num_rows % NUM_ROWS), (0, -num_chunks % NUM_CHUNKS)]
-    padded = jax.tree.map(lambda leaf: np.pad(leaf, fill + [(0, 0)] * (leaf.ndim - 2)), tree)
+    padding = [(0, -num_rows % NUM_ROWS), (0, -num_chunks % NUM_CHUNKS)]
+    padded = jax.tree.map(lambda leaf: np.pad(leaf, padding + [(0, 0)] * (leaf.ndim - 2)), tree)
 
     def part(row: int, chunk: int) -> Any:
-        place = slice(row, row + NUM_ROWS), slice(chunk, chunk + NUM_CHUNKS)
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf[place]), padded)
+        part_slices = slice(row, row + NUM_ROWS), slice(chunk, chunk + NUM_CHUNKS)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[part_slices]), padded)
 
     return {
         chunk: {row: part(row, chunk) for row in range(0, num_rows, NUM_ROWS)}
@@ -253,7 +294,7 @@ def cut_to_size(tree: Any) -> dict[int, dict[int, Any]]:
 
 
 def step_to(chunks: Chunks) -> np.ndarray:
-    """Return the time from the row before, (rows, chunks) s."""
+    """Return the time since the row before (s), (rows, chunks)."""
     step_s = chunks.record.step_s
     return np.concatenate([step_s[:1], step_s[:-1]])
 
@@ -274,11 +315,11 @@ DIFFERENCE = 1e-4  # of logarithms, for slopes
 def _misfit_rows(
     log_noise: jax.Array, state: Any, rows: Conditions, residuals: jax.Array
 ) -> tuple[Any, tuple[jax.Array, jax.Array, jax.Array]]:
-    """Return the state after some rows, and what these add to the misfit of a noise.
+    """Return the state after some rows, and the contributions of these to the misfit of a noise.
 
-    Each axis's misfit (NUM_AXES,), its slopes (6, NUM_AXES) and its expected curvature
-    (NUM_AXES, 6, 6). The misfit is minus twice the log likelihood, outliers counted by their size.
-    Axes do not depend on each other, so that one difference serves all.
+    The contributions are each axis's misfit (NUM_AXES,), its slopes (6, NUM_AXES) and its expected
+    curvature (NUM_AXES, 6, 6). The misfit is minus twice the log likelihood; outliers count by
+    their size. Axes do not depend on each other, so that one difference serves all.
     """
     shifts = DIFFERENCE * jnp.eye(len(log_noise))[:, :, None]
     noise = jax.vmap(noise_of)(jnp.concatenate([log_noise[None], log_noise + shifts]))
@@ -302,8 +343,8 @@ def _misfit_rows(
     misfit = (squares + logs).sum(axis=(0, 2, 4))
 
     def slopes(values: jax.Array, axis: int = 0) -> jax.Array:
-        others = jax.lax.slice_in_dim(values, 1, None, axis=axis)
-        return (others - jax.lax.slice_in_dim(values, 0, 1, axis=axis)) / DIFFERENCE
+        shifted = jax.lax.slice_in_dim(values, 1, None, axis=axis)
+        return (shifted - jax.lax.slice_in_dim(values, 0, 1, axis=axis)) / DIFFERENCE
 
     log_slopes = slopes(logs, axis=1)
     error_slopes = slopes(errors, axis=1) * scale[:, :1]
@@ -313,15 +354,15 @@ def _misfit_rows(
 
 
 class Likelihood:
-    """Residuals of chunks, (rows, chunks, NUM_AXES, 2), whose noise is asked for."""
+    """The likelihood of noises, given residuals of chunks (rows, chunks, NUM_AXES, 2)."""
 
     def __init__(self, chunks: Chunks, residuals: np.ndarray):
         self._parts = cut_to_size((conditions_of(chunks), residuals))
 
     def misfit(self, log_noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the sums of ``_misfit_rows`` over all rows."""
-        nothing = jnp.zeros((1 + len(log_noise), NUM_CHUNKS, NUM_AXES))
-        begin = Variances(*[nothing] * 3), Filtered(*[nothing] * 3)
+        zeros = jnp.zeros((1 + len(log_noise), NUM_CHUNKS, NUM_AXES))
+        begin = Variances(*[zeros] * 3), Filtered(*[zeros] * 3)
         sums = []
         for parts in self._parts.values():
             state = begin
@@ -329,14 +370,14 @@ class Likelihood:
                 state, added = _misfit_rows(log_noise, state, rows, residuals)
                 sums.append(added)
         total, slopes, curvature = (
-            np.sum([np.asarray(one) for one in leaves], axis=0)
+            np.sum([np.asarray(leaf) for leaf in leaves], axis=0)
             for leaves in zip(*sums, strict=True)
         )
         return total, slopes, curvature
 
 
 def floors_of(chunks: Chunks) -> np.ndarray:
-    """Return the least noise of each channel, (2, NUM_AXES): of its last digit, or of float32."""
+    """Return the least noise of each channel, (2, NUM_AXES): of its last digit or of float32."""
     return np.maximum(FLOORS, chunks.quanta * UNIFORM)
 
 
@@ -345,63 +386,63 @@ def least_noise(chunks: Chunks) -> np.ndarray:
     return _bounds(chunks)[0]
 
 
-def first_guess(chunks: Chunks, left: np.ndarray) -> np.ndarray:
-    """Return log noise to start the search from, (6, NUM_AXES), robust against slow residuals."""
+def first_guess(chunks: Chunks, residuals: np.ndarray) -> np.ndarray:
+    """Return a first estimate of log noise, (6, NUM_AXES), robust against slow residuals."""
     counts, floors = chunks.counts, floors_of(chunks)
-    both = counts[1:] & counts[:-1]
-    found = np.zeros((6, NUM_AXES))
+    is_pair = counts[1:] & counts[:-1]
+    guess = np.zeros((6, NUM_AXES))
     for axis in range(NUM_AXES):
-        direct = (left[1:, :, axis, 0] - left[:-1, :, axis, 0])[both[..., axis, 0]]
-        level = left[1:, :, axis, 1][both[..., axis, 1]]
-        for number, change in enumerate((direct, level)):
+        direct = (residuals[1:, :, axis, 0] - residuals[:-1, :, axis, 0])[is_pair[..., axis, 0]]
+        level = residuals[1:, :, axis, 1][is_pair[..., axis, 1]]
+        for channel, change in enumerate((direct, level)):
             spread = np.sqrt(0.5 * np.mean(np.square(change))) if len(change) else 1.0
-            found[number, axis] = np.log(max(spread, floors[number, axis]))
-    found[2], found[3], found[4], found[5] = np.log(0.1), np.log(0.1), np.log(0.3), 0.0
-    return found
+            guess[channel, axis] = np.log(max(spread, floors[channel, axis]))
+    guess[2], guess[3], guess[4], guess[5] = np.log(0.1), np.log(0.1), np.log(0.3), 0.0
+    return guess
 
 
-def disturbance_gain(chunks: Chunks, left: np.ndarray, log_noise: np.ndarray) -> np.ndarray:
-    """Return how much a disturbance lowers minus twice the log likelihood, by axis."""
-    still = log_noise.copy()
-    still[3] = np.log(MIN_DISTURBANCE_RATIO)
-    likelihood = Likelihood(chunks, left)
-    return likelihood.misfit(still)[0] - likelihood.misfit(log_noise)[0]
+def disturbance_gain(chunks: Chunks, residuals: np.ndarray, log_noise: np.ndarray) -> np.ndarray:
+    """Return the decrease of minus twice the log likelihood due to a disturbance, by axis."""
+    without = log_noise.copy()
+    without[3] = np.log(MIN_DISTURBANCE_RATIO)
+    likelihood = Likelihood(chunks, residuals)
+    return likelihood.misfit(without)[0] - likelihood.misfit(log_noise)[0]
 
 
-def total_misfit(chunks: Chunks, left: np.ndarray, log_noise: np.ndarray) -> float:
+def total_misfit(chunks: Chunks, residuals: np.ndarray, log_noise: np.ndarray) -> float:
     """Return minus twice the log likelihood of residuals under a noise."""
-    return float(np.sum(Likelihood(chunks, left).misfit(log_noise)[0]))
+    return float(np.sum(Likelihood(chunks, residuals).misfit(log_noise)[0]))
 
 
-def fit_noise(chunks: Chunks, left: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-    """Return the likeliest noise, (6, NUM_AXES), of residuals (rows, chunks, NUM_AXES, 2).
+def fit_noise(chunks: Chunks, residuals: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+    """Return the likeliest log noise, (6, NUM_AXES), of residuals (rows, chunks, NUM_AXES, 2).
 
-    Fisher scoring with Levenberg damping, every axis by itself.
+    The method is Fisher scoring with Levenberg damping, for each axis by itself.
     """
-    likelihood, (low, high) = Likelihood(chunks, left), _bounds(chunks)
-    best = np.clip(first_guess(chunks, left) if start is None else start, low, high)
+    likelihood, (low, high) = Likelihood(chunks, residuals), _bounds(chunks)
+    best = np.clip(first_guess(chunks, residuals) if start is None else start, low, high)
     misfit, slopes, curvature = likelihood.misfit(best)
     damping = np.full(NUM_AXES, FIRST_DAMPING)
     for _ in range(MAX_ROUNDS):
-        scaled = curvature + 1e-9 * np.eye(6)
-        scaled = scaled + damping[:, None, None] * np.eye(6) * np.maximum(
+        damped = curvature + 1e-9 * np.eye(6)
+        damped = damped + damping[:, None, None] * np.eye(6) * np.maximum(
             np.diagonal(curvature, axis1=1, axis2=2)[:, :, None], 1.0
         )
         is_stuck = ((best <= low) & (slopes > 0.0)) | ((best >= high) & (slopes < 0.0))
-        pull = np.where(is_stuck, 0.0, slopes)
-        scaled = np.where(
-            is_stuck.T[:, :, None] | is_stuck.T[:, None, :], np.eye(6) * scaled, scaled
+        free_slopes = np.where(is_stuck, 0.0, slopes)
+        damped = np.where(
+            is_stuck.T[:, :, None] | is_stuck.T[:, None, :], np.eye(6) * damped, damped
         )
-        step = np.linalg.solve(scaled, pull.T[..., None])[..., 0].T
-        tried = np.clip(best - np.clip(step, -1.0, 1.0), low, high)
-        then, then_slopes, then_curvature = likelihood.misfit(tried)
-        is_better = then < misfit
-        best = np.where(is_better, tried, best)
-        slopes = np.where(is_better, then_slopes, slopes)
-        curvature = np.where(is_better[:, None, None], then_curvature, curvature)
+        step = np.linalg.solve(damped, free_slopes.T[..., None])[..., 0].T
+        trial = np.clip(best - np.clip(step, -1.0, 1.0), low, high)
+        trial_misfit, trial_slopes, trial_curvature = likelihood.misfit(trial)
+        is_better = trial_misfit < misfit
+        best = np.where(is_better, trial, best)
+        slopes = np.where(is_better, trial_slopes, slopes)
+        curvature = np.where(is_better[:, None, None], trial_curvature, curvature)
         damping = np.where(is_better, damping * LESS, damping * MORE)
-        misfit = np.where(is_better, then, misfit)
-        expected = 0.5 * np.sum(pull * step, axis=0)
+        misfit = np.where(is_better, trial_misfit, misfit)
+        expected = 0.5 * np.sum(free_slopes * step, axis=0)
         if np.all(expected < ENOUGH):
             break
     return best

@@ -1,14 +1,14 @@
-"""Causes that begin or end within a log: when, told from constant ones and from slow drift.
+"""Causes that begin or end within a log: their times, and tests against constancy and slow drift.
 
-The scores of an effect, summed up after each second of the log, say what it would gain if it acted
-from there on only, all else constant (the largest of these is a sup-LM test: D. Andrews,
-Econometrica 61, 1993). Where that is more than chance, the search starts anew with windows: the
-likely effects act from then on (or until then), all others throughout. The new model stands if it
-explains clearly more than the constant one, and held-out rows agree. The time is then found to a
-row by profile likelihood, on the rows that are held out as well: one number more that they decide.
+The scores of an effect, summed over the rows after each second of the log, give its gain if it
+acted from there on only, all else constant. (The largest of these is a sup-LM test: D. Andrews,
+Econometrica 61, 1993.) Where that exceeds chance, the search starts anew with windows: the likely
+effects act from then on (or until then), all others throughout. The new model is kept if it
+explains clearly more than the constant one, and held-out rows agree. The time is then estimated to
+a row by profile likelihood, on the held-out rows, too: they determine one more number.
 
-Times are those of one clock. Where a log's time goes back, it is of several flights, and nothing is
-looked for.
+Times are those of one clock. A log whose time goes back is of several flights, and is not searched
+for changes.
 """
 
 from collections.abc import Sequence
@@ -39,21 +39,21 @@ from flytrack_sysid.diagnosis.search import (
 from flytrack_sysid.diagnosis.vetoes import Selection, select
 from flytrack_sysid.log import FlightLog
 
-FALSE_POSITIVE_RATE = 1e-5  # of a change for each effect, where nothing changes
+FALSE_POSITIVE_RATE = 1e-5  # of a change of each effect, if nothing changes
 MIN_SIDE_S = 2.0  # of the log on each side of a change
 MIN_SIDE_FRACTION = 0.04  # of the log there
 NEAR, MAX_NEAR = (
     0.3,
     5,
-)  # of the largest gain: the search chooses among effects that come so near to it
-CLEAR = 10.0  # of minus twice the log likelihood, by which an end has to be likelier than an onset
+)  # of the largest gain: the search chooses among effects with such gains
+CLEAR = 10.0  # of minus twice the log likelihood: an end has to be likelier than an onset by this
 MAX_CHANGES = 3
 ALWAYS, NEVER = Window("").start, Window("").end
 RIDGE = 1e-7  # of a column's own information
-# Of the likelihood ratio of a time of change: its distribution is that of the maximum of a Brownian
-# motion with drift (B. Hansen, Econometrica 68, 2000), not chi2.
+# 95 % quantile of the likelihood ratio of a time of change. Its distribution is that of the maximum
+# of a Brownian motion with drift (B. Hansen, Econometrica 68, 2000), not chi2.
 DROP_95 = -2.0 * float(np.log(1.0 - np.sqrt(0.95)))
-# The profile: seconds about the time, and between the times tried, one after the other.
+# The profile: seconds about the time, and seconds between the times tried, in successive rounds.
 PROFILES = ((8.0, 0.5), (1.0, 0.05), (0.1, 0.01))
 
 
@@ -62,10 +62,13 @@ def threshold(
 ) -> float:
     """Return the sup-LM gain of chi2 that is exceeded with probability ``chance``.
 
-    Source: Andrews 1993, section 5.
+    Source: Andrews 1993, section 5. The tail is that of D. DeLong (Communications in Statistics 10,
+    1981).
 
-    trimmed: share of the log on each side within which no change is looked for. The tail is D.
-    DeLong's (Communications in Statistics 10, 1981).
+    Args:
+        num_parameters: that change.
+        trimmed: share of the log on each side in which no change is searched for.
+        chance: the probability.
     """
     span = 2.0 * np.log((1.0 - trimmed) / trimmed)
 
@@ -81,34 +84,46 @@ def windowed_gains(
     score: np.ndarray,
     information: np.ndarray,
     given: Sequence[int],
-    own: Sequence[int],
+    changing: Sequence[int],
     weights: np.ndarray,
 ) -> np.ndarray:
     """Return the first-order gain of columns that act with a weight in each block, (hypotheses,).
 
-    score, information: (blocks, columns) and (blocks, columns, columns); weights: (hypotheses,
-    blocks). given: the columns that are free throughout.
+    Args:
+        score: by block, (blocks, columns).
+        information: by block, (blocks, columns, columns).
+        given: the columns that are free throughout.
+        changing: the columns that act with the weights.
+        weights: (hypotheses, blocks).
     """
-    given, own = list(given), list(own)
+    given, changing = list(given), list(changing)
     free = information[:, given][:, :, given].sum(axis=0)
     across = np.tensordot(
-        weights, information[:, given][:, :, own], axes=1
-    )  # (hypotheses, given, own)
-    alone = np.tensordot(weights**2, information[:, own][:, :, own], axes=1)
+        weights, information[:, given][:, :, changing], axes=1
+    )  # (hypotheses, given, changing)
+    unprojected = np.tensordot(weights**2, information[:, changing][:, :, changing], axes=1)
     share = solve(free, np.moveaxis(across, 0, 1).reshape(len(given), -1))
-    share = np.moveaxis(share.reshape(len(given), len(weights), len(own)), 1, 0)
-    left = weights @ score[:, own] - np.einsum("hgo,g->ho", share, score[:, given].sum(axis=0))
-    size = np.maximum(np.diagonal(alone, axis1=1, axis2=2), 1e-300)
-    inner = alone - np.swapaxes(across, 1, 2) @ share
-    inner = inner + RIDGE * size[:, None] * np.eye(len(own))
-    return np.einsum("ho,ho->h", left, np.linalg.solve(inner, left[..., None])[..., 0])
+    share = np.moveaxis(share.reshape(len(given), len(weights), len(changing)), 1, 0)
+    projected_score = weights @ score[:, changing] - np.einsum(
+        "hgo,g->ho", share, score[:, given].sum(axis=0)
+    )
+    size = np.maximum(np.diagonal(unprojected, axis1=1, axis2=2), 1e-300)
+    projected = unprojected - np.swapaxes(across, 1, 2) @ share
+    projected = projected + RIDGE * size[:, None] * np.eye(len(changing))
+    return np.einsum(
+        "ho,ho->h", projected_score, np.linalg.solve(projected, projected_score[..., None])[..., 0]
+    )
 
 
 class Hypothesis(NamedTuple):
     """An effect that changes within the log.
 
-    way: "start", "end" or "drift". row: of the record, at which it begins or ends, 0 where it
-    drifts. gain: of chi2 to first order, over its inflation. num_parameters: those that change.
+    Attributes:
+        candidate: the effect.
+        way: "start", "end" or "drift".
+        row: of the record, at which the effect begins or ends; 0 if it drifts.
+        gain: of chi2 to first order, over its inflation.
+        num_parameters: the number that change.
     """
 
     candidate: Candidate
@@ -131,16 +146,19 @@ def seconds_of(chunks: Chunks) -> tuple[np.ndarray, np.ndarray]:
     rows = chunks.row[lead_in_of(len(chunks.row)) :]
     start = rows[:: len(rows) // CHUNK_S].ravel()
     known = np.sort(start[start >= 0])
-    least = int(np.ceil(max(MIN_SIDE_S, MIN_SIDE_FRACTION * len(known))))
-    return start, known[least : len(known) - least + 1]
+    margin = int(np.ceil(max(MIN_SIDE_S, MIN_SIDE_FRACTION * len(known))))
+    return start, known[margin : len(known) - margin + 1]
 
 
 def changes_of(
     linearization: Linearization, model: FittedModel, lacking: Sequence[str]
 ) -> list[Hypothesis]:
-    """Return how effects would change within the log, the likeliest first, one of each effect.
+    """Return the likeliest change of each effect within the log, the likeliest effect first.
 
-    linearization: of the model, along everything. lacking: effects that are not looked for.
+    Args:
+        linearization: of the model, along everything.
+        model: without changes.
+        lacking: effects that are not searched for.
     """
     seconds = seconds_of(linearization.problem.chunks)
     if not len(seconds[1]):
@@ -151,10 +169,10 @@ def changes_of(
             continue
         if candidate.effect in model.effects and candidate != model.candidate(candidate.effect):
             continue
-        found = _change_of(linearization, model, candidate, seconds)
-        if found is not None and found.margin > best.get(candidate.effect, found).margin - 1e-12:
-            best[candidate.effect] = found
-    return sorted(best.values(), key=lambda one: -one.margin)
+        change = _change_of(linearization, model, candidate, seconds)
+        if change is not None and change.margin > best.get(candidate.effect, change).margin - 1e-12:
+            best[candidate.effect] = change
+    return sorted(best.values(), key=lambda hypothesis: -hypothesis.margin)
 
 
 def _change_of(
@@ -163,58 +181,77 @@ def _change_of(
     candidate: Candidate,
     seconds: tuple[np.ndarray, ...],
 ) -> Hypothesis | None:
-    """Return the likeliest change of an effect; None where nothing depends on it.
+    """Return the likeliest change of an effect; None if nothing depends on it.
 
-    seconds: as of ``seconds_of``.
+    Args:
+        linearization: of the model, along everything.
+        model: without changes.
+        candidate: the effect.
+        seconds: as of ``seconds_of``.
     """
     is_named = candidate.effect in model.effects
     columns = [linearization.column(field) for field in candidate.fields]
-    own = linearization.acting(columns if is_named else linearization.columns_of(candidate))
-    if not own:
+    changing = linearization.acting(columns if is_named else linearization.columns_of(candidate))
+    if not changing:
         return None
     given, (start, changes) = linearization.columns_at(model.indices), seconds
     score, information = linearization.score_by_block, linearization.by_block
     after = (start >= changes[:, None]).astype(float)
     ramp = (start - start.min()) / max(np.ptp(start), 1)
-    ways = {"start": after, "end": 1.0 - after, "drift": ramp[None]}
-    gains = {way: windowed_gains(score, information, given, own, one) for way, one in ways.items()}
+    weights = {"start": after, "end": 1.0 - after, "drift": ramp[None]}
+    gains = {
+        way: windowed_gains(score, information, given, changing, one)
+        for way, one in weights.items()
+    }
     way = max(gains, key=lambda one: gains[one].max())
     index = int(np.argmax(gains[way]))
-    inflation = _inflation(score, information, given, own, ways[way][index])
+    inflation = _inflation(score, information, given, changing, weights[way][index])
     row = int(changes[index]) if way != "drift" else 0
-    return Hypothesis(candidate, way, row, float(gains[way][index]) / inflation, len(own))
+    return Hypothesis(candidate, way, row, float(gains[way][index]) / inflation, len(changing))
 
 
 def _inflation(
     score: np.ndarray,
     information: np.ndarray,
     given: Sequence[int],
-    own: Sequence[int],
+    changing: Sequence[int],
     weight: np.ndarray,
 ) -> float:
-    """Return how much more the scores of blocks vary than information says, with the change put in.
+    """Return how much more the scores of blocks vary than information says, with the change fitted.
 
-    Arguments as in ``windowed_gains``; weight: (blocks,).
+    Args:
+        score: as in ``windowed_gains``.
+        information: as in ``windowed_gains``.
+        given: as in ``windowed_gains``.
+        changing: as in ``windowed_gains``.
+        weight: of the change, (blocks,).
     """
     free = information[:, given][:, :, given]
-    across = weight[:, None, None] * information[:, given][:, :, own]
-    alone = weight[:, None, None] ** 2 * information[:, own][:, :, own]
+    across = weight[:, None, None] * information[:, given][:, :, changing]
+    unprojected = weight[:, None, None] ** 2 * information[:, changing][:, :, changing]
     share = solve(free.sum(axis=0), across.sum(axis=0))
-    crossed = np.swapaxes(across, 1, 2) @ share
-    by_block = alone - crossed - np.swapaxes(crossed, 1, 2) + share.T @ free @ share
-    inner = by_block.sum(axis=0)
-    left = weight[:, None] * score[:, own] - score[:, given] @ share
-    step = solve(inner + RIDGE * np.diag(np.diag(alone.sum(axis=0))), left.sum(axis=0))
-    return inflation_of(inner, left - by_block @ step)
+    cross_terms = np.swapaxes(across, 1, 2) @ share
+    by_block = unprojected - cross_terms - np.swapaxes(cross_terms, 1, 2) + share.T @ free @ share
+    projected = by_block.sum(axis=0)
+    projected_score = weight[:, None] * score[:, changing] - score[:, given] @ share
+    step = solve(
+        projected + RIDGE * np.diag(np.diag(unprojected.sum(axis=0))), projected_score.sum(axis=0)
+    )
+    return inflation_of(projected, projected_score - by_block @ step)
 
 
 def is_one_flight(log: FlightLog) -> bool:
-    """Return whether a log's time runs on from its first row to its last, as in one flight."""
+    """Return whether a log's time increases from its first row to its last, as in one flight."""
     return bool(np.all(np.diff(log.time) > 0.0))
 
 
 class Profile(NamedTuple):
-    """Minus twice the log likelihood by row of the record at which a change was tried, sorted."""
+    """The profile likelihood of the row of a change.
+
+    Attributes:
+        rows: of the record, at which a change was tried, sorted.
+        costs: minus twice the log likelihood of each.
+    """
 
     rows: np.ndarray
     costs: np.ndarray
@@ -227,7 +264,7 @@ class Profile(NamedTuple):
     def ends95(self, inflation: float) -> tuple[int, int]:
         """Return the 95 % interval of the row.
 
-        It reaches from the last row tried before the likely ones to the first one after them.
+        It extends from the last row tried before the likely ones to the first one after them.
         """
         likely = np.flatnonzero(self.costs < self.costs.min() + DROP_95 * inflation)
         low, high = max(likely[0] - 1, 0), min(likely[-1] + 1, len(self.rows) - 1)
@@ -235,13 +272,17 @@ class Profile(NamedTuple):
 
 
 def profile_of(problem: Problem, test: Problem, vector: np.ndarray, row: int) -> Profile:
-    """Return how likely it is that what changes at a row changes at others; the vector stays.
+    """Return the profile likelihood of a change's row, with the vector fixed.
 
-    test: of rows held out, which decide as well.
+    Args:
+        problem: with the windows.
+        test: of held-out rows, which are used as well.
+        vector: the model.
+        row: at which the change is in ``problem``.
     """
     step_s = float(np.median(problem.chunks.record.step_s))
     problems = problem, replace(test, windows=problem.windows).with_noise(problem.noise)
-    # As if what changes at the row changed after the log, and before it.
+    # Residuals with the change after the log, and before it.
     sides = [
         [moved(one, row, to).residuals(vector[None])[0] for to in (NEVER, ALWAYS)]
         for one in problems
@@ -249,15 +290,17 @@ def profile_of(problem: Problem, test: Problem, vector: np.ndarray, row: int) ->
     known: dict[int, float] = {}
     for reach_s, every_s in PROFILES:
         centre = min(known, key=lambda tried: known[tried]) if known else row
-        every = max(round(every_s / step_s), 1)
-        reach = max(round(reach_s / step_s), every)
+        spacing = max(round(every_s / step_s), 1)
+        reach = max(round(reach_s / step_s), spacing)
         tried = [
-            one for one in range(centre - reach, centre + reach + 1, every) if one not in known
+            one for one in range(centre - reach, centre + reach + 1, spacing) if one not in known
         ]
         costs = np.zeros(len(tried))
-        for own, (before, after) in zip(problems, sides, strict=True):
-            is_after = own.chunks.row[..., None, None] >= np.array(tried)[:, None, None, None, None]
-            white = own.whiten(np.where(is_after, after, before))
+        for part, (before, after) in zip(problems, sides, strict=True):
+            is_after = (
+                part.chunks.row[..., None, None] >= np.array(tried)[:, None, None, None, None]
+            )
+            white = part.whiten(np.where(is_after, after, before))
             costs += [robust_square(one) for one in white]
         known |= dict(zip(tried, costs.tolist(), strict=True))
     rows = np.array(sorted(known))
@@ -267,17 +310,17 @@ def profile_of(problem: Problem, test: Problem, vector: np.ndarray, row: int) ->
 def log_rows(problem: Problem, test: Problem, rows: Sequence[int]) -> np.ndarray:
     """Return the rows of the log, as fractions, of rows of the record."""
     chunks = problem.chunks, test.chunks
-    own = np.concatenate([one.row.ravel() for one in chunks])
-    source = np.concatenate([one.record.source_row.ravel() for one in chunks])
-    known = (own >= 0) & (source >= 0)
-    order = np.argsort(own[known])
-    return np.interp(rows, own[known][order], source[known][order])
+    rows_of_record = np.concatenate([part.row.ravel() for part in chunks])
+    source = np.concatenate([part.record.source_row.ravel() for part in chunks])
+    known = (rows_of_record >= 0) & (source >= 0)
+    order = np.argsort(rows_of_record[known])
+    return np.interp(rows, rows_of_record[known][order], source[known][order])
 
 
 def spans_of(selection: Selection, test: Problem, log: FlightLog) -> dict[str, dict[str, Any]]:
-    """Return, by effect, when those act that do so in a part of a log only, as fields of a cause.
+    """Return the onset and end of effects with windows, by effect, as fields of a cause.
 
-    Onset and end, s of the log's clock, with their 95 % intervals; None without.
+    Both are in seconds of the log's clock, with 95 % intervals; None if there is no onset or end.
     """
     problem, vector = selection.state.problem, selection.model.vector
 
@@ -290,42 +333,55 @@ def spans_of(selection: Selection, test: Problem, log: FlightLog) -> dict[str, d
         return Estimated(value, (low, high), "s")
 
     return {
-        one.effect: {
-            "onset_s": time_of(one.effect, one.start),
-            "end_s": time_of(one.effect, one.end),
+        window.effect: {
+            "onset_s": time_of(window.effect, window.start),
+            "end_s": time_of(window.effect, window.end),
         }
-        for one in windows_of(selection)
+        for window in windows_of(selection)
     }
 
 
 def windows_of(selection: Selection) -> list[Window]:
     """Return the windows of a selected model's effects."""
-    return [one for one in selection.state.problem.windows if one.effect in selection.model.effects]
+    return [
+        window
+        for window in selection.state.problem.windows
+        if window.effect in selection.model.effects
+    ]
 
 
 def ended(selection: Selection) -> list[str]:
-    """Return the effects that act no longer at the end of the log."""
-    return [one.effect for one in windows_of(selection) if one.end != NEVER]
+    """Return the effects that end within the log."""
+    return [window.effect for window in windows_of(selection) if window.end != NEVER]
 
 
 def at_end(selection: Selection, model: FittedModel) -> FittedModel:
-    """Return the model without the effects that act no longer at the end of the log."""
+    """Return the model without the effects that end within the log."""
     gone = ended(selection)
-    candidates = tuple(one for one in model.candidates if one.effect not in gone)
+    candidates = tuple(candidate for candidate in model.candidates if candidate.effect not in gone)
     vector = selection.state.problem.without(model.vector, gone)
     return model._replace(candidates=candidates, vector=vector)
 
 
 def first_row_as_at_end(selection: Selection, test: Problem) -> int:
-    """Return the row of the log from which on the effects act that do so at its end."""
-    rows = {row for one in windows_of(selection) for row in (one.start, one.end)} - {ALWAYS, NEVER}
+    """Return the row of the log after which the same effects act as at its end."""
+    rows = {row for window in windows_of(selection) for row in (window.start, window.end)} - {
+        ALWAYS,
+        NEVER,
+    }
     return int(np.ceil(log_rows(selection.state.problem, test, [max(rows)])[0])) if rows else 0
 
 
 def notes_of(selection: Selection, linearization: Linearization, log: FlightLog) -> list[str]:
-    """Return what a reader must know of changes within the log; linearization: of the model."""
-    spans, notes = windows_of(selection), []
-    begun = [one.effect for one in spans if one.end == NEVER]
+    """Return notes on changes within the log.
+
+    Args:
+        selection: the selected model.
+        linearization: of the model.
+        log: that was diagnosed.
+    """
+    windows, notes = windows_of(selection), []
+    begun = [window.effect for window in windows if window.end == NEVER]
     if begun:
         notes.append(
             f"the extended model has {', '.join(begun)} as at the end of the log, from the start on"
@@ -334,28 +390,38 @@ def notes_of(selection: Selection, linearization: Linearization, log: FlightLog)
     if gone:
         notes.append(f"not in the extended model: {', '.join(gone)}, which ended within the log")
     lacking = (*selection.state.unobservable, *selection.state.refused)
-    left = changes_of(linearization, selection.model, lacking) if is_one_flight(log) else []
-    if left and left[0].margin > 0.0:
-        name, how = left[0].candidate.effect, "drifts" if left[0].way == "drift" else "changes"
+    further = changes_of(linearization, selection.model, lacking) if is_one_flight(log) else []
+    if further and further[0].margin > 0.0:
+        name, how = (
+            further[0].candidate.effect,
+            "drifts" if further[0].way == "drift" else "changes",
+        )
         value = ": its value is a mean" if name in selection.model.effects else ""
         notes.append(f"{name} {how} within the log{value}")
     return notes
 
 
 def moved(problem: Problem, row: int, to: int) -> Problem:
-    """Return the problem with what begins or ends at a row doing so at another one."""
+    """Return the problem with the changes at a row moved to another row."""
 
     def at(old: int) -> int:
         return to if old == row else old
 
-    windows = tuple(one._replace(start=at(one.start), end=at(one.end)) for one in problem.windows)
+    windows = tuple(
+        window._replace(start=at(window.start), end=at(window.end)) for window in problem.windows
+    )
     return replace(problem, windows=windows)
 
 
 def with_changes(selection: Selection, test: Problem, log: FlightLog) -> Selection:
     """Return the selection with effects that begin or end within the log, if clearly better.
 
-    test: rows held out. A selection whose effects are constant is returned as it is.
+    A selection whose effects are constant is returned as it is.
+
+    Args:
+        selection: without these changes.
+        test: held-out rows.
+        log: that is searched.
     """
     for _ in range(MAX_CHANGES if is_one_flight(log) else 0):
         later = _with_change(selection, test)
@@ -366,14 +432,14 @@ def with_changes(selection: Selection, test: Problem, log: FlightLog) -> Selecti
 
 
 def _with_change(selection: Selection, test: Problem) -> Selection | None:
-    """Return the selection with one change more; None where none is clear."""
+    """Return the selection with one more change; None if no change is clear."""
     state, linearization = selection.state.linearized(selection.model.vector)
-    found = changes_of(linearization, selection.model, (*state.unobservable, *state.refused))
-    if not found or found[0].margin < 0.0 or found[0].way == "drift":
+    changes = changes_of(linearization, selection.model, (*state.unobservable, *state.refused))
+    if not changes or changes[0].margin < 0.0 or changes[0].way == "drift":
         return None
     first, near = (
-        found[0],
-        [one for one in found if one.way != "drift" and one.gain > NEAR * found[0].gain],
+        changes[0],
+        [one for one in changes if one.way != "drift" and one.gain > NEAR * changes[0].gain],
     )
     state, model = _likeliest_side(
         selection, first, [one.candidate.effect for one in near[:MAX_NEAR]]
@@ -381,31 +447,33 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     state, model = with_noise_of(_at_best_row(state, test, model, first.row), model)
     state, base, model = extended(state, state.fitted((), selection.base.vector), model)
     named = tuple(one for one in state.problem.windows if one.effect in model.effects)
-    now, before = (
+    new_rows, old_rows = (
         {row for one in windows for row in (one.start, one.end)}
         for windows in (named, selection.state.problem.windows)
     )
-    rows = now - before - {ALWAYS, NEVER}
+    rows = new_rows - old_rows - {ALWAYS, NEVER}
     if not rows:
         return None
     state = _at_best_row(windowed(state, named), test, model, max(rows))
     later = select(state, base, state.fitted(model.candidates, model.vector))
-    lost = [
+    misfit_changes = [
         misfit(later, problem) - misfit(selection, problem)
         for problem in (selection.state.problem, test)
     ]
     price = PER_PARAMETER * (later.model.num_priced - selection.model.num_priced)
-    is_better = lost[0] + price < -threshold(first.num_parameters) and lost[1] < 0.0
+    is_better = (
+        misfit_changes[0] + price < -threshold(first.num_parameters) and misfit_changes[1] < 0.0
+    )
     return later if is_better else None
 
 
 def misfit(selection: Selection, problem: Problem) -> float:
     """Return minus twice the log likelihood of a problem under a selection and its noise."""
     state, chunks = selection.state, problem.chunks
-    left = replace(problem, windows=state.problem.windows).residuals(selection.model.vector[None])[
-        0
-    ]
-    return noises.total_misfit(chunks, left, state.problem.noise)
+    residuals = replace(problem, windows=state.problem.windows).residuals(
+        selection.model.vector[None]
+    )[0]
+    return noises.total_misfit(chunks, residuals, state.problem.noise)
 
 
 def windowed(state: SearchState, windows: Sequence[Window]) -> SearchState:
@@ -419,8 +487,8 @@ def _likeliest_side(
 ) -> tuple[SearchState, FittedModel]:
     """Return a state in which effects begin, or end, at the row of a change, and a model of it.
 
-    The model has the change's effect and those that have changed before. Where both sides are as
-    likely, as of a scale of what is fitted besides, the effect begins.
+    The model has the change's effect and those with earlier changes. If both sides are as likely,
+    as with a scale of something that is fitted besides, the effect begins.
     """
     old = {one.effect: one for one in selection.state.problem.windows}
     kept = [one for one in selection.model.candidates if one.effect in old]
@@ -429,8 +497,8 @@ def _likeliest_side(
     def trial(start: int, end: int) -> tuple[SearchState, FittedModel]:
         windows = dict(old)
         for effect in near:
-            own = old.get(effect, Window(effect))
-            windows[effect] = Window(effect, max(start, own.start), min(end, own.end))
+            old_window = old.get(effect, Window(effect))
+            windows[effect] = Window(effect, max(start, old_window.start), min(end, old_window.end))
         state = windowed(selection.state, tuple(windows.values()))
         return state, state.fitted(candidates, selection.base.vector)
 
@@ -439,6 +507,6 @@ def _likeliest_side(
 
 
 def _at_best_row(state: SearchState, test: Problem, model: FittedModel, row: int) -> SearchState:
-    """Return the state with what begins or ends at a row doing so at the likeliest row."""
+    """Return the state with the changes at a row moved to the likeliest row."""
     best = profile_of(state.problem, test, model.vector, row).best
     return windowed(state, moved(state.problem, row, best).windows)

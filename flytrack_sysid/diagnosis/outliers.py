@@ -1,8 +1,7 @@
-"""Outliers by channel: isolated rows far beyond the noise, and more than chance brings about.
+"""Outliers by channel: isolated rows far beyond the noise, and more than chance explains.
 
 They count by their size instead of its square (``problem.robust_weight``), so that a few do no
-harm; a reader has to know of them all the same. Errors of a model last, so only runs of a few rows
-count.
+harm. They are still reported. Errors of a model last, so only runs of a few rows are outliers.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,37 +14,43 @@ from flytrack_sysid.diagnosis.noise import OUTLIER
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import CHANNELS, Outliers
 
-MAX_RUN_LENGTH = 3  # rows: the filter that whitens takes in part of an outlier and gives it back
-FALSE_POSITIVE_RATE = 1e-6  # of so many, were the noise normal
-MIN_ROW_FRACTION = 1e-3  # of rows: fewer change nothing
+MAX_RUN_LENGTH = 3  # rows: the whitening filter absorbs a part of an outlier and returns it later
+FALSE_POSITIVE_RATE = 1e-6  # of this many outliers, if the noise is normal
+MIN_ROW_FRACTION = 1e-3  # of rows: fewer have no effect
 
 
 def outliers_of(problems: Sequence[Problem], vector: np.ndarray) -> dict[str, Outliers]:
-    """Return the outliers of a model's residuals by channel, of those that have some.
+    """Return the outliers of a model's residuals, by channel that has some.
 
-    problems: with a noise; their rows are counted together.
+    Args:
+        problems: with a noise; their rows are counted together.
+        vector: the model.
     """
     parts = [(problem.whitened_residuals(vector)[0], problem.counts) for problem in problems]
-    found = {}
+    result = {}
     for axes, names in zip(AXES, CHANNELS, strict=True):
         for side, name in enumerate(names):
             if name is None:
                 continue
             counted = [counts[:, :, axes, side].any(axis=-1) for _, counts in parts]
-            number = sum(int(each.sum()) for each in counted)
+            num_rows = sum(int(rows.sum()) for rows in counted)
             far = [np.abs(white[:, :, axes, side]).max(axis=-1) > OUTLIER for white, _ in parts]
-            alone = sum(_short_runs(each) for each in far)
-            by_chance = number * (axes.stop - axes.start) * 2.0 * stats.norm.sf(OUTLIER)
+            num_isolated = sum(_short_runs(rows) for rows in far)
+            by_chance = num_rows * (axes.stop - axes.start) * 2.0 * stats.norm.sf(OUTLIER)
             if (
-                alone > MIN_ROW_FRACTION * number
-                and stats.poisson.sf(alone - 1, by_chance) < FALSE_POSITIVE_RATE
+                num_isolated > MIN_ROW_FRACTION * num_rows
+                and stats.poisson.sf(num_isolated - 1, by_chance) < FALSE_POSITIVE_RATE
             ):
-                found[name] = Outliers(alone, number)
-    return found
+                result[name] = Outliers(num_isolated, num_rows)
+    return result
 
 
 def _short_runs(is_far: np.ndarray) -> int:
-    """Return how many rows, (rows, chunks) bool, lie in runs of at most ``MAX_RUN_LENGTH``."""
+    """Return the number of rows in runs of at most ``MAX_RUN_LENGTH``.
+
+    Args:
+        is_far: rows beyond the noise, (rows, chunks) bool.
+    """
     edges = np.diff(np.pad(is_far, ((1, 1), (0, 0))).astype(int), axis=0)
     starts, ends = (np.argwhere(sign == edges.T)[:, 1] for sign in (1, -1))
     lengths = ends - starts
@@ -53,8 +58,10 @@ def _short_runs(is_far: np.ndarray) -> int:
 
 
 def outlier_notes(outliers: Mapping[str, Outliers]) -> list[str]:
-    """Return a sentence on the outliers; none where there are none."""
+    """Return a sentence on the outliers, if there are any."""
     if not outliers:
         return []
-    listed = ", ".join(f"{one.rows} of {one.of} rows of {name}" for name, one in outliers.items())
+    listed = ", ".join(
+        f"{counts.rows} of {counts.of} rows of {name}" for name, counts in outliers.items()
+    )
     return [f"outliers, beyond {OUTLIER:g} times the noise, count less: {listed}"]

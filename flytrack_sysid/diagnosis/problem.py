@@ -1,8 +1,8 @@
-"""A log and all that its model may be: residuals, slopes and whitening for parameter vectors.
+"""A log and its possible models: residuals, slopes and whitening for parameter vectors.
 
 One program replays pairs of a model and a chunk, some rows at a time, whatever the length, rate and
 channels of a log. Each model has every effect of the list; a model without an effect has it at its
-neutral value. So no set of effects needs a compilation of its own.
+neutral value. So all sets of effects share one compilation.
 
 ========  ==============================================================================  =======
 channel   residual of a row                                                               unit
@@ -36,8 +36,8 @@ from flytrack_sysid.record import Record
 from flytrack_sysid.replay import Step, replay, start_replay
 from flytrack_sysid.trace_cache import keep_trace
 
-# What a replay can show, whatever the craft: it is fed with poses, so that how late these are has
-# to be known before.
+# The effects that a replay can show of any craft. It is fed with poses, so their lateness has to be
+# known before.
 SEARCHED = tuple(
     effect for effect in EFFECTS if "pose" not in effect.hooks and not effect.search.is_setting
 )
@@ -55,10 +55,14 @@ def _turn(measured: Quaternion, predicted: Quaternion) -> Vec3:
 
 
 class Measured(NamedTuple):
-    """What was measured at a row, (..., size).
+    """Measurements at a row, (..., size).
 
-    gyro_b: rad/s, NaN where the log has none. force_b: m/s^2, body, 0 where there is no
-    accelerometer.
+    Attributes:
+        quat: attitude.
+        vel_w: velocity, world (m/s).
+        battery_v: voltage (V).
+        gyro_b: rates, body (rad/s); NaN where the log has none.
+        force_b: specific force, body (m/s^2); 0 where there is no accelerometer.
     """
 
     quat: Any
@@ -69,7 +73,13 @@ class Measured(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Rows of chunks, the gyro at them, and what was measured at the rows after them."""
+    """Rows of chunks, and measurements.
+
+    Attributes:
+        row: the rows.
+        gyro_b: rates at the rows, body (rad/s).
+        later: the measurements at the rows after them.
+    """
 
     row: Record
     gyro_b: Any
@@ -79,11 +89,11 @@ class Rows(NamedTuple):
 def _of_step(step: Step, measured: Measured) -> jax.Array:
     """Return the residuals of the row after a step, (NUM_AXES, 2)."""
     row, before, after = step.row, step.before, step.after
-    read = read_sensors(step.moved, step.model)
+    sensors = read_sensors(step.moved, step.model)
     to_world = before.quat.rotate  # whatever attitude the sensors' force had
-    rates = to_world(Vec3(*jnp.nan_to_num(measured.gyro_b)) - read.rates_b)
+    rates = to_world(Vec3(*jnp.nan_to_num(measured.gyro_b)) - sensors.rates_b)
     turn = _turn(Quaternion(*measured.quat), after.quat)
-    force = to_world(Vec3(*measured.force_b) - read.force_b)
+    force = to_world(Vec3(*measured.force_b) - sensors.force_b)
     vel_change = Vec3(*measured.vel_w) - before.vel_w - after.acc_w.scale(row.step_s)
     voltage_change = measured.battery_v - after.battery_v
     direct, level = (*rates, *force, 0.0), (*turn, *vel_change, voltage_change)
@@ -95,7 +105,13 @@ States = tuple[jax.Array, ...]  # leaves of the states of pairs, (NUM_PAIRS, ...
 
 @jax.jit
 def _start_states(vectors: jax.Array, like: ModelParameters, row: Record) -> States:
-    """Return the states before the first rows of pairs; row: leaves (NUM_PAIRS, ...)."""
+    """Return the states before the first rows of pairs.
+
+    Args:
+        vectors: the model of each pair, (NUM_PAIRS, parameters).
+        like: the model whose parameters the vectors have.
+        row: leaves (NUM_PAIRS, ...).
+    """
     start = jax.vmap(lambda vector, row: start_replay(from_vector(vector, like), row))
     return tuple(jax.tree.leaves(start(vectors, row)))
 
@@ -106,8 +122,12 @@ def _replay_rows(
 ) -> tuple[States, jax.Array]:
     """Return the states of pairs after some rows, and (rows, NUM_PAIRS, NUM_AXES, 2) residuals.
 
-    vectors: (NUM_PAIRS, parameters), the model of each pair, in the order of
-    ``parameters.names_of(like)``. rows: leaves (rows, NUM_PAIRS, ...), the chunk of each pair.
+    Args:
+        vectors: the model of each pair, (NUM_PAIRS, parameters), in the order of
+            ``parameters.names_of(like)``.
+        like: the model whose parameters the vectors have.
+        states: before the rows.
+        rows: the chunk of each pair, leaves (rows, NUM_PAIRS, ...).
     """
 
     def of_pair(vector: jax.Array, leaves: States, rows: Rows) -> Any:
@@ -122,9 +142,11 @@ def _replay_rows(
 
 
 class Batch(NamedTuple):
-    """What ``NUM_PAIRS`` pairs of a model and a chunk are replayed with.
+    """Rows with which ``NUM_PAIRS`` pairs of a model and a chunk are replayed.
 
-    first: the first row of each pair's chunk. parts: all rows, ``NUM_ROWS`` at a time.
+    Attributes:
+        first: the first row of each pair's chunk.
+        parts: all rows, ``NUM_ROWS`` at a time.
     """
 
     first: Record
@@ -147,7 +169,7 @@ class Batches:
         self._known: dict[int, Batch] = {}
 
     def at(self, first_pair: int) -> Batch:
-        """Return the batch that begins with a pair, made once for each chunk it begins with."""
+        """Return the batch that begins with a pair; it is made once for each first chunk."""
         first_chunk = first_pair % self._num_chunks
         if first_chunk not in self._known:
             self._known[first_chunk] = self._beginning_with(first_chunk)
@@ -168,9 +190,14 @@ class Batches:
 
 
 class Window(NamedTuple):
-    """When an effect acts: in the steps to the rows of the record from ``start`` up to ``end``.
+    """The window of a log in which an effect acts.
 
     Outside, the effect is as in the given model.
+
+    Attributes:
+        effect: its name.
+        start: the effect acts from the step to this row of the record on.
+        end: the effect no longer acts in the step to this row.
     """
 
     effect: str
@@ -181,9 +208,11 @@ class Window(NamedTuple):
 class Slopes(NamedTuple):
     """A model's residuals, and how they change along columns, not whitened.
 
-    residuals: (rows, chunks, NUM_AXES, 2). columns: (num_columns, rows, chunks, NUM_AXES, 2).
-
-    indices: the parameters of the first columns; ways to other vectors follow.
+    Attributes:
+        vector: the model.
+        residuals: (rows, chunks, NUM_AXES, 2).
+        indices: the parameters of the first columns; ways to other vectors follow.
+        columns: (num_columns, rows, chunks, NUM_AXES, 2).
     """
 
     vector: np.ndarray
@@ -194,13 +223,22 @@ class Slopes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Judged rows of a log and a noise, for models as vectors in the order of ``names``.
+    """Scored rows of a log and a noise, for models as vectors in the order of ``names``.
 
-    like: the nominal model with every effect, float64. given_effects: those that the nominal model
-    has. low, high, scale: of each parameter, its bounds and the size of its steps. noise: (6,
-    NUM_AXES), as of ``noise.fit_noise``, and its filter; the least one before ``with_noise``. late:
-    of chunks whose poses were corrected. windows: of the effects that act for a part of the log
-    only.
+    Attributes:
+        chunks: the rows.
+        like: the nominal model with every effect, float64.
+        given_effects: those that the nominal model has.
+        names: of the parameters.
+        start: the nominal model's parameters.
+        low: the lower bound of each parameter.
+        high: the upper bound of each parameter.
+        scale: the size of each parameter's steps.
+        batches: the rows, as they are replayed.
+        noise: as of ``noise.fit_noise``, (6, NUM_AXES); the least one before ``with_noise``.
+        whitener: the filter of the noise.
+        late: of chunks whose poses were corrected.
+        windows: of the effects that act for a part of the log only.
     """
 
     chunks: Chunks
@@ -227,18 +265,22 @@ class Problem:
     ) -> Self:
         """Return the problem of chunks and a nominal model, with the least noise.
 
-        effects: those that the model may have.
+        Args:
+            chunks: the rows.
+            model: the nominal one.
+            effects: those that the model may have.
+            late: of chunks whose poses were corrected.
         """
         model = as_replayed(model)
-        every = model.with_effects(*(model.effect(effect.name) for effect in effects))
-        like = jax.tree.map(lambda leaf: np.asarray(leaf, float), every)
+        with_all_effects = model.with_effects(*(model.effect(effect.name) for effect in effects))
+        like = jax.tree.map(lambda leaf: np.asarray(leaf, float), with_all_effects)
         names, start = names_of(like), to_vector(like)
         low, high = np.array([range_of(name)[:2] for name in names]).T
         noise = noises.least_noise(chunks)
         return cls(
             chunks=chunks,
             like=like,
-            given_effects=tuple(effect_of(one).name for one in model.effects),
+            given_effects=tuple(effect_of(given_effect).name for given_effect in model.effects),
             names=names,
             start=start,
             low=low,
@@ -251,7 +293,11 @@ class Problem:
         )
 
     def with_noise(self, noise: np.ndarray) -> "Problem":
-        """Return the same problem, weighted by a noise, (6, NUM_AXES)."""
+        """Return the same problem, weighted by a noise.
+
+        Args:
+            noise: as of ``noise.fit_noise``, (6, NUM_AXES).
+        """
         return replace(self, noise=noise, whitener=noises.Whitener(self.chunks, noise))
 
     def with_chunks(self, chunks: Chunks) -> "Problem":
@@ -260,7 +306,7 @@ class Problem:
         return replace(self, chunks=chunks, batches=Batches(chunks), whitener=whitener)
 
     def with_law(self, law: LearnedLaw) -> "Problem":
-        """Return the problem whose vectors end with the numbers of a law.
+        """Return the problem whose vectors end with the parameters of a law.
 
         At the start, the scale of the law is 0.
         """
@@ -292,28 +338,28 @@ class Problem:
 
     @property
     def counts(self) -> np.ndarray:
-        """What is to be explained, (rows, chunks, NUM_AXES, 2) bool."""
+        """The residuals to explain, (rows, chunks, NUM_AXES, 2) bool."""
         return self.chunks.counts
 
     def residuals(self, vectors: np.ndarray) -> np.ndarray:
         """Return residuals (num_models, rows, chunks, NUM_AXES, 2) of models.
 
-        vectors: (num_models, parameters).
+        Rows outside an effect's window come from another replay, which has no memory of the effect.
 
-        Where an effect's window ends, rows come from another replay: nothing of the effect is
-        remembered.
+        Args:
+            vectors: the models, (num_models, parameters).
         """
-        found = self._composed(vectors) if self.windows else self._replayed(vectors)
-        return found if self.late is None else self.late.residuals(found)
+        result = self._composed(vectors) if self.windows else self._replayed(vectors)
+        return result if self.late is None else self.late.residuals(result)
 
     def _replayed(self, vectors: np.ndarray) -> np.ndarray:
         rows, chunks = self.chunks.row.shape
-        number = len(vectors) * chunks
-        pairs = np.zeros((rows, number, NUM_AXES, 2))
-        for first in range(0, number, NUM_PAIRS):
-            own = np.minimum(first + np.arange(NUM_PAIRS), number - 1)
-            found = self._replay_pairs(vectors[own // chunks], self.batches.at(first))
-            pairs[1:, first : first + NUM_PAIRS] = found[:, : number - first]
+        num_pairs = len(vectors) * chunks
+        pairs = np.zeros((rows, num_pairs, NUM_AXES, 2))
+        for first in range(0, num_pairs, NUM_PAIRS):
+            pair_numbers = np.minimum(first + np.arange(NUM_PAIRS), num_pairs - 1)
+            residuals = self._replay_pairs(vectors[pair_numbers // chunks], self.batches.at(first))
+            pairs[1:, first : first + NUM_PAIRS] = residuals[:, : num_pairs - first]
         result = np.swapaxes(pairs.reshape(rows, len(vectors), chunks, NUM_AXES, 2), 0, 1)
         result *= self.chunks.is_joined[..., None, None]
         for name, axes in zip(("w", "f"), AXES, strict=False):
@@ -330,36 +376,40 @@ class Problem:
         return np.concatenate(parts)[: len(self.chunks.row) - 1]
 
     def _composed(self, vectors: np.ndarray) -> np.ndarray:
-        """Return residuals of models whose effects act in windows; each row is of one replay."""
-        found = self._replayed(vectors)
+        """Return residuals of models with windows of effects; each row is of one replay."""
+        result = self._replayed(vectors)
         row = self.chunks.row
-        acts = np.stack([(row >= one.start) & (row < one.end) for one in self.windows])
+        acts = np.stack([(row >= window.start) & (row < window.end) for window in self.windows])
         for acting in np.unique(acts.reshape(len(acts), -1), axis=1).T:
             if not acting.all():
-                still = [
-                    one.effect for one, is_on in zip(self.windows, acting, strict=True) if not is_on
+                inactive = [
+                    window.effect
+                    for window, is_on in zip(self.windows, acting, strict=True)
+                    if not is_on
                 ]
-                there = (acts == acting[:, None, None]).all(axis=0)
-                found = np.where(
-                    there[..., None, None], self._replayed(self.without(vectors, still)), found
+                is_here = (acts == acting[:, None, None]).all(axis=0)
+                result = np.where(
+                    is_here[..., None, None],
+                    self._replayed(self.without(vectors, inactive)),
+                    result,
                 )
-        return found
+        return result
 
     def without(self, vectors: np.ndarray, effects: Sequence[str]) -> np.ndarray:
-        """Return vectors, (..., parameters), with some effects as in the given model."""
+        """Return vectors (..., parameters) with some effects as in the given model."""
         return self.at_start(
             vectors, [name for name in self.names if name.split(".")[0] in effects]
         )
 
     def at_start(self, vectors: np.ndarray, fields: Sequence[str]) -> np.ndarray:
-        """Return vectors, (..., parameters), with some parameters as in the given model."""
+        """Return vectors (..., parameters) with some parameters as in the given model."""
         vectors, indices = vectors.copy(), self.indices_of(fields)
         vectors[..., indices] = self.start[indices]
         return vectors
 
-    def whiten(self, left: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
+    def whiten(self, residuals: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
         """Return residuals (num_models, rows, chunks, axes, 2) of some axes as innovations."""
-        return self.whitener(left, axes)
+        return self.whitener(residuals, axes)
 
     def whitened_residuals(self, *vectors: np.ndarray) -> np.ndarray:
         """Return the innovations of models, (num_models, rows, chunks, NUM_AXES, 2)."""
@@ -374,8 +424,13 @@ class Problem:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return copies of a vector, each with one parameter moved, and the steps, for slopes.
 
-        One-sided differences, into the bounds: an effect may be defined on one side of neutral
-        only. share: of a parameter's scale.
+        Differences are one-sided and within the bounds: an effect may be defined on one side of
+        neutral only.
+
+        Args:
+            vector: to copy.
+            indices: of the parameters to move.
+            share: the step as a share of a parameter's scale.
         """
         indices = list(indices)
         step = share * self.scale[indices]
@@ -387,13 +442,13 @@ class Problem:
     def slopes(
         self, vector: np.ndarray, indices: Sequence[int], others: np.ndarray | None = None
     ) -> Slopes:
-        """Return a model's residuals, their slopes along indices, and the way to other vectors."""
+        """Return a model's residuals, their slopes along indices, and the ways to other vectors."""
         moved, step = self.nudged(vector, indices)
         others = np.zeros((0, len(vector))) if others is None else others
-        found = self.residuals(np.concatenate([vector[None], moved, others]))
-        away = found[1:] - found[0]
-        away[: len(step)] /= step[:, None, None, None, None]
-        return Slopes(vector, found[0], tuple(indices), away)
+        residuals = self.residuals(np.concatenate([vector[None], moved, others]))
+        columns = residuals[1:] - residuals[0]
+        columns[: len(step)] /= step[:, None, None, None, None]
+        return Slopes(vector, residuals[0], tuple(indices), columns)
 
     def indices_of(self, names: Sequence[str]) -> list[int]:
         """Return the indices of parameters in the vector."""
@@ -403,17 +458,19 @@ class Problem:
 def as_replayed(model: ModelParameters) -> ModelParameters:
     """Return a model without the effects on poses."""
     return model._replace(
-        effects=tuple(one for one in model.effects if "pose" not in effect_of(one).hooks)
+        effects=tuple(effect for effect in model.effects if "pose" not in effect_of(effect).hooks)
     )
 
 
 def vector_of(model: ModelParameters) -> np.ndarray:
     """Return a model as a vector of a ``Problem``."""
-    return to_vector(as_replayed(model).with_effects(*(model.effect(one.name) for one in SEARCHED)))
+    return to_vector(
+        as_replayed(model).with_effects(*(model.effect(effect.name) for effect in SEARCHED))
+    )
 
 
 def _longest(names: Sequence[str], chunks: Chunks) -> np.ndarray:
-    """Return the longest delays that effects remember, s; infinity for other parameters."""
+    """Return the longest delay (s) that each effect remembers; infinity for other parameters."""
     step_s = float(np.median(chunks.record.step_s))
     fields = [name.partition(".") for name in names]
     steps = [
@@ -424,7 +481,7 @@ def _longest(names: Sequence[str], chunks: Chunks) -> np.ndarray:
 
 
 def _scale(name: str, value: float) -> float:
-    """Return the size of a parameter that steps are measured by."""
+    """Return the size of a parameter, in which steps are measured."""
     if "." in name:
         bounds = range_of(name)
         return 0.1 * (bounds.high - bounds.low)
@@ -432,7 +489,7 @@ def _scale(name: str, value: float) -> float:
 
 
 def robust_weight(white: np.ndarray) -> np.ndarray:
-    """Return Huber weights of innovations: outliers count by their size, not its square."""
+    """Return Huber weights of innovations: outliers count by their size, not by its square."""
     return noises.OUTLIER / np.maximum(np.abs(white), noises.OUTLIER)
 
 
@@ -448,8 +505,8 @@ def blocks_of(values: np.ndarray) -> np.ndarray:
     """
     rows, chunks = values.shape[-4:-2]
     kept = values[..., lead_in_of(rows) :, :, :, :]
-    second = kept.shape[-4] // CHUNK_S
-    split = kept.reshape(*kept.shape[:-4], CHUNK_S, second, chunks, kept.shape[-2] * 2)
+    rows_per_s = kept.shape[-4] // CHUNK_S
+    split = kept.reshape(*kept.shape[:-4], CHUNK_S, rows_per_s, chunks, kept.shape[-2] * 2)
     return np.moveaxis(split, (-4, -2), (0, 1)).reshape(
-        CHUNK_S * chunks, *kept.shape[:-4], second * kept.shape[-2] * 2
+        CHUNK_S * chunks, *kept.shape[:-4], rows_per_s * kept.shape[-2] * 2
     )

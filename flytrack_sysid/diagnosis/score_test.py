@@ -1,8 +1,8 @@
 """The score test: the first-order gain of freeing parameters, from one linearization of a log.
 
 A ``Linearization`` has a model's whitened residuals and their slopes along every parameter, summed
-up over blocks of a second. Gains are divided by how much more the scores of blocks vary than
-independent rows would (``inflation``).
+over blocks of a second. Gains are divided by ``inflation``: the variance of the scores of blocks
+over that of independent rows.
 """
 
 import copy
@@ -23,13 +23,13 @@ from flytrack_sysid.diagnosis.problem import (
 )
 from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS, neutral_value, range_of
 
-FALSE_POSITIVE_RATE = 1e-4  # of a name where there is nothing, for each effect
-# A direction of which the others leave less than this share cannot be told apart from them.
+FALSE_POSITIVE_RATE = 1e-4  # that an absent effect is named, for each effect
+# A direction cannot be told from others that explain all but this share of it.
 MIN_INDEPENDENT_FRACTION = 1e-7
 AT_BOUND = 1e-9
-# relative change of a parameter that is looked for at probes, within which its slope holds
+# Relative change of a parameter with probes within which its slope holds.
 SAME_SLOPE = 0.1
-PROBE_PRIOR = 1e-2  # a step to a probe is known to be less than ten times that
+PROBE_PRIOR = 1e-2  # prior: a step is shorter than ten times the way to the probe
 # Names of causes in the base, and the parameters of each.
 BASE_CAUSES = {
     **{name: (name,) for name in TAUS},
@@ -39,7 +39,12 @@ BASE_CAUSES = {
 
 
 class Probe(NamedTuple):
-    """A parameter, ``effect.parameter``, and a value at which to look for it."""
+    """A value of a parameter at which the search looks for an effect.
+
+    Attributes:
+        field: the parameter, ``effect.parameter``.
+        value: of the parameter.
+    """
 
     field: str
     value: float
@@ -57,10 +62,13 @@ class Probe(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """An effect and one way to look for it.
+    """An effect and one parameterization of it.
 
-    fields: ``effect.parameter`` names that are freed. probes: of some of them, where there is no
-    slope at neutral; each may lie on another share of its way.
+    Attributes:
+        effect: its name.
+        fields: ``effect.parameter`` names that are freed.
+        probes: of the fields that have no slope at neutral; each may lie at another share of its
+            way.
     """
 
     effect: str
@@ -69,20 +77,24 @@ class Candidate(NamedTuple):
 
     @property
     def num_priced(self) -> int:
-        """How many of its parameters count against it: not those that only shape what others do."""
+        """The number of parameters that count; not those that only shape what others do."""
         shapes = [f"{self.effect}.{field}" for field in BY_NAME[self.effect].search.shapes]
         return sum(field not in shapes for field in self.fields)
 
     @property
     def groups(self) -> list[tuple[str, ...]]:
-        """Its fields by what changes together; several groups if its settings are independent."""
+        """Its fields, grouped by what changes together; several groups of independent settings."""
         fields = set(self.fields)
-        own = [
-            one.fields
-            for one in candidates_of(BY_NAME[self.effect])
-            if fields.issuperset(one.fields)
+        contained = [
+            group.fields
+            for group in candidates_of(BY_NAME[self.effect])
+            if fields.issuperset(group.fields)
         ]
-        largest = [one for one in own if not any(set(one) < set(other) for other in own)]
+        largest = [
+            group
+            for group in contained
+            if not any(set(group) < set(larger) for larger in contained)
+        ]
         return largest if BY_NAME[self.effect].search.is_setting else [self.fields]
 
     def excludes(self, other: "Candidate") -> bool:
@@ -92,8 +104,11 @@ class Candidate(NamedTuple):
         """
         if self.effect != other.effect or not BY_NAME[self.effect].search.is_setting:
             return self.effect == other.effect
-        own, theirs = {*self.fields}, {*other.fields}
-        return any(own & family and theirs & family for family in families_of(BY_NAME[self.effect]))
+        fields, other_fields = {*self.fields}, {*other.fields}
+        return any(
+            fields & family and other_fields & family
+            for family in families_of(BY_NAME[self.effect])
+        )
 
     @property
     def other_fields(self) -> tuple[str, ...]:
@@ -102,27 +117,27 @@ class Candidate(NamedTuple):
 
 
 def candidates_of(effect: Effect) -> list[Candidate]:
-    """Return the ways in which an effect is looked for."""
-    found = []
+    """Return the candidates of an effect."""
+    candidates = []
     for group in effect.search.groups or (tuple(effect.ranges),):
         fields = tuple(f"{effect.name}.{field}" for field in group)
-        probed = [
+        probes_by_field = [
             [Probe(f"{effect.name}.{field}", value) for value in effect.search.probes[field]]
             for field in group
             if field in effect.search.probes
         ]
-        ways = zip(*probed, strict=True) if probed else [()]
-        found += [Candidate(effect.name, fields, probes) for probes in ways]
-    return found
+        combinations = zip(*probes_by_field, strict=True) if probes_by_field else [()]
+        candidates += [Candidate(effect.name, fields, probes) for probes in combinations]
+    return candidates
 
 
 def families_of(effect: Effect) -> list[set[str]]:
-    """Return the parameters that groups connect: one weak motor, say, or another, or two."""
+    """Return sets of parameters that groups connect: one weak motor, say, or another, or two."""
     families: list[set[str]] = []
     for candidate in candidates_of(effect):
         family = {*candidate.fields}
-        family |= set().union(*(one for one in families if one & family))
-        families = [*(one for one in families if not one & family), family]
+        family |= set().union(*(known for known in families if known & family))
+        families = [*(known for known in families if not known & family), family]
     return families
 
 
@@ -130,25 +145,34 @@ CANDIDATES = [candidate for effect in SEARCHED for candidate in candidates_of(ef
 
 
 def candidates_for(problem: Problem) -> list[Candidate]:
-    """Return the candidates: effects of the list, and settings of the craft that may be changed."""
+    """Return the candidates: effects of the list, and settings of the craft that may change."""
     given = [BY_NAME[name] for name in problem.given_effects if BY_NAME[name].search.is_setting]
     return [
         *CANDIDATES,
-        *(one for effect in given if effect.search.groups for one in candidates_of(effect)),
+        *(
+            candidate
+            for effect in given
+            if effect.search.groups
+            for candidate in candidates_of(effect)
+        ),
     ]
 
 
 def threshold(num_parameters: int) -> float:
-    """Return the gain of chi2 from which so many parameters are named."""
+    """Return the gain of chi2 above which an effect with this number of parameters is named."""
     return float(stats.chi2.isf(FALSE_POSITIVE_RATE, num_parameters))
 
 
 class Gain(NamedTuple):
-    """What freeing some parameters besides others would gain.
+    """The gain of freeing some parameters besides given ones.
 
-    chi2: in minus twice the log likelihood. inflation: of its variance, where residuals within a
-    second are correlated. step: of the parameters. given_step: of the others, along with it.
-    information: about those that others cannot replace, with what others explain projected out.
+    Attributes:
+        chi2: the gain in minus twice the log likelihood.
+        inflation: of its variance, where residuals within a second are correlated.
+        step: of the freed parameters.
+        given_step: of the given ones, along with it.
+        information: about the parameters that given ones cannot replace, with the given ones
+            projected out.
     """
 
     chi2: float
@@ -159,7 +183,7 @@ class Gain(NamedTuple):
 
     @property
     def num_parameters(self) -> int:
-        """How many of the parameters the log determines."""
+        """The number of parameters that the log determines."""
         return len(self.information)
 
     @property
@@ -169,11 +193,15 @@ class Gain(NamedTuple):
 
 
 class Linearization:
-    """A model and, to first order, what every column would change: parameters, and ways to probes.
+    """A model's residuals and their slopes along columns: parameters, and ways to probes.
 
-    vector: the model. indices: parameters of the first columns. probes: of further ones, whose step
-    is the share of the way to the probe. columns: whitened, (blocks, columns, numbers). The slopes
-    may be those of a nearby model.
+    The slopes may be those of a nearby model.
+
+    Attributes:
+        vector: the model.
+        indices: parameters of the first columns.
+        probes: of the further columns, whose step is the share of the way to the probe.
+        columns: whitened slopes, (blocks, columns, numbers).
     """
 
     def __init__(self, problem: Problem, slopes: Slopes, probes: Sequence[Probe] = ()):
@@ -193,47 +221,49 @@ class Linearization:
         self._sum_scores()
 
     def _sum_scores(self) -> None:
-        away = (self.vector - self.problem.start)[self.indices]
-        pull = self.prior * np.append(away, np.zeros(len(self.probes)))
-        self.score = self.score_by_block.sum(axis=0) - pull
+        change = (self.vector - self.problem.start)[self.indices]
+        prior_score = self.prior * np.append(change, np.zeros(len(self.probes)))
+        self.score = self.score_by_block.sum(axis=0) - prior_score
         self.cost = costs_of(self.problem, self.vector[None], self.white[None])[0]
 
     def moved(self, vector: np.ndarray, white: np.ndarray | None = None) -> "Linearization":
         """Return the linearization at a nearby model, with the slopes of this one.
 
-        white: its whitened residuals, if they are known.
+        Args:
+            vector: the nearby model.
+            white: its whitened residuals, if they are known.
         """
-        later = copy.copy(self)
-        later.vector = vector
-        later.white = self.problem.whitened_residuals(vector)[0] if white is None else white
-        weighted = blocks_of(later.white * robust_weight(later.white))
-        later.score_by_block = -(self.columns @ weighted[..., None])[..., 0]
-        later._sum_scores()
-        return later
+        shifted = copy.copy(self)
+        shifted.vector = vector
+        shifted.white = self.problem.whitened_residuals(vector)[0] if white is None else white
+        weighted = blocks_of(shifted.white * robust_weight(shifted.white))
+        shifted.score_by_block = -(self.columns @ weighted[..., None])[..., 0]
+        shifted._sum_scores()
+        return shifted
 
     def distance(self, vector: np.ndarray) -> float:
-        """Return how far, as a chi2 to first order, a model is from where the slopes were taken."""
+        """Return the distance of a model from that of the slopes, as a first-order chi2."""
         change = vector - self.slopes.vector
         indices = np.array(self.indices)
-        elsewhere = np.delete(change, indices)
-        sloping = self.problem.indices_of(sorted({probe.field for probe in self.probes}))
+        fixed_change = np.delete(change, indices)
+        probed = self.problem.indices_of(sorted({probe.field for probe in self.probes}))
         size = np.maximum(np.abs(vector), np.abs(self.slopes.vector))
-        # Where there was no slope, first order cannot measure the distance.
-        if np.any(elsewhere != 0.0) or np.any((np.abs(change) > SAME_SLOPE * size)[sloping]):
+        # First order cannot measure the distance along parameters without a slope.
+        if np.any(fixed_change != 0.0) or np.any((np.abs(change) > SAME_SLOPE * size)[probed]):
             return np.inf
         end = len(indices)
         return float(change[indices] @ self.total[:end, :end] @ change[indices])
 
     def narrowed(self, indices: Sequence[int]) -> "Linearization":
         """Return the linearization along some of the indices only."""
-        kept = [self.indices.index(index) for index in indices]
-        later = copy.copy(self)
-        later.indices, later.probes = list(indices), []
-        later.prior, later.columns = self.prior[kept], self.columns[:, kept]
-        later.by_block = self.by_block[:, kept][:, :, kept]
-        later.score_by_block = self.score_by_block[:, kept]
-        later.total, later.score = self.total[np.ix_(kept, kept)], self.score[kept]
-        return later
+        columns = [self.indices.index(index) for index in indices]
+        narrow = copy.copy(self)
+        narrow.indices, narrow.probes = list(indices), []
+        narrow.prior, narrow.columns = self.prior[columns], self.columns[:, columns]
+        narrow.by_block = self.by_block[:, columns][:, :, columns]
+        narrow.score_by_block = self.score_by_block[:, columns]
+        narrow.total, narrow.score = self.total[np.ix_(columns, columns)], self.score[columns]
+        return narrow
 
     def column(self, name: str) -> int:
         """Return the column of a parameter."""
@@ -246,21 +276,21 @@ class Linearization:
 
     def columns_of(self, candidate: Candidate) -> list[int]:
         """Return a candidate's columns: those of its probes, then those of its other parameters."""
-        ways = [self.probe_column(probe) for probe in candidate.probes]
-        return ways + [self.column(field) for field in candidate.other_fields]
+        probe_columns = [self.probe_column(probe) for probe in candidate.probes]
+        return probe_columns + [self.column(field) for field in candidate.other_fields]
 
     def probe_column(self, probe: Probe) -> int:
         """Return the column of the way to a probe."""
         return len(self.indices) + self.probes.index(probe)
 
     def acting(self, columns: Sequence[int]) -> list[int]:
-        """Return the columns that change anything."""
+        """Return the columns that change the residuals."""
         return [
             column for column in columns if self.total[column, column] > 2.0 * self.prior[column]
         ]
 
     def step(self, columns: Sequence[int]) -> np.ndarray:
-        """Return the step along columns that explains most, nothing else moving."""
+        """Return the step along columns that explains most, with all others fixed."""
         return solve(self.total[np.ix_(columns, columns)], self.score[columns])
 
     def step_inside(self) -> np.ndarray:
@@ -277,7 +307,9 @@ class Linearization:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return information about columns with given ones projected out, and the projection.
 
-        The projection is the shares of the given columns in the others, (given, columns).
+        Returns:
+            The information (columns, columns), and the shares of the given columns in the others
+            (given, columns).
         """
         across = self.total[np.ix_(given, columns)]
         share = solve(self.total[np.ix_(given, given)], across)
@@ -286,66 +318,77 @@ class Linearization:
     def gain(self, added: Sequence[int], given: Sequence[int]) -> Gain | None:
         """Return the gain of freeing ``added`` besides ``given`` columns; None if these suffice.
 
-        Columns that those nearly replace are left out, and their step is 0.
+        Columns that the given ones nearly replace are left out, and their step is 0.
         """
-        given, every = list(given), list(added)
-        added = self._own(every, given)
+        given, columns = list(given), list(added)
+        added = self._own(columns, given)
         if not added:
             return None
-        found = self.freed(added, given)
-        whole = np.zeros(len(every))
-        whole[[every.index(column) for column in added]] = found.step
-        return found._replace(step=whole)
+        freed_gain = self.freed(added, given)
+        step = np.zeros(len(columns))
+        step[[columns.index(column) for column in added]] = freed_gain.step
+        return freed_gain._replace(step=step)
 
     def freed(self, added: list[int], given: list[int]) -> Gain:
         """Return the gain of freeing ``added`` columns besides ``given`` ones.
 
         None of them may nearly replace another.
         """
-        own, share = self.projected(added, given)
+        information, share = self.projected(added, given)
         score = self.score[added] - share.T @ self.score[given]
-        step = solve(own, score)
+        step = solve(information, score)
         alone = solve(self.total[np.ix_(given, given)], self.score[given])
-        both, columns = np.concatenate([alone - share @ step, step]), given + added
-        blocks = self.score_by_block[:, columns] - self.by_block[:, columns][:, :, columns] @ both
-        blocks = blocks[:, len(given) :] - blocks[:, : len(given)] @ share
-        return Gain(float(score @ step), inflation_of(own, blocks), step, both[: len(given)], own)
+        joint, columns = np.concatenate([alone - share @ step, step]), given + added
+        scores = self.score_by_block[:, columns] - self.by_block[:, columns][:, :, columns] @ joint
+        scores = scores[:, len(given) :] - scores[:, : len(given)] @ share
+        return Gain(
+            float(score @ step),
+            inflation_of(information, scores),
+            step,
+            joint[: len(given)],
+            information,
+        )
 
     def gain_of(self, candidate: Candidate, given: Sequence[int]) -> Gain | None:
-        """Return the gain of a candidate; None if others do the same or no probe lies ahead.
+        """Return the gain of a candidate; None if others replace it or no probe lies ahead.
 
-        Parameters that begin at neutral do not move away from their probes; the step of those is 0.
+        Parameters whose range begins at neutral do not move away from their probes: their step
+        is 0.
         """
-        columns, probed = (
+        columns, probe_columns = (
             self.columns_of(candidate),
-            [self.probe_column(one) for one in candidate.probes],
+            [self.probe_column(probe) for probe in candidate.probes],
         )
-        one_way = {self.probe_column(one) for one in candidate.probes if one.is_one_way}
+        one_way_columns = {
+            self.probe_column(probe) for probe in candidate.probes if probe.is_one_way
+        }
         kept = list(columns)
-        while not probed or set(kept) & set(probed):
+        while not probe_columns or set(kept) & set(probe_columns):
             gain = self.gain(kept, given)
             if gain is None:
                 break
             steps = dict(zip(kept, gain.step, strict=True))
-            forwards = [column for column in kept if column not in one_way or steps[column] > 0.0]
+            forwards = [
+                column for column in kept if column not in one_way_columns or steps[column] > 0.0
+            ]
             if forwards == kept:
                 return gain._replace(step=np.array([steps.get(column, 0.0) for column in columns]))
             kept = forwards
         return None
 
     def _own(self, columns: list[int], given: list[int]) -> list[int]:
-        """Return the columns that given ones, or those before them, do not nearly replace."""
+        """Return the columns that given ones and earlier ones do not nearly replace."""
         kept: list[int] = []
         for column in columns:
             others = given + kept
             across = self.total[others, column]
-            own = self.total[column, column] - across @ solve(
+            information = self.total[column, column] - across @ solve(
                 self.total[np.ix_(others, others)], across
             )
-            least = max(
+            min_information = max(
                 MIN_INDEPENDENT_FRACTION * self.total[column, column], 2.0 * self.prior[column]
             )
-            if own > least:
+            if information > min_information:
                 kept.append(column)
         return kept
 
@@ -358,17 +401,23 @@ def step_inside(
 ) -> np.ndarray:
     """Return the step along indices that stays within bounds; parameters stuck at one do not move.
 
-    step_along: the best step along those that are free, (num_places,) bool.
+    Args:
+        problem: with the bounds.
+        vector: where the step begins.
+        indices: of the parameters that may move.
+        step_along: returns the best step along the free ones, from a mask of the indices
+            (num_indices,) bool.
     """
     indices = np.array(indices)
-    low, high, now = problem.low[indices], problem.high[indices], vector[indices]
-    room = AT_BOUND * np.maximum(np.abs(now), 1.0)
+    low, high, current = problem.low[indices], problem.high[indices], vector[indices]
+    tolerance = AT_BOUND * np.maximum(np.abs(current), 1.0)
     free, step = np.ones(len(indices), bool), np.zeros(len(indices))
     while free.any():
         step[:] = 0.0
         step[free] = step_along(free)
         stuck = free & (
-            ((now <= low + room) & (step < 0.0)) | ((now >= high - room) & (step > 0.0))
+            ((current <= low + tolerance) & (step < 0.0))
+            | ((current >= high - tolerance) & (step > 0.0))
         )
         if not stuck.any():
             break
@@ -378,27 +427,32 @@ def step_inside(
 
 
 def inflation_of(information: np.ndarray, scores: np.ndarray) -> float:
-    """Return how much more scores, (blocks, parameters), vary than information says; at least 1."""
+    """Return how much more scores vary than information says, at least 1.
+
+    Args:
+        information: (parameters, parameters).
+        scores: (blocks, parameters).
+    """
     used = np.abs(scores).sum(axis=1) > 0.0
     spread = scores[used].T @ scores[used]
-    number = max(int(used.sum()), 2)
-    ratio = np.trace(solve(information, spread)) / len(information) * number / (number - 1)
+    count = max(int(used.sum()), 2)
+    ratio = np.trace(solve(information, spread)) / len(information) * count / (count - 1)
     return max(float(ratio), 1.0)
 
 
-def solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+def solve(matrix: np.ndarray, right_side: np.ndarray) -> np.ndarray:
     """Return the solution of a positive semidefinite system, in the scale of its diagonal."""
     if len(matrix) == 0:
-        return np.zeros((0, *right.shape[1:]))
+        return np.zeros((0, *right_side.shape[1:]))
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     scaled = matrix * np.outer(scale, scale) + 1e-12 * np.eye(len(matrix))
-    scaled_right = right * (scale if right.ndim == 1 else scale[:, None])
-    found = linalg.solve(scaled, scaled_right, assume_a="sym", check_finite=False)
-    return found * (scale if right.ndim == 1 else scale[:, None])
+    scaled_right = right_side * (scale if right_side.ndim == 1 else scale[:, None])
+    solution = linalg.solve(scaled, scaled_right, assume_a="sym", check_finite=False)
+    return solution * (scale if right_side.ndim == 1 else scale[:, None])
 
 
 def prior_information(problem: Problem) -> np.ndarray:
-    """Return the weak prior information about each parameter, which only keeps estimates finite."""
+    """Return the weak prior information about each parameter; it only keeps estimates finite."""
     finite = np.isfinite(problem.high - problem.low)
     width = np.where(finite, problem.high - problem.low, 0.0)
     return 1.0 / np.where(finite, width, 10.0 * problem.scale) ** 2
@@ -407,7 +461,10 @@ def prior_information(problem: Problem) -> np.ndarray:
 def costs_of(problem: Problem, vectors: np.ndarray, white: np.ndarray) -> np.ndarray:
     """Return minus twice the log likelihood of models plus their prior, (num_models,).
 
-    white: their whitened residuals.
+    Args:
+        problem: the rows, with the noise.
+        vectors: the models, (num_models, parameters).
+        white: their whitened residuals.
     """
     prior = prior_information(problem) * (vectors - problem.start) ** 2
-    return np.array([robust_square(one) for one in white]) + prior.sum(axis=1)
+    return np.array([robust_square(innovations) for innovations in white]) + prior.sum(axis=1)

@@ -1,4 +1,4 @@
-"""The search: add effects one by one, and refit each together with all before it."""
+"""The search: add effects one by one, and refit each one together with all earlier ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,26 +20,33 @@ from flytrack_sysid.diagnosis.score_test import (
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import DRAIN, base_of
 
-PER_PARAMETER = 4.0  # of chi2: what one more parameter has to gain to be preferred to fewer
+PER_PARAMETER = 4.0  # of chi2: the gain that one more parameter needs to be preferred
 MAX_EFFECTS = 6
-# of the best gain: candidates that come so near to first order are refitted before one is chosen
+# of the best gain: candidates this close to first order are refitted before one is chosen
 CLOSE = 0.6
 MAX_REFITTED = 4
-MAX_FAILED_ROUNDS = 3  # of refits before a search ends
+MAX_FAILED_ROUNDS = 3  # rounds of refits without an effect before a search ends
 PROMISING = 0.7  # of the threshold, to first order
-SHARE_OF_WAY = (0.02, 1.5)  # to a probe, at which a fit starts
-KEPT_PROMISE = 0.6  # of a gain to first order: a fit that comes to less may have gone astray
-SATURATED_SHARES = np.array([0.0, 1.0, 0.5, 0.2])  # of the step to everything at once
-# Gauss-Newton: rounds, the least gain of a round, and after how much gain slopes are taken again;
-# gains in minus twice the log likelihood.
+SHARE_OF_WAY = (0.02, 1.5)  # range of the share of the way to a probe at which a fit starts
+KEPT_PROMISE = 0.6  # of the first-order gain: a fit that gains less may have gone astray
+SATURATED_SHARES = np.array([0.0, 1.0, 0.5, 0.2])  # of the step along every effect at once
+# Gauss-Newton: the most rounds, the least gain of a round, and the gain after which slopes are
+# computed again. Gains are in minus twice the log likelihood.
 MAX_ROUNDS, MIN_GAIN, STALE = 30, 0.2, 30.0
-TRIAL_ROUNDS = 5  # after which a fit says whether it is worth carrying on
-# Of a step, tried one after the other until one gains a part of what first order promises.
+TRIAL_ROUNDS = 5  # after these, a fit ends unless its cost is below the limit
+# Shares of a step, tried in this order until one gains the given part of the first-order gain.
 STEP_SHARES, PART_OF_PROMISE = np.array([1.0, 0.5, 0.2, 0.05]), 0.25
 
 
 class FittedModel(NamedTuple):
-    """A fitted model: its effects as candidates, its vector, cost, and free indices."""
+    """A fitted model.
+
+    Attributes:
+        candidates: its effects.
+        vector: its parameters.
+        cost: minus twice the log likelihood, and the prior.
+        indices: of its free parameters in the vector.
+    """
 
     candidates: tuple[Candidate, ...]
     vector: np.ndarray
@@ -49,34 +56,41 @@ class FittedModel(NamedTuple):
     @property
     def effects(self) -> set[str]:
         """The names of its effects."""
-        return {one.effect for one in self.candidates}
+        return {candidate.effect for candidate in self.candidates}
 
     @property
     def num_priced(self) -> int:
-        """How many parameters count against it."""
-        return sum(one.num_priced for one in self.candidates)
+        """The number of parameters that count against it."""
+        return sum(candidate.num_priced for candidate in self.candidates)
 
     def candidate(self, effect: str) -> Candidate:
-        """Return the way in which an effect of the model was found."""
-        return next(one for one in self.candidates if one.effect == effect)
+        """Return the candidate of one of the model's effects."""
+        return next(existing for existing in self.candidates if existing.effect == effect)
 
     def lacks(self, candidate: Candidate) -> bool:
         """Return whether an effect may be added.
 
-        The model does not have it, or has only other settings of it.
+        It may if the model does not have it, or has only other settings of it.
         """
-        return not any(one.excludes(candidate) for one in self.candidates)
+        return not any(existing.excludes(candidate) for existing in self.candidates)
 
     def joined_by(self, candidate: Candidate) -> tuple[Candidate, ...]:
-        """Return the effects with one more, or with more settings of one."""
-        own = [one for one in self.candidates if one.effect == candidate.effect]
-        fields = tuple(field for one in (*own, candidate) for field in one.fields)
-        rest = [one for one in self.candidates if one not in own]
-        return (*rest, candidate._replace(fields=fields))
+        """Return the candidates with one more, or with more settings of one."""
+        same_effect = [
+            existing for existing in self.candidates if existing.effect == candidate.effect
+        ]
+        fields = tuple(field for existing in (*same_effect, candidate) for field in existing.fields)
+        others = [existing for existing in self.candidates if existing not in same_effect]
+        return (*others, candidate._replace(fields=fields))
 
 
 class HeldParameter(NamedTuple):
-    """A base parameter held at nominal; effect: what explains its change, "" if none does."""
+    """A base parameter held at nominal.
+
+    Attributes:
+        field: its name.
+        effect: that explains its change, "" if none does.
+    """
 
     field: str
     effect: str
@@ -84,11 +98,14 @@ class HeldParameter(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SearchState:
-    """What a search knows; every step of the search returns a new one.
+    """State of a search; every step of the search returns a new one.
 
-    problem: what is learnt from, with the noise. unobservable: effects that need channels the log
-    lacks. refused: effects that vetoes have rejected. held: base parameters that stay nominal.
-    linearization: the last one along everything, kept because slopes are expensive.
+    Attributes:
+        problem: the rows to learn from, with the noise.
+        unobservable: effects that need channels the log lacks.
+        refused: effects that vetoes have rejected.
+        held: base parameters that stay nominal.
+        linearization: the last one along everything, kept because slopes are expensive.
     """
 
     problem: Problem
@@ -99,61 +116,76 @@ class SearchState:
 
     @classmethod
     def start(cls, log: FlightLog, problem: Problem) -> "SearchState":
-        """Return the state before anything was searched for, with a first guess of the noise.
+        """Return the state before the search, with a first guess of the noise.
 
-        problem: of rows of the log.
+        Args:
+            problem: of rows of the log.
         """
         noise = noises.first_guess(problem.chunks, problem.residuals(problem.start[None])[0])
         channels = {*log.channels, *problem.chunks.measured}
         lacking = tuple(
             effect.name for effect in SEARCHED if not set(effect.search.needs) <= channels
         )
-        # The replay's voltage is then assumed at every row; what falls within a step would pass for
-        # thrust.
+        # Without voltages, the replay assumes one at every row. A drop within a step would then
+        # pass for thrust.
         held = () if voltages_of(problem.chunks) else (HeldParameter(DRAIN, ""),)
         return cls(problem.with_noise(noise), unobservable=lacking, held=held)
 
     @property
     def base_indices(self) -> list[int]:
         """The indices of the free base parameters."""
-        held = {one.field for one in self.held}
+        held_fields = {parameter.field for parameter in self.held}
         return self.problem.indices_of(
-            [name for name in base_of(self.problem.like) if name not in held]
+            [name for name in base_of(self.problem.like) if name not in held_fields]
         )
 
     @property
     def all_indices(self) -> list[int]:
-        """The indices that may become free: the base, and all parameters of all effects."""
-        base, fields = self.base_indices, [one.fields for one in candidates_for(self.problem)]
-        others = {index for some in fields for index in self.problem.indices_of(some)} - {*base}
+        """The indices that may become free: of the base, and of all effects' parameters."""
+        base, groups = (
+            self.base_indices,
+            [candidate.fields for candidate in candidates_for(self.problem)],
+        )
+        others = {index for fields in groups for index in self.problem.indices_of(fields)} - {*base}
         return base + sorted(others)
 
     def with_noise(self, noise: np.ndarray) -> "SearchState":
-        """Return the state with another noise, (6, NUM_AXES)."""
+        """Return the state with another noise.
+
+        Args:
+            noise: as of ``noise.fit_noise``, (6, NUM_AXES).
+        """
         return replace(self, problem=self.problem.with_noise(noise))
 
     def linearized(
         self, vector: np.ndarray, max_distance: float = STALE
     ) -> tuple["SearchState", Linearization]:
-        """Return the state that has a linearization along everything, and the linearization.
+        """Return the state with a linearization along everything, and the linearization.
 
-        Slopes of one that is near, within ``max_distance`` of chi2, are used again.
+        Args:
+            vector: the model.
+            max_distance: the distance (chi2) within which the slopes of the last linearization are
+                used again.
         """
         problem, last = self.problem, self.linearization
         is_same = last is not None and last.indices == self.all_indices
         if last is not None and is_same and last.distance(vector) <= max_distance:
             if last.noise is not problem.noise:
                 last = Linearization(problem, last.slopes, last.probes)
-            found = last.moved(vector)
+            linearization = last.moved(vector)
         else:
             probes = list(
-                dict.fromkeys(probe for one in candidates_for(problem) for probe in one.probes)
+                dict.fromkeys(
+                    probe for candidate in candidates_for(problem) for probe in candidate.probes
+                )
             )
-            others = problem.clipped(
+            at_probes = problem.clipped(
                 np.array([probe.placed_in(problem, vector) for probe in probes])
             )
-            found = Linearization(problem, problem.slopes(vector, self.all_indices, others), probes)
-        return replace(self, linearization=found), found
+            linearization = Linearization(
+                problem, problem.slopes(vector, self.all_indices, at_probes), probes
+            )
+        return replace(self, linearization=linearization), linearization
 
     def fitted(
         self,
@@ -162,12 +194,18 @@ class SearchState:
         nearby: Linearization | None = None,
         limit: float = np.inf,
     ) -> FittedModel:
-        """Return the best fit of the model with these effects, starting from a vector.
+        """Return the best fit of the model with these effects.
 
-        nearby, limit: as in ``refine``.
+        Args:
+            candidates: the effects.
+            vector: where the fit starts.
+            nearby: as in ``refine``.
+            limit: as in ``refine``.
         """
-        effects = [index for one in candidates for index in self.problem.indices_of(one.fields)]
-        indices = self.base_indices + effects
+        effect_indices = [
+            index for candidate in candidates for index in self.problem.indices_of(candidate.fields)
+        ]
+        indices = self.base_indices + effect_indices
         vector, cost = refine(self.problem, vector, indices, nearby, limit)
         return FittedModel(tuple(candidates), vector, cost, tuple(indices))
 
@@ -181,55 +219,60 @@ def refine(
 ) -> tuple[np.ndarray, float]:
     """Minimise the cost along some indices by Gauss-Newton; return the vector and its cost.
 
-    Slopes are kept while little is gained: residuals cost a tenth of them. nearby: a linearization
-    whose slopes serve at first. limit: of the cost; a fit that is above it after a few rounds ends
-    there.
+    Slopes are kept while little is gained: residuals cost a tenth of them.
+
+    Args:
+        problem: the rows, with the noise.
+        vector: where the fit starts.
+        indices: of the parameters that are free.
+        nearby: a linearization whose slopes are used at first.
+        limit: of the cost; a fit that is above it after ``TRIAL_ROUNDS`` rounds ends there.
     """
     indices = list(indices)
     if nearby is None:
-        now = Linearization(problem, problem.slopes(vector, indices))
+        current = Linearization(problem, problem.slopes(vector, indices))
     else:
-        now = nearby.narrowed(indices).moved(vector)
-    since, is_fresh = now.cost, nearby is None
-    for number in range(MAX_ROUNDS):
-        if number == TRIAL_ROUNDS and now.cost > limit:
+        current = nearby.narrowed(indices).moved(vector)
+    cost_at_slopes, is_fresh = current.cost, nearby is None
+    for round_number in range(MAX_ROUNDS):
+        if round_number == TRIAL_ROUNDS and current.cost > limit:
             break
-        gained, later = _step(problem, now)
-        if gained > 0.0:
-            now, is_fresh = later, False
-        if gained < MIN_GAIN:
-            if is_fresh or since - now.cost < STALE:
+        gain, following = _step(problem, current)
+        if gain > 0.0:
+            current, is_fresh = following, False
+        if gain < MIN_GAIN:
+            if is_fresh or cost_at_slopes - current.cost < STALE:
                 break
-            now = Linearization(problem, problem.slopes(now.vector, indices))
-            since, is_fresh = now.cost, True
-    return now.vector, float(now.cost)
+            current = Linearization(problem, problem.slopes(current.vector, indices))
+            cost_at_slopes, is_fresh = current.cost, True
+    return current.vector, float(current.cost)
 
 
-def _step(problem: Problem, now: Linearization) -> tuple[float, Linearization]:
-    """Return what the best share of a step gains, and the linearization after it.
+def _step(problem: Problem, current: Linearization) -> tuple[float, Linearization]:
+    """Return the gain of the best share of a step, and the linearization after it.
 
     As many shares are tried at once as are replayed at once.
     """
-    step, at_once = now.step_inside(), max(NUM_PAIRS // problem.chunks.row.shape[1], 1)
-    promised = float(step @ now.score)
-    best, gained = now, -np.inf
+    step, at_once = current.step_inside(), max(NUM_PAIRS // problem.chunks.row.shape[1], 1)
+    expected_gain = float(step @ current.score)
+    best, gain = current, -np.inf
     for first in range(0, len(STEP_SHARES), at_once):
         shares = STEP_SHARES[first : first + at_once]
-        tried = np.repeat(now.vector[None], len(shares), axis=0)
-        tried[:, now.indices] += shares[:, None] * step
-        tried = problem.clipped(tried)
-        white = problem.whitened_residuals(*tried)
-        costs = costs_of(problem, tried, white)
+        vectors = np.repeat(current.vector[None], len(shares), axis=0)
+        vectors[:, current.indices] += shares[:, None] * step
+        vectors = problem.clipped(vectors)
+        white = problem.whitened_residuals(*vectors)
+        costs = costs_of(problem, vectors, white)
         index = int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))
-        if now.cost - costs[index] > gained:
-            best, gained = now.moved(tried[index], white[index]), now.cost - costs[index]
-        if gained > PART_OF_PROMISE * promised:
+        if current.cost - costs[index] > gain:
+            best, gain = current.moved(vectors[index], white[index]), current.cost - costs[index]
+        if gain > PART_OF_PROMISE * expected_gain:
             break
-    return gained, best
+    return gain, best
 
 
 class Scored(NamedTuple):
-    """A candidate and what it would gain, to first order."""
+    """A candidate and its first-order gain."""
 
     candidate: Candidate
     gain: Gain
@@ -243,7 +286,7 @@ class Scored(NamedTuple):
 def score_candidates(
     state: SearchState, linearization: Linearization, model: FittedModel
 ) -> list[Scored]:
-    """Return all effects that a model lacks, by merit to first order, one way of each."""
+    """Return the best candidate of each effect that a model lacks, by first-order merit."""
     given = linearization.columns_at(model.indices)
     excluded = {*state.unobservable, *state.refused}
     best: dict[str, Scored] = {}
@@ -266,10 +309,16 @@ def add_effect(
     scored: Scored,
     limit: float = np.inf,
 ) -> FittedModel:
-    """Return the model with an effect more, fitted from where first order says.
+    """Return the model with one more effect, fitted from the first-order estimate.
 
-    An effect that is looked for at a probe also starts there, if it came to much less than
-    promised. limit: as in ``refine``.
+    An effect with probes is also fitted from these, if the first fit gains much less than expected.
+
+    Args:
+        state: of the search.
+        linearization: of the model.
+        model: to which the effect is added.
+        scored: the effect, and its first-order gain.
+        limit: as in ``refine``.
     """
     problem, (candidate, gain) = state.problem, scored
     candidates = model.joined_by(candidate)
@@ -282,13 +331,13 @@ def add_effect(
         at_probes = model.vector
         for probe, share in zip(candidate.probes, gain.step, strict=False):
             at_probes = probe.placed_in(problem, at_probes) if share > 0.0 else at_probes
-        other = state.fitted(candidates, problem.clipped(at_probes), limit=limit)
-        best = min(best, other, key=lambda one: one.cost)
+        from_probes = state.fitted(candidates, problem.clipped(at_probes), limit=limit)
+        best = min(best, from_probes, key=lambda fitted: fitted.cost)
     return best
 
 
 def _on_the_way(problem: Problem, model: FittedModel, scored: Scored) -> np.ndarray:
-    """Return the vector at the best shares of the ways to probes, with all else moved along."""
+    """Return the vector at the best shares of the ways to probes, with all others moved."""
     candidate, gain = scored
     vector = model.vector.copy()
     vector[list(model.indices)] += gain.given_step
@@ -303,20 +352,22 @@ def _on_the_way(problem: Problem, model: FittedModel, scored: Scored) -> np.ndar
 def add_best(
     state: SearchState, linearization: Linearization, model: FittedModel
 ) -> FittedModel | None:
-    """Return the model with the best effect added; None where none explains enough."""
+    """Return the model with the best effect added; None if no effect explains enough."""
     ranked = [
-        one
-        for one in score_candidates(state, linearization, model)
-        if one.gain.robust > PROMISING * threshold(one.gain.num_parameters)
+        scored
+        for scored in score_candidates(state, linearization, model)
+        if scored.gain.robust > PROMISING * threshold(scored.gain.num_parameters)
     ]
     for _ in range(MAX_FAILED_ROUNDS):
-        near = [one for one in ranked[:MAX_REFITTED] if one.merit > CLOSE * ranked[0].merit]
+        near = [
+            scored for scored in ranked[:MAX_REFITTED] if scored.merit > CLOSE * ranked[0].merit
+        ]
         best: tuple[float, FittedModel] | None = None
-        for one in near:
-            trial = add_effect(state, linearization, model, one, limit=-np.inf)
-            gain = (model.cost - trial.cost) / one.gain.inflation
-            merit = gain - PER_PARAMETER * one.gain.num_parameters
-            if gain > threshold(one.gain.num_parameters) and (best is None or merit > best[0]):
+        for scored in near:
+            trial = add_effect(state, linearization, model, scored, limit=-np.inf)
+            gain = (model.cost - trial.cost) / scored.gain.inflation
+            merit = gain - PER_PARAMETER * scored.gain.num_parameters
+            if gain > threshold(scored.gain.num_parameters) and (best is None or merit > best[0]):
                 best = merit, trial
         if best is not None:
             return best[1]
@@ -327,37 +378,37 @@ def add_best(
 
 
 def add_effects(state: SearchState, model: FittedModel) -> tuple[SearchState, FittedModel]:
-    """Add effects while one explains enough, the best first; return the model, the same if none."""
+    """Add effects while one explains enough, best first; return the same model if none does."""
     while len(model.candidates) < MAX_EFFECTS:
         state, linearization = state.linearized(model.vector)
-        more = add_best(state, linearization, model)
-        if more is None:
+        extended_model = add_best(state, linearization, model)
+        if extended_model is None:
             break
-        model = more
+        model = extended_model
     return state, model
 
 
 def saturated_residuals(linearization: Linearization) -> np.ndarray:
-    """Return the residuals one step towards every effect at once, regularised by the prior.
+    """Return the residuals after one step along every effect at once, regularised by the prior.
 
-    Noise is fitted to this, so that a missing effect is not mistaken for noise.
+    Noise is fitted to these, so that a missing effect is not mistaken for noise.
     """
     problem, indices = linearization.problem, linearization.indices
-    tried = np.repeat(linearization.vector[None], len(SATURATED_SHARES), axis=0)
-    tried[:, indices] += SATURATED_SHARES[:, None] * linearization.step(range(len(indices)))
-    tried = problem.clipped(tried)
-    left = problem.residuals(tried)
-    return left[int(np.nanargmin(costs_of(problem, tried, problem.whiten(left))))]
+    vectors = np.repeat(linearization.vector[None], len(SATURATED_SHARES), axis=0)
+    vectors[:, indices] += SATURATED_SHARES[:, None] * linearization.step(range(len(indices)))
+    vectors = problem.clipped(vectors)
+    residuals = problem.residuals(vectors)
+    return residuals[int(np.nanargmin(costs_of(problem, vectors, problem.whiten(residuals))))]
 
 
 def with_noise_of(state: SearchState, model: FittedModel) -> tuple[SearchState, FittedModel]:
-    """Return the state with the noise that a model and everything it may lack leave, and its fit.
+    """Return the state with the noise fitted beside a model, and the model refitted under it.
 
-    The fit is the model's own, under that noise.
+    The noise is fitted to the saturated residuals, which lack no effect.
     """
     state, linearization = state.linearized(model.vector)
-    left = saturated_residuals(linearization)
-    state = state.with_noise(noises.fit_noise(state.problem.chunks, left, state.problem.noise))
+    residuals = saturated_residuals(linearization)
+    state = state.with_noise(noises.fit_noise(state.problem.chunks, residuals, state.problem.noise))
     state, linearization = state.linearized(model.vector)
     return state, state.fitted(model.candidates, model.vector, linearization)
 
@@ -367,12 +418,12 @@ def extended(
 ) -> tuple[SearchState, FittedModel, FittedModel]:
     """Return the state with its noise, the refitted base, and the model with effects added.
 
-    Noise and effects take turns: a large effect hides small ones as long as its remainder passes
-    for noise.
+    Noise and effects are fitted in turns: a large effect hides small ones while its remainder is
+    taken for noise.
     """
     while True:
-        state, more = add_effects(state, model)
-        if more is model:
+        state, extended_model = add_effects(state, model)
+        if extended_model is model:
             return state, base, model
-        state, model = with_noise_of(state, more)
+        state, model = with_noise_of(state, extended_model)
         base = state.fitted((), base.vector)

@@ -1,8 +1,8 @@
-"""Whether a cause matters: what is significant may still be too small to be worth a name.
+"""Whether a cause matters: a significant cause may still be too small to be named.
 
-A cause matters where a parameter departs from what the nominal model has by a notable size (an
-effect's ``notable``; for the base, the sizes here), or where flight without it, all else refitted,
-ends at least 2 % farther off on held-out rows.
+A cause matters if a parameter differs from the nominal model's by a notable size (an effect's
+``notable``; for the base, the sizes here), or if the error of flight without it, all else refitted,
+is at least 2 % larger on held-out rows.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -32,21 +32,29 @@ def split_by_size(
 ) -> tuple[tuple[Cause, ...], tuple[Cause, ...]]:
     """Return the causes that matter, and those that are negligible.
 
-    vector: the extended model. flight_error: of a vector, by horizon, on held-out rows; empty where
-    the log cannot show it. without: the vector that is refitted without a cause.
+    Args:
+        causes: to split.
+        problem: of the extended model.
+        vector: the extended model.
+        flight_error: returns the error of a vector, by horizon, on held-out rows; empty if the log
+            cannot show it.
+        without: returns the vector that is refitted without a cause.
     """
     small = [cause for cause in causes if not is_notable(cause.effect, problem, vector)]
-    full = flight_error(vector) if small else {}
+    full_error = flight_error(vector) if small else {}
     negligible = []
     for cause in small:
-        less = flight_error(without(cause))
-        if all(less[horizon] < (1.0 + MIN_ERROR_FRACTION) * full[horizon] for horizon in full):
+        error = flight_error(without(cause))
+        if all(
+            error[horizon] < (1.0 + MIN_ERROR_FRACTION) * full_error[horizon]
+            for horizon in full_error
+        ):
             negligible.append(cause)
     return tuple(cause for cause in causes if cause not in negligible), tuple(negligible)
 
 
 def is_notable(name: str, problem: Problem, vector: np.ndarray) -> bool:
-    """Return whether a cause departs from the nominal model by a size that matters."""
+    """Return whether a cause differs from the nominal model by a notable size."""
     if name == "thrust_scale" and "thrust_scale.factor" in problem.names:
         change = _change(problem, vector, ["thrust_scale.factor"])[0]
         if abs(change) >= BY_NAME[name].notable["factor"]:
@@ -55,7 +63,8 @@ def is_notable(name: str, problem: Problem, vector: np.ndarray) -> bool:
     if name in BASE_CAUSES:
         return _is_base_notable(BASE_CAUSES[name], problem, vector)
     effect = BY_NAME[name]
-    # Volts of the handout's battery: as large a share of a smaller pack matters as much.
+    # Notable voltages are of the handout's battery: the same share of a smaller one matters as
+    # much.
     volt = float(problem.like.battery.full_v) / BATTERY_FULL_V
     sizes = {
         field: size * (volt if effect.ranges[field].unit == "V" else 1.0)
@@ -73,9 +82,9 @@ def _change(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> np.n
 def _is_base_notable(fields: Sequence[str], problem: Problem, vector: np.ndarray) -> bool:
     if fields == THRUST_COEFFS:
         stick, volt = problem.chunks.record.command[..., 3], problem.chunks.record.battery_v
-        more = collective_thrust(stick, volt, _change(problem, vector, fields))
+        thrust_change = collective_thrust(stick, volt, _change(problem, vector, fields))
         weight = float(problem.like.m) * float(problem.like.g)
-        return bool(np.sqrt(np.mean(np.square(more))) >= NOTABLE_THRUST * weight)
+        return bool(np.sqrt(np.mean(np.square(thrust_change))) >= NOTABLE_THRUST * weight)
     battery = problem.like.battery
     notable_drain = NOTABLE_DRAIN_PER_MIN * float(battery.full_v - battery.empty_v)
     sizes = {**dict.fromkeys(TAUS, NOTABLE_LAG_S), DRAIN: notable_drain}

@@ -21,38 +21,43 @@ from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.record import Record
 
-# Held-out rows contradict a cause where it gains so many standard deviations less than it would if
-# it were there, and less than that share of its size is there: laws are not exact where they are
-# flown harder.
+# Held-out rows contradict a cause if its gain there is lower, by so many standard deviations, than
+# the gain expected of it, and if less than this share of its size shows there: laws are not exact
+# in harder flight.
 HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.35
-HELD_OUT_SHOWN = 20.0  # of chi2: held-out rows that would show less contradict nothing
-LOSS_SIGMAS = 2.5  # instead, where held-out rows are likelier without the cause
-# Commands are at rest if they changed by no more than this share of the largest stick for this
-# long.
+HELD_OUT_SHOWN = 20.0  # of chi2: held-out rows with a lower expected gain contradict nothing
+LOSS_SIGMAS = 2.5  # instead of both, where held-out rows are likelier without the cause
+# Commands are at rest if, for this long, they changed by no more than this share of the largest
+# stick.
 REST_S, REST_SHARE = 0.1, 0.05
-# A choice among many effects finds what fits the noise of one log: an effect that gains less than
-# so many thresholds has to gain on held-out rows, too, if they would show that much chi2 of it.
+# A choice among many effects can fit the noise of one log. So an effect that gains less than this
+# many thresholds has to gain on held-out rows, too, if at least this chi2 is expected there.
 BARELY, BARELY_SHOWN = 2.0, 1.0
-# No law of a force is exact to 5 % of the force, 1/400 of what it explains: an effect with less
-# than that beside another one is the remainder of the other's law.
+# No law of a force is exact to 5 % of the force, 1/400 of what it explains. An effect that gains
+# less than this share of another one's gain is the remainder of the other's law.
 FORCE_REMAINDER = 0.0025
-# The same for a base change beside an effect that shows in the same channels: lags and thrust
-# curves absorb remainders more easily than a law does, so that the share is larger.
+# The same for a base change beside an effect that shows in the same channels. The share is larger:
+# lags and thrust curves absorb remainders more easily than a law does.
 BASE_REMAINDER = 0.01
-# A name on a side that something unknown disturbs needs so many thresholds; one that keeps less
-# than that share of its noncentrality beside what the unknown depends on stood in for it. Base
-# changes, which absorb remainders easily, need more.
+# A name on a side that something unknown disturbs needs this many thresholds; base changes, which
+# absorb remainders easily, need more. A name that keeps less than KEPT_SHARE of its noncentrality
+# beside what the unknown depends on is a stand-in for it.
 DISTURBED, DISTURBED_BASE, KEPT_SHARE = 3.0, 10.0, 0.1
-# What stands in for something unknown takes up a part of it: a name that explains so many times
-# what the dependences do is no stand-in, and they are the remainder of its law.
+# A stand-in for something unknown explains a part of it. A name that explains this many times what
+# the dependences explain is no stand-in: the dependences are the remainder of its law.
 OUTWEIGHS = 30.0
 
 
 class Selection(NamedTuple):
-    """A selected model, what it leaves unexplained, and the state of the search that led to it.
+    """A selected model, and what it leaves unexplained.
 
-    base: the refitted model without effects. ablations: of each effect of the model. stand_ins:
-    effects and causes in the base that stand in for something unknown.
+    Attributes:
+        state: of the search that led to the model.
+        base: the refitted model without effects.
+        model: the selected one.
+        ablations: of each effect of the model.
+        unexplained: what the model leaves unexplained.
+        stand_ins: effects and causes in the base that stand in for something unknown.
     """
 
     state: SearchState
@@ -67,7 +72,7 @@ Veto = Callable[[Selection, Problem], list[str]]
 
 
 def select(state: SearchState, base: FittedModel, model: FittedModel) -> Selection:
-    """Swap or remove effects, or replace base changes by one, while that helps."""
+    """Swap or remove effects, or replace base changes by an effect, while that helps."""
     state, model, ablations = model_selection.select_effects(state, model)
     while True:
         state, simpler = model_selection.explain_base_by_effect(state, model)
@@ -77,10 +82,10 @@ def select(state: SearchState, base: FittedModel, model: FittedModel) -> Selecti
 
 
 def reject(selection: Selection, effects: Sequence[str]) -> Selection:
-    """Return the selection without some effects, which stay refused, and their base free again."""
+    """Return the selection without some effects, which stay refused; free the base they held."""
     state, model = selection.state, selection.model
-    freed = {one.field for one in state.held if one.effect in effects}
-    held = tuple(one for one in state.held if one.field not in freed)
+    freed = {parameter.field for parameter in state.held if parameter.effect in effects}
+    held = tuple(parameter for parameter in state.held if parameter.field not in freed)
     state = replace(state, refused=(*state.refused, *effects), held=held)
     for effect in effects:
         model = model_selection.without_effect(state, model, effect)
@@ -91,7 +96,9 @@ def reject(selection: Selection, effects: Sequence[str]) -> Selection:
 def apply_vetoes(selection: Selection, test: Problem) -> tuple[Selection, dict[str, Veto]]:
     """Return the selection without effects that a veto rejects, and the veto of each.
 
-    test: held-out rows, with the noise of the selection's problem.
+    Args:
+        selection: to examine.
+        test: held-out rows, with the noise of the selection's problem.
     """
     vetoed: dict[str, Veto] = {}
     selection = examined(selection)
@@ -107,15 +114,15 @@ def apply_vetoes(selection: Selection, test: Problem) -> tuple[Selection, dict[s
 
 
 def examined(selection: Selection) -> Selection:
-    """Return the selection with what it leaves unexplained, and the names that stand in for it."""
+    """Return the selection with its unexplained part, and the names that stand in for it."""
     problem, model = selection.state.problem, selection.model
-    rest, dependences = unknown.find_unexplained(problem, model, selection.base.vector)
-    selection = selection._replace(unexplained=rest, stand_ins=())
-    if not rest.flagged:
+    unexplained, dependences = unknown.find_unexplained(problem, model, selection.base.vector)
+    selection = selection._replace(unexplained=unexplained, stand_ins=())
+    if not unexplained.flagged:
         return selection
     suspects = [
-        Suspect(one.effect, one.fields, weight.robust, weight.num_parameters)
-        for one, weight in zip(model.candidates, selection.ablations.values(), strict=True)
+        Suspect(candidate.effect, candidate.fields, ablation.robust, ablation.num_parameters)
+        for candidate, ablation in zip(model.candidates, selection.ablations.values(), strict=True)
     ]
     state, linearization = selection.state.linearized(model.vector)
     for name, change in model_selection.base_changes(state, linearization, model).items():
@@ -127,9 +134,13 @@ def examined(selection: Selection) -> Selection:
 
 
 class Suspect(NamedTuple):
-    """A suspected name, its parameters, and its gain over its inflation.
+    """A name that may stand in for something unknown.
 
-    num_parameters: how many of the parameters the log determines.
+    Attributes:
+        name: of the effect, or of the cause in the base.
+        fields: its parameters.
+        robust: its gain over its inflation.
+        num_parameters: of its parameters, the number that the log determines.
     """
 
     name: str
@@ -141,70 +152,81 @@ class Suspect(NamedTuple):
 def find_stand_ins(
     selection: Selection, suspects: Sequence[Suspect], dependences: Sequence[unknown.Dependence]
 ) -> tuple[str, ...]:
-    """Return names that stand in for something that no list has.
+    """Return names that stand in for something that is not in the list of effects.
 
-    Their gain is gone beside smooth functions of what the rest depends on (with the constants of
-    those, which a wind, say, would be), or is small where something unknown disturbs the same side;
-    unless it outweighs what the dependences explain.
+    Their gain vanishes beside smooth functions of what the rest depends on (and beside constants,
+    which a wind, for example, would be), or is small while something unknown disturbs the same
+    side. A name is no stand-in if its gain outweighs what the dependences explain.
     """
     problem, model = selection.state.problem, selection.model
-    left, slopes = unknown.linearized_residuals(problem, model)
+    residuals, slopes = unknown.linearized_residuals(problem, model)
     flight = unknown.flight_of(problem, model)
     disturbed = {name.split(":")[0] for name in selection.unexplained.shares}
 
-    def noncentralities(one: Suspect, side: str) -> tuple[float, float]:
+    def noncentralities(suspect: Suspect, side: str) -> tuple[float, float]:
         """Return a suspect's noncentrality on a side, alone and beside the found dependences."""
         axes = unknown.SIDES[side]
-        own = [model.indices.index(index) for index in problem.indices_of(one.fields)]
-        acting = slopes[own][..., axes, :]
+        own_columns = [model.indices.index(index) for index in problem.indices_of(suspect.fields)]
+        acting = slopes[own_columns][..., axes, :]
         if not (problem.counts[..., axes, :].any() and np.abs(acting).max() > 0.0):
             return 0.0, 0.0
-        test = unknown.SideTest.of(side, left, np.delete(slopes, own, axis=0))
+        test = unknown.SideTest.of(side, residuals, np.delete(slopes, own_columns, axis=0))
         columns = blocks_of(acting * test.root)
-        size = (model.vector - problem.start)[problem.indices_of(one.fields)]
+        size = (model.vector - problem.start)[problem.indices_of(suspect.fields)]
         before = test.noncentrality(columns, size)
-        more = [dependence.columns for dependence in dependences if dependence.side == side]
-        if more:
+        smooth_columns = [
+            dependence.columns for dependence in dependences if dependence.side == side
+        ]
+        if smooth_columns:
             constants = unknown.whitened(problem, unknown.constants(flight, side), side)
-            more.append(blocks_of(constants * test.root))
-        return before, test.given_also(*more).noncentrality(columns, size)
+            smooth_columns.append(blocks_of(constants * test.root))
+        return before, test.given_also(*smooth_columns).noncentrality(columns, size)
 
     result = []
-    for one in suspects:
-        by_side = {side: noncentralities(one, side) for side in unknown.SIDES}
+    for suspect in suspects:
+        by_side = {side: noncentralities(suspect, side) for side in unknown.SIDES}
         before, after = (sum(values) for values in zip(*by_side.values(), strict=True))
         if before == 0.0:
             continue  # it acts on neither side: the battery
         own_side = max(by_side, key=lambda side: by_side[side][0])
-        least = threshold(one.num_parameters)
+        min_gain = threshold(suspect.num_parameters)
         rest_gain = sum(
             dependence.gain for dependence in dependences if dependence.side == own_side
         )
-        is_gone = after < least or (
-            after < KEPT_SHARE * before and one.robust < OUTWEIGHS * rest_gain
+        is_gone = after < min_gain or (
+            after < KEPT_SHARE * before and suspect.robust < OUTWEIGHS * rest_gain
         )
-        needed = least * (DISTURBED_BASE if one.name in BASE_CAUSES else DISTURBED)
-        if is_gone or (own_side in disturbed and one.robust < needed):
-            result.append(one.name)
+        needed = min_gain * (DISTURBED_BASE if suspect.name in BASE_CAUSES else DISTURBED)
+        if is_gone or (own_side in disturbed and suspect.robust < needed):
+            result.append(suspect.name)
     return tuple(result)
 
 
 def stands_in_for_unknown(selection: Selection, test: Problem) -> list[str]:
-    """Reject effects that stand in for something that no list has."""
+    """Reject effects that stand in for something that is not in the list of effects."""
     return [effect for effect in selection.ablations if effect in selection.stand_ins]
 
 
 def held_out_gain(test: Problem, less: np.ndarray, full: np.ndarray) -> tuple[float, float]:
-    """Return a model's gain over a lesser one on other rows, and that expected if it is right."""
+    """Return a model's gain on held-out rows, and the gain expected if the model is right.
+
+    Args:
+        test: the rows.
+        less: the vector of the smaller model.
+        full: the vector of the model.
+    """
     white = test.whitened_residuals(less, full)
     gain = float(np.sum(white[0] ** 2) - np.sum(white[1] ** 2))
     return gain, float(np.sum((white[0] - white[1]) ** 2))
 
 
 def is_contradicted(gain: float, expected: float, inflation: float) -> bool:
-    """Return whether a gain on held-out rows says that a cause is not there.
+    """Return whether a gain on held-out rows contradicts a cause.
 
-    expected: the gain if it were; its spread is that of a chi2 about it.
+    Args:
+        gain: of the cause, there.
+        expected: the gain if the cause is real; its spread is that of a chi2 about it.
+        inflation: of the gain's variance.
     """
     spread = 2.0 * np.sqrt(expected * inflation)
     if gain < 0.0 and expected > HELD_OUT_SHOWN:
@@ -216,34 +238,35 @@ def is_contradicted(gain: float, expected: float, inflation: float) -> bool:
 
 
 def contradicted_on_held_out(selection: Selection, test: Problem) -> list[str]:
-    """Reject effects of which held-out rows show too little: they acted for a time or never."""
+    """Reject effects that held-out rows show too little: they acted for a time or never."""
 
-    def is_rejected(one: model_selection.Ablation) -> bool:
-        gain, expected = held_out_gain(test, one.without.vector, selection.model.vector)
-        return is_contradicted(gain, expected, one.inflation)
+    def is_rejected(ablation: model_selection.Ablation) -> bool:
+        gain, expected = held_out_gain(test, ablation.without.vector, selection.model.vector)
+        return is_contradicted(gain, expected, ablation.inflation)
 
-    return [effect for effect, one in selection.ablations.items() if is_rejected(one)]
+    return [effect for effect, ablation in selection.ablations.items() if is_rejected(ablation)]
 
 
 def rests(record: Record) -> np.ndarray:
-    """Return where the rate commands have rested for a while, (rows, chunks) bool.
+    """Return where the rate commands have rested for ``REST_S``, (rows, chunks) bool.
 
-    record: in chunks.
+    Args:
+        record: in chunks.
     """
     sticks = record.command[..., :3]
     rows = max(round(REST_S / float(np.median(record.step_s))), 1)
-    before = np.pad(sticks, ((rows, 0), (0, 0), (0, 0)), mode="edge")
-    moved = np.ptp(np.lib.stride_tricks.sliding_window_view(before, rows + 1, axis=0), axis=-1)
+    padded = np.pad(sticks, ((rows, 0), (0, 0), (0, 0)), mode="edge")
+    moved = np.ptp(np.lib.stride_tricks.sliding_window_view(padded, rows + 1, axis=0), axis=-1)
     return np.asarray(moved.max(axis=-1) <= REST_SHARE * np.abs(sticks).max(axis=-1))
 
 
 def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
-    """Reject laws of the sticks that do not hold while those rest, each or all together.
+    """Reject laws of the sticks that do not hold while these rest, each or all together.
 
-    What is there in transients only is dynamics that no list has: feedforward, say, turns faster
-    than asked for on the way to full stick, as a scale and a saturation would, and not while the
-    stick stays there. Where turns are left unexplained, laws that this log never shows at rest are
-    rejected, too.
+    A law that holds in transients only stands for dynamics that are not in the list of effects. For
+    example, feedforward turns faster than commanded on the way to full stick, as a scale and a
+    saturation would, but not while the stick stays there. Where turns are left unexplained, laws
+    that this log never shows at rest are rejected, too.
     """
     state, model = selection.state, selection.model
     laws = [name for name in selection.ablations if BY_NAME[name].search.follows_sticks]
@@ -253,20 +276,23 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
         return []
     at_rest = rests(state.problem.chunks.record)
 
-    def seen(without: np.ndarray) -> tuple[float, float]:
+    def gain_at_rest(without: np.ndarray) -> tuple[float, float]:
         white = state.problem.whitened_residuals(without, model.vector)
         less, full = white[:, at_rest][..., AXES[0], :]
         return float(np.sum(less**2) - np.sum(full**2)), float(np.sum((less - full) ** 2))
 
     ablations = [selection.ablations[name] for name in laws]
-    alone = [is_contradicted(*seen(one.without.vector), one.inflation) for one in ablations]
-    if any(alone):
-        return [name for name, is_false in zip(laws, alone, strict=True) if is_false]
+    contradicted = [
+        is_contradicted(*gain_at_rest(ablation.without.vector), ablation.inflation)
+        for ablation in ablations
+    ]
+    if any(contradicted):
+        return [name for name, is_false in zip(laws, contradicted, strict=True) if is_false]
     without = ablations[0].without
-    for name in laws[1:]:  # a scale needs the saturation that undoes it, and the other way round
+    for name in laws[1:]:  # a scale needs the saturation that undoes it, and vice versa
         without = model_selection.without_effect(state, without, name)
-    gain, expected = seen(without.vector)
-    inflation = max(one.inflation for one in ablations)
+    gain, expected = gain_at_rest(without.vector)
+    inflation = max(ablation.inflation for ablation in ablations)
     are_turns_unexplained = any(name.startswith("rate:") for name in selection.unexplained.shares)
     is_unseen = expected < HELD_OUT_SHOWN * inflation and are_turns_unexplained
     return laws if is_unseen or is_contradicted(gain, expected, inflation) else []
@@ -275,16 +301,18 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
 def is_force_law(effect: str) -> bool:
     """Return whether an effect is a law of a force, which may have the wrong form.
 
-    A scale of thrust is none.
+    A scale of thrust is not a law.
     """
     acts_on_force = not {"thrust", "air", "force"}.isdisjoint(BY_NAME[effect].hooks)
     return acts_on_force and effect != "thrust_scale"
 
 
 def remainder_of_force_law(selection: Selection, test: Problem) -> list[str]:
-    """Reject laws of a force that explain next to nothing beside another one."""
+    """Reject laws of a force that explain almost nothing compared with another one."""
     gains = {
-        effect: one.gain for effect, one in selection.ablations.items() if is_force_law(effect)
+        effect: ablation.gain
+        for effect, ablation in selection.ablations.items()
+        if is_force_law(effect)
     }
     return [
         effect for effect, gain in gains.items() if gain < FORCE_REMAINDER * max(gains.values())
@@ -294,7 +322,8 @@ def remainder_of_force_law(selection: Selection, test: Problem) -> list[str]:
 def seen_once(selection: Selection, test: Problem) -> list[str]:
     """Reject effects that gain barely enough where they were fitted, and nothing on held-out rows.
 
-    One that begins or ends in flight has to gain there in any case: a few rows can carry a change.
+    An effect that begins or ends in flight has to gain there in any case: a few rows can cause an
+    apparent change.
     """
     changing = {one.effect for one in selection.state.problem.windows}
 
@@ -308,7 +337,7 @@ def seen_once(selection: Selection, test: Problem) -> list[str]:
     return [effect for effect, one in selection.ablations.items() if is_rejected(effect, one)]
 
 
-# Rules in one row act together, on the same selection.
+# Rules in one row are applied together, to the same selection.
 VETOES: tuple[tuple[Veto, ...], ...] = (
     (stands_in_for_unknown,),
     (contradicted_on_held_out,),
