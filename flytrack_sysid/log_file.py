@@ -112,8 +112,10 @@ def describe(log: FlightLog) -> str:
             "gaps: none",
         ]
         if len(gaps):
-            longest = gaps[np.argmax(steps[gaps])]
-            lines[2] = f"gaps: {len(gaps)}, longest {steps[longest]:.4g} s, after row {longest}"
+            row_of_longest = gaps[np.argmax(steps[gaps])]
+            lines[2] = (
+                f"gaps: {len(gaps)}, longest {steps[row_of_longest]:.4g} s, after row {row_of_longest}"
+            )
     return "\n".join([*lines, *_ranges(log)])
 
 
@@ -147,8 +149,8 @@ def _read_npz(path: Path) -> Table:
     check_names(str(path), list(arrays))
     for name, values in arrays.items():
         if values.dtype.kind not in "iuf" or values.ndim != 1:
-            found = f"an array of {values.dtype}, shape {values.shape}"
-            raise LogError(f"{path}: column {name}: found {found}, expected a row of numbers")
+            description = f"an array of {values.dtype}, shape {values.shape}"
+            raise LogError(f"{path}: column {name}: found {description}, expected a row of numbers")
     return Table(str(path), {name: np.asarray(values, float) for name, values in arrays.items()})
 
 
@@ -243,8 +245,8 @@ def _number(where: str, column: str, cell: str) -> float:
     if (
         not math.isfinite(value) or "_" in cell
     ):  # Python reads 1_000 as a number; other programs do not
-        found = quote_value(cell) if cell.strip() else "an empty cell"
+        description = quote_value(cell) if cell.strip() else "an empty cell"
         raise LogError(
-            f"{where}, column {quote_name(column)}: found {found}, expected a finite number"
+            f"{where}, column {quote_name(column)}: found {description}, expected a finite number"
         )
     return value

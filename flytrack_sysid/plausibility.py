@@ -153,9 +153,9 @@ def _length(log: FlightLog) -> Iterator[str]:
 
 def _commands(log: FlightLog) -> Iterator[str]:
     if np.ptp(log["u"], axis=0).max() <= STILL:
-        found = ", ".join(f"{value:g}" for value in log["u"][0])
+        values = ", ".join(f"{value:g}" for value in log["u"][0])
         yield (
-            f"{_columns('u')}: found {found} in every row, expected commands that move: they look "
+            f"{_columns('u')}: found {values} in every row, expected commands that move: they look "
             "stuck"
         )
 
@@ -164,8 +164,8 @@ def _motion(log: FlightLog) -> Iterator[str]:
     measured = [name for name in ("p", "v", "a", "f", "q", "w") if name in log]
     moving = {name for name in ("u", *measured) if np.ptp(log[name], axis=0).max() > STILL}
     if measured and moving == {"u"}:
-        found = "found the same values in every row while the commands move"
-        yield f"{_columns(*measured)}: {found}: the sensors or their logging look stuck"
+        problem = "found the same values in every row while the commands move"
+        yield f"{_columns(*measured)}: {problem}: the sensors or their logging look stuck"
 
 
 def summed_turns(attitude: Rotation) -> np.ndarray:
@@ -181,11 +181,11 @@ def _attitude(log: FlightLog) -> Iterator[str]:
     windows = windows_of(log, WINDOWS_S[-1])
     turn = np.linalg.norm(windows.mean_of(log, log["w"]), axis=1) * windows.durations
     if np.ptp(log["q"], axis=0).max() <= STILL and len(turn) and turn.max() > MIN_TURN:
-        found = (
+        problem = (
             f"found the same in every row while {_columns('w')} turn by {turn.max():.2g} rad in a "
             "second"
         )
-        yield f"{_columns('q')}: {found}: the attitude looks stuck"
+        yield f"{_columns('q')}: {problem}: the attitude looks stuck"
 
 
 def _pairs(log: FlightLog) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -327,14 +327,14 @@ def _rates(log: FlightLog) -> Iterator[str]:
             log, summed_turns(Rotation.from_quat(log["q"], scalar_first=True)), log["w"]
         )
         if _is_about(slope, np.rad2deg(1.0)):
-            found = f"found {slope:.3g} for the rates over those by {_columns('q')}, expected 1"
-            yield f"{_columns('w')}: {found}: this looks like deg/s, not rad/s"
+            problem = f"found {slope:.3g} for the rates over those by {_columns('q')}, expected 1"
+            yield f"{_columns('w')}: {problem}: this looks like deg/s, not rad/s"
             return
     fast = np.percentile(np.linalg.norm(log["w"], axis=1), FAST_PERCENTILE)
     if fast > FASTEST_RATE:
-        found = f"found a {FAST_PERCENTILE:g}th percentile of {fast:.0f}"
+        problem = f"found a {FAST_PERCENTILE:g}th percentile of {fast:.0f}"
         expected = f"expected at most {FASTEST_RATE:.0f} rad/s, all that gyroscopes measure"
-        yield f"{_columns('w')}: {found}, {expected}: this looks like deg/s"
+        yield f"{_columns('w')}: {problem}, {expected}: this looks like deg/s"
 
 
 def _acceleration(log: FlightLog) -> Iterator[str]:
@@ -347,8 +347,8 @@ def _acceleration(log: FlightLog) -> Iterator[str]:
     changes = windows.change_of(log["v"]) / windows.durations[:, None]
     offset = float(np.median((windows.mean_of(log, log["a"]) - changes)[:, 2]))
     if abs(offset - GRAVITY) <= MAX_BIAS:
-        found = f"found {offset:.3g} m/s^2 more than v_z changes by, expected 0 in hover"
-        yield f"a_z: {found}: gravity looks left in, as an accelerometer measures it"
+        problem = f"found {offset:.3g} m/s^2 more than v_z changes by, expected 0 in hover"
+        yield f"a_z: {problem}: gravity looks left in, as an accelerometer measures it"
 
 
 def _force(log: FlightLog) -> Iterator[str]:
@@ -386,8 +386,8 @@ def _force_sign(log: FlightLog) -> Iterator[str]:
         body_z_w = Rotation.from_quat(log["q"], scalar_first=True).apply([0.0, 0.0, 1.0])
         force_z = force_z[body_z_w[:, 2] >= UPRIGHT]
     if len(force_z) >= MIN_UPRIGHT_ROWS and np.median(force_z) <= -MIN_FORCE_DOWN:
-        found = f"found a median of {np.median(force_z):.3g} m/s^2 where upright"
-        yield f"f_z: {found}, expected about {GRAVITY:.3g}: z looks as if it pointed down"
+        problem = f"found a median of {np.median(force_z):.3g} m/s^2 where upright"
+        yield f"f_z: {problem}, expected about {GRAVITY:.3g}: z looks as if it pointed down"
 
 
 def _battery(log: FlightLog) -> Iterator[str]:

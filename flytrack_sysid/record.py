@@ -82,13 +82,13 @@ def _new_times(
     ends = np.append(log.segment[1:] != log.segment[:-1], True)
     is_long = ~ends & (steps > MAX_FILLED_S)
     is_gap = ~ends & ~is_long & (steps > GAP_STEPS * usual_step_s)
-    pieces = np.where(is_gap, np.round(steps / usual_step_s).astype(int), 1)
-    pieces = np.maximum(pieces, 1)
-    row = np.repeat(np.arange(len(log)), pieces)
-    part = np.arange(len(row)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    times = log.time[row] + part * (steps / pieces)[row]
-    begins = (part == 0) & np.append(True, (ends | is_long)[:-1])[row]
-    return times, np.where(part == 0, row, -1 - row), begins
+    num_parts = np.where(is_gap, np.round(steps / usual_step_s).astype(int), 1)
+    num_parts = np.maximum(num_parts, 1)
+    row = np.repeat(np.arange(len(log)), num_parts)
+    index_in_step = np.arange(len(row)) - np.repeat(np.cumsum(num_parts) - num_parts, num_parts)
+    times = log.time[row] + index_in_step * (steps / num_parts)[row]
+    begins = (index_in_step == 0) & np.append(True, (ends | is_long)[:-1])[row]
+    return times, np.where(index_in_step == 0, row, -1 - row), begins
 
 
 def _doubts(log: FlightLog, pieces: np.ndarray) -> np.ndarray:

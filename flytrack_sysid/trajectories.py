@@ -134,15 +134,15 @@ def force_w(residuals: Traces, model: str, time_s: np.ndarray) -> np.ndarray:
     columns, counts = zip(
         *(residuals.column(model, f"force_world_{axis}") for axis in "xyz"), strict=True
     )
-    parts = np.column_stack([*columns, np.ones(len(time_s))])
+    forces_and_one = np.column_stack([*columns, np.ones(len(time_s))])
     # Weighted by duration, so that only velocity noise at the ends of a window remains.
-    is_scored = counts[0] & np.isfinite(parts).all(axis=1)
+    is_scored = counts[0] & np.isfinite(forces_and_one).all(axis=1)
     weight = np.where(is_scored, np.diff(time_s, prepend=time_s[:1]), 0.0)[:, None]
-    cumulative = np.cumsum(np.where(weight > 0.0, parts * weight, 0.0), axis=0)
-    cumulative = np.concatenate([np.zeros((1, 4)), cumulative])
+    integral = np.cumsum(np.where(weight > 0.0, forces_and_one * weight, 0.0), axis=0)
+    integral = np.concatenate([np.zeros((1, 4)), integral])
     begin = np.searchsorted(time_s, time_s - 0.5 * WINDOW_S)
     end = np.searchsorted(time_s, time_s + 0.5 * WINDOW_S, side="right")
-    total = cumulative[end] - cumulative[begin]
+    total = integral[end] - integral[begin]
     has_any = weight[:, 0] > 0.0
     force[residuals.row[has_any]] = total[has_any, :3] / total[has_any, 3:]
     return force

@@ -159,14 +159,14 @@ def _parts(flight: ImportedFlight) -> list[ImportedFlight]:
     numbers = np.unique(log.segment)
     if len(numbers) == 1:
         return [flight]
-    parts = []
+    flights = []
     for count, number in enumerate(numbers, start=1):
-        part = replace(
+        segment_log = replace(
             log.select(log.segment == number),
             source=f"{log.source}, part {count} of {len(numbers)}",
         )
-        parts.append(flight._replace(log=part, notes=flight.notes if count == 1 else ()))
-    return parts
+        flights.append(flight._replace(log=segment_log, notes=flight.notes if count == 1 else ()))
+    return flights
 
 
 def _flights_in_the_air(
@@ -213,13 +213,13 @@ def _with_measured_voltage(log: FlightLog) -> tuple[FlightLog, list[str]]:
     if "v_bat" not in log or log["v_bat"].min() > 0.0:
         return log, []
     is_measured = log["v_bat"][:, 0] > 0.0
-    found = f"{log.source}: v_bat: not above 0 V in {np.sum(~is_measured)} of {len(log)} rows"
+    problem = f"{log.source}: v_bat: not above 0 V in {np.sum(~is_measured)} of {len(log)} rows"
     if not is_measured.any():
-        return log.without("v_bat"), [f"{found}: left out"]
+        return log.without("v_bat"), [f"{problem}: left out"]
     row = np.arange(len(log))
     volts = np.interp(row, row[is_measured], log["v_bat"][is_measured, 0])
     channels = {**log.channels, "v_bat": volts[:, None]}
-    return replace(log, channels=channels), [f"{found}: interpolated between the others"]
+    return replace(log, channels=channels), [f"{problem}: interpolated between the others"]
 
 
 def _is_selected(path: Path, log: FlightLog, mapping: Mapping) -> np.ndarray:
@@ -253,8 +253,8 @@ def _is_airborne(log: FlightLog, above_m: float, source: str) -> np.ndarray:
         )
     is_high = log["p"][:, 2] - log["p"][0, 2] > above_m
     stretch = np.cumsum(np.diff(is_high, prepend=False))  # odd stretches are high
-    longest = np.argmax(np.bincount(stretch[is_high])) if is_high.any() else -1
-    return stretch == longest
+    longest_stretch = np.argmax(np.bincount(stretch[is_high])) if is_high.any() else -1
+    return stretch == longest_stretch
 
 
 def _count_of(path: Path, wanted: Manifest) -> int:

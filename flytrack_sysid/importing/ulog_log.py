@@ -284,10 +284,10 @@ def _check_full_stick(path: Path, commands: np.ndarray, full_stick: np.ndarray) 
         advised = ", ".join(
             f"{value:.0f}" for value in np.ceil(np.maximum(largest, 1.0) * full_stick)
         )
-        found = f"roll, pitch, yaw: found setpoints of up to {reached} deg/s"
+        problem = f"roll, pitch, yaw: found setpoints of up to {reached} deg/s"
         expected = f"expected at most full stick, {limits} deg/s"
         advice = f"in a mapping, craft.max_rate_deg_s = [{advised}] raises it"
-        raise LogError(f"{path}: topic vehicle_rates_setpoint: {found}, {expected}; {advice}")
+        raise LogError(f"{path}: topic vehicle_rates_setpoint: {problem}, {expected}; {advice}")
 
 
 def _full_stick_deg_s(path: Path, parameters: dict[str, float]) -> tuple[float, float, float]:
