@@ -66,7 +66,7 @@ def _fly_plant(plant: Plant) -> Fly:
             states = np.asarray(fly_all(starts, commands))
             plant.check_alive()
             return states
-        except Exception as error:  # whatever a user's plant raises
+        except Exception as error:  # a user's plant may raise anything
             raise CollectError(f"plant: {type(error).__name__}: {error}") from error
 
     return fly
@@ -77,9 +77,9 @@ def _fly_function(step: StepFunction, report: Report) -> Fly:
 
     def checked(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         try:
-            # Copies: a function that changes its arguments must not change the log.
+            # Pass copies, because a function that changes its arguments must not change the log.
             after = np.asarray(step(x.copy(), u.copy()), np.float32)
-        except Exception as error:  # whatever a user's function raises
+        except Exception as error:  # a user's function may raise anything
             raise CollectError(f"step: {type(error).__name__}: {error}") from error
         if after.shape != (STATE_SIZE,):
             raise CollectError(

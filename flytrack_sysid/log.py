@@ -51,7 +51,7 @@ COLUMNS = (
     *(column for columns in CHANNELS.values() for column in columns),
     *STATED,
 )
-# What flew a log, and what its files say of it in the column ``measured``.
+# Origins of a log, and the values of the column ``measured`` that state them.
 Origin = Literal["measured", "simulated"]
 ORIGINS: dict[float, Origin] = {1.0: "measured", 0.0: "simulated"}
 GAP_STEPS = 1.5  # of the usual step: a longer step lacks a sample; loggers jitter by less

@@ -32,10 +32,10 @@ MAX_BYTES = 512 * 2**20
 PACKED_BYTES, MAX_RATIO = (
     2**24,
     32,
-)  # characters in a compressed file: that, or as many times its bytes
+)  # most characters of a compressed file: that many, or that many times its bytes if more
 MAX_VALUES = (
     56 * 2**20
-)  # all columns at 1 kHz for half an hour; twice as many float64 are below 1 GiB
+)  # all columns at 1 kHz for half an hour; twice as many float64 take less than 1 GiB
 MAX_ROW_LENGTH = 2**16  # characters: thousands of columns
 
 
@@ -112,10 +112,8 @@ def describe(log: FlightLog) -> str:
             "gaps: none",
         ]
         if len(gaps):
-            row_of_longest = gaps[np.argmax(steps[gaps])]
-            lines[2] = (
-                f"gaps: {len(gaps)}, longest {steps[row_of_longest]:.4g} s, after row {row_of_longest}"
-            )
+            gap_row = gaps[np.argmax(steps[gaps])]
+            lines[2] = f"gaps: {len(gaps)}, longest {steps[gap_row]:.4g} s, after row {gap_row}"
     return "\n".join([*lines, *_ranges(log)])
 
 

@@ -15,7 +15,7 @@ STEEP_RC_RATE, STEEP_SLOPE = 2.0, 14.54  # the curve is steeper above this RC ra
 BETAFLIGHT_RATE_DEG_S = KISS_RATE_DEG_S = 200.0  # at RC rate 1
 TENS = 10.0  # deg/s in one unit of the other types' settings
 QUICK_RATE_DEG_S = 2.0  # per unit of RC rate
-MIN_REMAINDER = 0.01  # of 1 less the super rate, as the firmware bounds it
+MIN_REMAINDER = 0.01  # lower bound of 1 minus the super rate, as in the firmware
 # Settings that the effect of the loop assumes; a craft with other settings has another loop.
 ASSUMED = {
     "mixer_type": "LEGACY",
@@ -31,7 +31,7 @@ ASSUMED = {
 GENERIC = BetaflightLoop(20.0, 20.0, 2.0, 2.0, 0.02, 0.5)
 SETTINGS = BetaflightLoop._fields[
     BetaflightLoop._fields.index("p_roll") :
-]  # before them: the craft
+]  # the fields before are of the craft
 MIN_SMOOTHING_HZ, SMOOTHING, TENTHS = 15, 1.5, 10.0
 
 

@@ -61,7 +61,7 @@ class Craft(NamedTuple):
         per_volt = float(nominal.battery.full_v) / full_v
         coeffs = np.asarray(nominal.thrust_coeffs, float) * self.mass_kg / float(nominal.m)
         coeffs[VOLTAGE_TERMS:] *= per_volt
-        leaves: dict[str, Any] = {  # of NumPy
+        leaves: dict[str, Any] = {  # NumPy arrays
             "thrust_coeffs": coeffs.astype(np.float32),
             "max_rate": np.asarray(self.max_rate_deg_s, np.float32),
         }
