@@ -1,14 +1,14 @@
 """Offsets between the clocks of sensors that measure the same motion.
 
 Only sensors are compared: attitude with gyroscope, velocity with accelerometer, position with
-velocity. Commands are not: how late the motion follows them is the plant's lag. But if a
-drone turns before its command, the clock of the commands is late. A slow estimator looks like a
-late clock and is corrected as one.
+velocity. Commands are not compared, because the delay of the motion behind them is the plant's lag.
+But if a drone turns before its command, the clock of the commands is late. A slow estimator looks
+like a late clock and is corrected as one.
 
-Of a pair, one is the integral of the other. Both are taken as changes over the same windows of 0.1
-s, so that both are filtered alike; the offset minimises the squared difference (Gauss-Newton from
-the best of a grid), and a jackknife over blocks of 2 s gives its standard error (Efron and
-Tibshirani 1993, chapter 11).
+One channel of a pair is the integral of the other. Both are compared as changes over the same
+windows of 0.1 s, so that both are filtered equally. The offset minimises the squared difference
+(Gauss-Newton from the best point of a grid). A jackknife over blocks of 2 s gives its standard
+error (Efron and Tibshirani 1993, chapter 11).
 """
 
 from collections.abc import Callable, Sequence
@@ -25,16 +25,16 @@ from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
 from flytrack_sysid.plausibility import GRAVITY, MIN_CORRELATION, summed_turns
 from flytrack_sysid.resample import interpolate, interpolate_quaternions
 
-MAX_OFFSET_S = 0.25  # beyond it, loggers are broken rather than late
+MAX_OFFSET_S = 0.25  # above, a logger is broken rather than late
 WINDOW_S = 0.1  # long against the noise of a sample, short against manoeuvres
-GRID_S = 0.01  # below it, the cost has one minimum: motion of a drone is slower
+GRID_S = 0.01  # within one step the cost has one minimum: motion of a drone is slower
 ROUNDS = 5  # of Gauss-Newton; it converges in two
-BLOCK_S = 2.0  # errors further apart than this have little in common
+BLOCK_S = 2.0  # errors further apart are hardly correlated
 MIN_BLOCKS = 5
-SPIKE = 12.0  # times the median deviation from both neighbours: eight standard deviations
+SPIKE = 12.0  # times the median deviation from the neighbours' mean: eight standard deviations
 SIGNIFICANT = 3.0  # standard errors
 CORRECTED, LEFT = "corrected", "significant, left as asked"
-# Of a clock that a diagnosis corrects: standard errors, and s.
+# A diagnosis corrects clocks that are later than this: standard errors, and s.
 LATE_ERRORS, LATE_S = 5.0, 0.005
 MIN_STEPS = 0.1  # of the log's step: smaller offsets change less than the step itself does
 
@@ -42,9 +42,13 @@ MIN_STEPS = 0.1  # of the log's step: smaller offsets change less than the step 
 class ClockOffset(NamedTuple):
     """How late one channel's clock is against another's.
 
-    channel, reference: of ``CHANNELS``. offset_s: what ``channel`` shows at t happened at t -
-    offset_s, s. sigma_s: its standard error, s. correlation: of the changes in both. verdict: what
-    was done.
+    Attributes:
+        channel: the compared channel, of ``CHANNELS``.
+        reference: the channel that it is compared with, of ``CHANNELS``.
+        offset_s: values of ``channel`` at time t are of time t - offset_s.
+        sigma_s: standard error of the offset.
+        correlation: of the changes in both.
+        verdict: what was done.
     """
 
     channel: str
@@ -70,7 +74,13 @@ class ClockOffset(NamedTuple):
 class _Stretch(NamedTuple):
     """A stretch of a log without gaps, and its windows.
 
-    starts, ends, block: of each window. change: over each window. rate, integral: by time.
+    Attributes:
+        starts: start of each window, s.
+        ends: end of each window, s.
+        change: of the integrated channel over each window.
+        rate: the other channel, as a function of time.
+        integral: its integral, as a function of time.
+        block: number of the jackknife block of each window.
     """
 
     starts: np.ndarray
@@ -81,9 +91,9 @@ class _Stretch(NamedTuple):
     block: np.ndarray
 
     def differences(self, offset_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the change, the integrated rate and its slope, each centred.
+        """Return the change, the integrated rate and its derivative by the offset, each centred.
 
-        The rate is integrated over windows moved by an offset; the slope is by this offset.
+        The rate is integrated over windows that are moved by the offset.
         """
         starts, ends = self.starts - offset_s, self.ends - offset_s
         integral = self.integral(ends) - self.integral(starts)
@@ -100,8 +110,8 @@ def _acceleration(log: FlightLog) -> np.ndarray:
     return force_w - np.array([0.0, 0.0, GRAVITY])
 
 
-# Channel, reference, required channels, and both as functions of the log. In this order each
-# reference has been corrected before it is used.
+# Channel, reference, required channels, and the integrated channel and its rate as functions of the
+# log. In this order each reference is corrected before it is used.
 PAIRS = (
     ("q", "w", ("q", "w"), _turns, lambda log: log["w"]),
     ("v", "f", ("v", "f", "q"), lambda log: log["v"], _acceleration),
@@ -112,17 +122,17 @@ PAIRS = (
 def _without_spikes(values: np.ndarray) -> np.ndarray:
     """Return values (num_rows, n) with isolated spikes replaced by the mean of their neighbours."""
     between = 0.5 * (values[:-2] + values[2:])
-    off = np.pad(np.abs(values[1:-1] - between), ((1, 1), (0, 0)))
-    usual = np.median(off[1:-1], axis=0)
-    is_peak = (off[1:-1] >= off[:-2]) & (off[1:-1] >= off[2:])
-    is_spike = (is_peak & (off[1:-1] > SPIKE * usual)).any(axis=1, keepdims=True)
-    found = np.array(values)
-    found[1:-1] = np.where(is_spike, between, values[1:-1])
-    return found
+    deviation = np.pad(np.abs(values[1:-1] - between), ((1, 1), (0, 0)))
+    median_deviation = np.median(deviation[1:-1], axis=0)
+    is_peak = (deviation[1:-1] >= deviation[:-2]) & (deviation[1:-1] >= deviation[2:])
+    is_spike = (is_peak & (deviation[1:-1] > SPIKE * median_deviation)).any(axis=1, keepdims=True)
+    result = np.array(values)
+    result[1:-1] = np.where(is_spike, between, values[1:-1])
+    return result
 
 
 def _stretches(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> list[_Stretch]:
-    """Return the runs without a gap, each within a segment, that are long enough."""
+    """Return the stretches without a gap, within segments, that have at least two windows."""
     stretches, num_blocks = [], 0
     is_gap = np.diff(log.time) > GAP_STEPS * usual_step(log)[:-1]
     edges = np.flatnonzero(np.append(is_gap | log.is_start()[1:], True)) + 1
@@ -144,21 +154,24 @@ def _stretches(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> list[_Str
 
 
 def _cost(stretches: list[_Stretch], offset_s: float) -> float:
-    parts = (stretch.differences(offset_s) for stretch in stretches)
-    return sum(float(np.sum((change - integral) ** 2)) for change, integral, _ in parts)
+    differences = (stretch.differences(offset_s) for stretch in stretches)
+    return sum(float(np.sum((change - integral) ** 2)) for change, integral, _ in differences)
 
 
 def _sums(stretches: list[_Stretch], offset_s: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return Gauss-Newton's numerator and denominator by block, and the correlation.
+    """Return the sums of a Gauss-Newton step over each block, and the correlation.
 
-    Numerator and denominator are (num_blocks,).
+    Returns:
+        numerator: (num_blocks,).
+        denominator: (num_blocks,).
+        correlation: of change and integral.
     """
     numerator, denominator, products = [], [], np.zeros(3)
     for stretch in stretches:
         change, integral, slope = stretch.differences(offset_s)
         _, block = np.unique(
             stretch.block, return_inverse=True
-        )  # none is empty, however long the gaps
+        )  # numbered from 0, so that gaps leave no empty blocks
         numerator.append(np.bincount(block, np.sum(slope * (change - integral), axis=1)))
         denominator.append(np.bincount(block, np.sum(slope**2, axis=1)))
         products += [np.sum(change * integral), np.sum(change**2), np.sum(integral**2)]
@@ -169,13 +182,13 @@ def _sums(stretches: list[_Stretch], offset_s: float) -> tuple[np.ndarray, np.nd
 def offset_between(
     log: FlightLog, sums: np.ndarray, rates: np.ndarray
 ) -> tuple[float, float, float, str]:
-    """Return offset, standard error and correlation, or why they are unknown (else empty)."""
+    """Return offset, s, standard error, s, correlation, and why they are unknown ("" if known)."""
     unknown = np.nan, np.nan, np.nan
     stretches = _stretches(log, sums, rates)
     if sum(stretch.block[-1] - stretch.block[0] + 1 for stretch in stretches) < MIN_BLOCKS:
         return *unknown, f"not compared: less than {MIN_BLOCKS * BLOCK_S:g} s without a gap"
     if any(not np.ptp(values, axis=0).any() for values in (sums, rates)):
-        # All offsets fit a constant signal equally well: rounding would choose between the reasons.
+        # All offsets fit a constant signal equally well, so rounding would choose the reason.
         return *unknown, "not compared: correlation 0.00: they do not show one motion clearly"
     # Windows keep the largest offset away from the ends of the data; the grid stays within it.
     grid = np.arange(-MAX_OFFSET_S + GRID_S, MAX_OFFSET_S - GRID_S / 2, GRID_S)
@@ -192,42 +205,46 @@ def offset_between(
     numerator, denominator, correlation = _sums(stretches, offset)
     if np.any(denominator.sum() - denominator <= 0.0):
         return *unknown, f"not compared: all motion is within {BLOCK_S:g} s"
-    left_out = (numerator.sum() - numerator) / (denominator.sum() - denominator)
-    count = len(left_out)
-    sigma = float(np.sqrt((count - 1) / count * np.sum((left_out - left_out.mean()) ** 2)))
+    jackknife = (numerator.sum() - numerator) / (denominator.sum() - denominator)
+    count = len(jackknife)
+    sigma = float(np.sqrt((count - 1) / count * np.sum((jackknife - jackknife.mean()) ** 2)))
     return offset, sigma, correlation, ""
 
 
 def read_later(
     log: FlightLog, channels: Sequence[str], offset_s: float
 ) -> tuple[FlightLog, np.ndarray]:
-    """Return the log with some channels read ``offset_s`` later, and the rows where that is known.
+    """Return the log with some channels interpolated ``offset_s`` later, and where they are known.
 
-    Interpolated; what is not known, (num_rows,) bool False, is anything.
+    Returns:
+        log: the changed log; values of rows where they are not known are arbitrary.
+        is_known: (num_rows,) bool.
     """
-    found, is_known = dict(log.channels), np.ones(len(log), bool)
+    channels_later, is_known = dict(log.channels), np.ones(len(log), bool)
     bounds = np.append(np.flatnonzero(log.is_start()), len(log))
     for channel in channels:
-        values, is_there = np.array(log[channel], float), np.zeros(len(log), bool)
-        look_up = interpolate_quaternions if channel == "q" else interpolate
+        values, is_known_here = np.array(log[channel], float), np.zeros(len(log), bool)
+        interpolate_channel = interpolate_quaternions if channel == "q" else interpolate
         for rows in (slice(start, end) for start, end in pairwise(bounds)):
             times = log.time[rows]
-            values[rows], is_there[rows] = look_up(times, log[channel][rows], times + offset_s)
-        found[channel] = values
-        is_known &= is_there
-    return replace(log, channels=found), is_known
+            values[rows], is_known_here[rows] = interpolate_channel(
+                times, log[channel][rows], times + offset_s
+            )
+        channels_later[channel] = values
+        is_known &= is_known_here
+    return replace(log, channels=channels_later), is_known
 
 
 def align_clocks(log: FlightLog, correct: bool = True) -> tuple[FlightLog, tuple[ClockOffset, ...]]:
     """Return a log with its sensors on one clock, and the offset of each pair that can be compared.
 
-    Offsets above three standard errors and a tenth of the log's step are corrected by reading the
-    channel later, interpolated; others, and all without ``correct``, are only reported. Rates,
-    specific force and commands count as one clock.
+    Interpolating a channel later corrects offsets above three standard errors and a tenth of the
+    log's step. Other offsets, and all without ``correct``, are only reported. Rates, specific force
+    and commands count as one clock.
     """
-    aligned, found = log, []
-    for channel, reference, needed, sums, rates in PAIRS:
-        if any(name not in log for name in needed):
+    aligned, offsets = log, []
+    for channel, reference, required, sums, rates in PAIRS:
+        if any(name not in log for name in required):
             continue
         offset, sigma, correlation, verdict = offset_between(aligned, sums(aligned), rates(aligned))
         step = float(np.median(usual_step(aligned)))
@@ -237,28 +254,31 @@ def align_clocks(log: FlightLog, correct: bool = True) -> tuple[FlightLog, tuple
             shifted, is_known = read_later(aligned, (channel,), offset)
             aligned = shifted.select(is_known)
             verdict = CORRECTED if correct else LEFT
-        found.append(ClockOffset(channel, reference, offset, sigma, correlation, verdict))
-    return aligned if correct else log, tuple(found)
+        offsets.append(ClockOffset(channel, reference, offset, sigma, correlation, verdict))
+    return aligned if correct else log, tuple(offsets)
 
 
 def on_one_clock(log: FlightLog) -> tuple[FlightLog, np.ndarray, list[str]]:
-    """Return a log on one clock, which of its rows are kept, and a note on each corrected clock.
+    """Return a log with position and velocity on the clocks of the other sensors.
 
-    The rows that are kept are (num_rows,) bool.
+    The offset between attitude and gyroscope is subtracted from that between velocity and
+    accelerometer, because half a step of a simulator, or a latency of both inertial sensors, is no
+    clock offset. Position is compared with velocity.
 
-    Velocity is compared with the accelerometer as attitude is with the gyro: half a step of a
-    simulator, and a latency of both inertial sensors, are no clocks apart. Position is compared
-    with velocity.
+    Returns:
+        log: the corrected log.
+        is_kept: which rows it keeps, (num_rows,) bool.
+        notes: one on each corrected clock.
     """
-    pose_s, notes, kept = 0.0, [], np.ones(len(log), bool)
+    pose_s, notes, is_kept = 0.0, [], np.ones(len(log), bool)
     slack_s = 0.5 * float(
         np.median(usual_step(log))
-    )  # a simulator's force may be that of half a step before
-    for channel, reference, needed, sums, rates in PAIRS:
-        if any(name not in log for name in needed):
+    )  # the force of a simulator may be that of half a step before
+    for channel, reference, required, sums, rates in PAIRS:
+        if any(name not in log for name in required):
             continue
-        seen = log if reference != "f" else read_later(log, ("q",), pose_s)[0]
-        offset_s, sigma_s, _, reason = offset_between(seen, sums(seen), rates(seen))
+        compared = log if reference != "f" else read_later(log, ("q",), pose_s)[0]
+        offset_s, sigma_s, _, reason = offset_between(compared, sums(compared), rates(compared))
         if channel == "q":
             pose_s = 0.0 if reason else offset_s
             continue
@@ -266,40 +286,48 @@ def on_one_clock(log: FlightLog) -> tuple[FlightLog, np.ndarray, list[str]]:
         if reason or abs(late_s) <= max(LATE_ERRORS * sigma_s, LATE_S) + slack_s:
             continue
         log, is_known = read_later(log, (channel,), late_s)
-        kept &= is_known
-        other = "attitude" if reference == "f" else "velocity"
+        is_kept &= is_known
+        reference_name = "attitude" if reference == "f" else "velocity"
         name = {"v": "velocity", "p": "position"}[channel]
         notes.append(
-            f"the clock of {name} was {1e3 * late_s:.0f} ms late against that of {other}: corrected"
+            f"the clock of {name} was {1e3 * late_s:.0f} ms late against that of "
+            f"{reference_name}: corrected"
         )
-    return (log.select(kept), kept, notes) if notes else (log, kept, [])
+    return (log.select(is_kept), is_kept, notes) if notes else (log, is_kept, [])
 
 
 def with_causal_commands(
     log: FlightLog, model: ModelParameters
 ) -> tuple[FlightLog, np.ndarray, list[str]]:
-    """Return a log whose commands come before the turns they cause, the rows kept, and notes.
+    """Return a log whose commands come before the rotations that they cause.
 
-    model: its mean lag of roll and pitch is what remains between commands and turns, in whole rows,
-    where the commands were late.
+    Where the commands are late, they are moved by whole rows.
+
+    Args:
+        model: its mean lag of roll and pitch remains between moved commands and rotations.
+
+    Returns:
+        log: the corrected log.
+        is_kept: which rows it keeps, (num_rows,) bool.
+        notes: one if the commands were moved.
     """
-    every = np.ones(len(log), bool)
+    all_rows = np.ones(len(log), bool)
     if "w" not in log:
-        return log, every, []
+        return log, all_rows, []
     turns = np.cumsum(log["w"] * usual_step(log)[:, None], axis=0)
-    asked = log["u"][:, :3] * np.deg2rad(np.asarray(model.max_rate))
-    lag_s, sigma_s, _, reason = offset_between(log, turns, asked)
+    commanded = log["u"][:, :3] * np.deg2rad(np.asarray(model.max_rate))
+    lag_s, sigma_s, _, reason = offset_between(log, turns, commanded)
     step_s = float(np.median(usual_step(log)))
     if reason or lag_s >= -(max(LATE_ERRORS * sigma_s, LATE_S) + step_s):
-        return log, every, []
-    late = round((float(np.mean(np.asarray(model.tau)[:2])) - lag_s) / step_s)
-    later, run = np.arange(len(log)) + late, np.cumsum(log.is_start())
-    source = np.minimum(later, len(log) - 1)
-    kept = (source == later) & (run[source] == run)
+        return log, all_rows, []
+    late_rows = round((float(np.mean(np.asarray(model.tau)[:2])) - lag_s) / step_s)
+    later_row, run = np.arange(len(log)) + late_rows, np.cumsum(log.is_start())
+    source = np.minimum(later_row, len(log) - 1)
+    is_kept = (source == later_row) & (run[source] == run)
     log = replace(log, channels={**log.channels, "u": log["u"][source]})
     note = (
-        f"the clock of the commands was about {1e3 * late * step_s:.0f} ms late: the drone turned "
-        f"{-1e3 * lag_s:.0f} ms before it was told to; corrected so that the model's lag remains, "
-        "which this log cannot show"
+        f"the clock of the commands was about {1e3 * late_rows * step_s:.0f} ms late: the drone "
+        f"turned {-1e3 * lag_s:.0f} ms before it was told to; corrected so that the model's lag "
+        "remains, which this log cannot show"
     )
-    return log.select(kept), kept, [note]
+    return log.select(is_kept), is_kept, [note]

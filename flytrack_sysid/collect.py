@@ -3,9 +3,9 @@
 A plant is a ``flytrack_env.plants.Plant`` or a function ``step(x, u)`` of the handout's vectors.
 Only its outputs are used.
 
-Envelope: a flight ends where the drone would become faster than 20 m/s, leave heights between 10
-and 110 m, or leave the plant's battery, 22 to 24 V if it does not say. A script may go down to 0.1
-m.
+Envelope: a flight ends where the drone would exceed 20 m/s, leave heights between 10 and 110 m, or
+leave the voltages of the plant's battery (22 to 24 V if it does not state them). A script may go
+down to 0.1 m.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,14 @@ class CollectError(ValueError):
 def states_flown(
     plant: Plant, model: ModelParameters, start: jax.Array, command: jax.Array
 ) -> jax.Array:
-    """Return the states (T + 1, 21) that commands (T, 4) lead to from a start (21,), included."""
+    """Return the states, (T + 1, 21), of a plant under commands, from the start on.
+
+    Args:
+        plant: what flies.
+        model: its parameters; a black box ignores them.
+        start: first state, (21,).
+        command: (T, 4).
+    """
 
     def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
         return plant.step(state, unpack_action(action), DT_S, model), pack(plant.drone(state))
@@ -59,7 +66,7 @@ def _fly_plant(plant: Plant) -> Fly:
             states = np.asarray(fly_all(starts, commands))
             plant.check_alive()
             return states
-        except Exception as error:  # whatever a user's plant raises
+        except Exception as error:  # a user's plant may raise anything
             raise CollectError(f"plant: {type(error).__name__}: {error}") from error
 
     return fly
@@ -70,9 +77,9 @@ def _fly_function(step: StepFunction, report: Report) -> Fly:
 
     def checked(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         try:
-            # Copies: a function that changes its arguments must not change the log.
+            # Pass copies, because a function that changes its arguments must not change the log.
             after = np.asarray(step(x.copy(), u.copy()), np.float32)
-        except Exception as error:  # whatever a user's function raises
+        except Exception as error:  # a user's function may raise anything
             raise CollectError(f"step: {type(error).__name__}: {error}") from error
         if after.shape != (STATE_SIZE,):
             raise CollectError(
@@ -112,13 +119,19 @@ def find_hover(fly: Fly, middle_v: float = MIDDLE_V) -> float:
     commands[:, 0, 3] = actions
     climb = fly(starts.astype(np.float32), commands)[:, -1, ACCELERATION][:, 2]
     if not (climb[0] < 0.0 < climb[-1]):
-        found = f"{climb[0]:.3g} and {climb[-1]:.3g} m/s^2"
+        accelerations = f"{climb[0]:.3g} and {climb[-1]:.3g} m/s^2"
         raise CollectError(
-            f"plant: found vertical accelerations of {found} at thrust -1 and 1, level at "
+            f"plant: found vertical accelerations of {accelerations} at thrust -1 and 1, level at "
             f"{middle_v:g} V; expected it to sink and to climb"
         )
-    above = int(np.argmax(climb > 0.0))
-    return float(np.interp(0.0, climb[above - 1 : above + 1], actions[above - 1 : above + 1]))
+    first_climbing = int(np.argmax(climb > 0.0))
+    return float(
+        np.interp(
+            0.0,
+            climb[first_climbing - 1 : first_climbing + 1],
+            actions[first_climbing - 1 : first_climbing + 1],
+        )
+    )
 
 
 def collect(
@@ -131,13 +144,19 @@ def collect(
 ) -> FlightLog:
     """Fly the excitation, or a script instead, on a plant and return the log, a segment per flight.
 
-    plant: a plant, or a function ``(x (21,), u (4,)) -> x (21,)`` of a step of 0.01 s, started from
-    chosen states. minutes: of flight before the envelope cuts any, at least 1. noise: 0 logs the
-    state itself, 1 what common sensors measure (``flytrack_sysid.sensors``). report: called with
-    the flights done and in all.
+    Args:
+        plant: a plant, or a function ``(x (21,), u (4,)) -> x (21,)`` of a step of 0.01 s, started
+            from chosen states.
+        minutes: of flight before the envelope cuts any, at least 1.
+        seed: of the excitation and the noise.
+        noise: 0 logs the state itself, 1 what common sensors measure
+            (``flytrack_sysid.sensors``).
+        report: called with the number of flights done and in all.
+        script: flights to fly instead of the excitation.
 
-    Raises: CollectError, ScriptError: arguments out of range, or a plant or script that cannot be
-        flown.
+    Raises:
+        CollectError: an argument is out of range, or the plant cannot be flown.
+        ScriptError: the script cannot be flown.
     """
     if not MIN_MINUTES <= minutes < np.inf:
         raise CollectError(f"minutes: found {minutes}, expected at least {MIN_MINUTES:g}")
@@ -151,31 +170,31 @@ def collect(
     voltages = VOLTAGES if battery is None else (float(battery.empty_v), float(battery.full_v))
     if script is None:
         hover = find_hover(_fly_any(plant, lambda done, total: None), 0.5 * sum(voltages))
-        number = round(minutes * 60.0 / SECONDS_PER_FLIGHT)
-        flown, heights = (
-            script_of(excitation.script(number, hover, rng, voltages)),
+        num_flights = round(minutes * 60.0 / SECONDS_PER_FLIGHT)
+        flights, heights = (
+            script_of(excitation.script(num_flights, hover, rng, voltages)),
             excitation.HEIGHTS,
         )
     else:
         check_script(script)
-        flown, heights = script, excitation.SCRIPT_HEIGHTS
-    log = log_of_states(_cut(*_states(fly, flown), heights, voltages), DT_S, "collected")
+        flights, heights = script, excitation.SCRIPT_HEIGHTS
+    log = log_of_states(_cut(*_states(fly, flights), heights, voltages), DT_S, "collected")
     if noise > 0.0:
         log = measure(log, noise, float(nominal_parameters().g), rng)
     return log
 
 
-def _states(fly: Fly, flown: Script) -> tuple[np.ndarray, np.ndarray]:
-    """Return the states (N, T, 21) of a script's flights and their commands (N, T, 4), float32."""
-    starts, commands = flown.starts.astype(np.float32), flown.commands.astype(np.float32)
-    # One step ahead of the log, so that the first row's acceleration is the plant's, not the
+def _states(fly: Fly, flights: Script) -> tuple[np.ndarray, np.ndarray]:
+    """Return states, (N, T, 21), and commands, (N, T, 4), of a script's flights, float32."""
+    starts, commands = flights.starts.astype(np.float32), flights.commands.astype(np.float32)
+    # Start one step before the log, so that the first row's acceleration is the plant's, not the
     # start's.
     states = fly(starts, np.concatenate([commands[:, :1], commands], axis=1))
     if not np.isfinite(states).all():
         flight, row, column = np.argwhere(~np.isfinite(states))[0]
         raise CollectError(
             f"plant: found {states[flight, row, column]} in component {column}, flight {flight} "
-            f"({flown.kinds[flight]}), step {row}; expected finite numbers"
+            f"({flights.kinds[flight]}), step {row}; expected finite numbers"
         )
     return states[:, 1:-1], commands
 
@@ -186,9 +205,9 @@ def _cut(
     heights: tuple[float, float],
     voltages: tuple[float, float],
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return each flight up to where it leaves the envelope; leave out those below two rows."""
-    inside = excitation.is_inside(states, heights, voltages)
-    lengths = np.where(inside.all(axis=1), states.shape[1], np.argmin(inside, axis=1))
+    """Return each flight until it leaves the envelope, without flights of less than two rows."""
+    is_inside = excitation.is_inside(states, heights, voltages)
+    lengths = np.where(is_inside.all(axis=1), states.shape[1], np.argmin(is_inside, axis=1))
     kept = [
         (x[:n], u[:n]) for x, u, n in zip(states, commands, lengths, strict=True) if n >= MIN_STEPS
     ]

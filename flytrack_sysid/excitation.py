@@ -1,7 +1,7 @@
 """Excitation: short flights from chosen states that excite one axis each (docs/identification.md).
 
-Four flights of a kind follow each other, so that the last of every four can be held out
-(``flytrack_sysid.split``) and every kind is in both parts.
+Four flights of a kind follow each other. So the last of every four can be held out
+(``flytrack_sysid.split``), and both parts have every kind.
 """
 
 from typing import NamedTuple
@@ -16,11 +16,11 @@ from flytrack_env import state as layout
 # The envelope of collected flights.
 MAX_SPEED = 20.0  # m/s
 HEIGHTS = (10.0, 110.0)  # m
-SCRIPT_HEIGHTS = (0.1, 110.0)  # m, of a script, which may want flights close to the ground
+SCRIPT_HEIGHTS = (0.1, 110.0)  # m, of a script, which may have flights close to the ground
 VOLTAGES = (layout.BATTERY_EMPTY_V, layout.BATTERY_FULL_V)
-ANY_VOLTAGE = (0.0, np.inf)  # of other craft
+ANY_VOLTAGE = (0.0, np.inf)  # V, for other craft
 MIDDLE_V = 0.5 * (layout.BATTERY_EMPTY_V + layout.BATTERY_FULL_V)
-MIN_STEPS = 2  # of a flight; a shorter one shows no step
+MIN_STEPS = 2  # of a flight; a shorter one has no step
 
 DT_S = 0.01
 SLOT_STEPS = 125
@@ -28,9 +28,8 @@ FLIGHT_STEPS = 2 * SLOT_STEPS
 FLIGHTS_PER_KIND = 4
 KINDS = ("roll", "pitch", "yaw", "thrust", "free", "leg")
 AMPLITUDES = (0.1, 0.3, 0.6, 1.0)
-# The index at which each wave starts to cycle through the amplitudes: the last of four flights,
-# which may be held out, has a large step, and no full stick, which is the most informative for the
-# fit.
+# Index at which each wave starts to cycle through the amplitudes. The last of four flights, which
+# may be held out, has a large step, but no full stick, which is the most informative for the fit.
 FIRST_AMPLITUDE = {"chirp": 2, "step": 3, "doublet": 3, "sine": 2}
 FREE_AMPLITUDES = (0.3, 0.5, 0.8, 1.0)
 LEG_SPEEDS = (3.0, 7.0, 11.0, 15.0)  # m/s
@@ -38,7 +37,7 @@ HEIGHT = 60.0  # m, at the start of each flight
 LEG_SWING, LEG_STICK = 0.3, 0.2
 # How long switching commands are held: fast ones identify lags, slow ones let thrust settle.
 FAST_STEPS, SLOW_STEPS = (3, 12), (15, 40)
-# V above empty: the drain of the flight itself, for any battery that lasts a minute.
+# V above empty: drain during the flight of any battery that lasts a minute.
 RESERVE_V = 0.1
 
 
@@ -47,9 +46,12 @@ def is_inside(
     heights: tuple[float, float] = HEIGHTS,
     voltages: tuple[float, float] = VOLTAGES,
 ) -> np.ndarray:
-    """Return where states (..., 21) are within the envelope; NaN is outside.
+    """Return where states are within the envelope; NaN is outside.
 
-    heights: in m. voltages: in V.
+    Args:
+        states: (..., 21).
+        heights: lowest and highest, m.
+        voltages: lowest and highest, V.
     """
     height, battery_v = states[..., layout.POSITION][..., 2], states[..., layout.BATTERY]
     is_slow = np.linalg.norm(states[..., layout.VELOCITY], axis=-1) <= MAX_SPEED
@@ -58,7 +60,13 @@ def is_inside(
 
 
 class ScriptedFlight(NamedTuple):
-    """One flight of a script: kind, start (21,) and commands (FLIGHT_STEPS, 4), not clipped yet."""
+    """One flight of a script, whose commands are not clipped yet.
+
+    Attributes:
+        kind: one of ``KINDS``, or a manoeuvre.
+        start: state, (21,).
+        command: (FLIGHT_STEPS, 4).
+    """
 
     kind: str
     start: np.ndarray
@@ -68,7 +76,7 @@ class ScriptedFlight(NamedTuple):
 def wave(name: str, rng: np.random.Generator) -> np.ndarray:
     """Return a sine, step, doublet or chirp of amplitude 1, (SLOT_STEPS,).
 
-    Its sign is random, and so is its frequency (sine) or its timing (step, doublet).
+    The sign, the frequency of a sine, and the timing of a step or doublet are random.
     """
     time = np.arange(SLOT_STEPS) * DT_S
     duration = SLOT_STEPS * DT_S
@@ -88,7 +96,10 @@ def switching(
 ) -> np.ndarray:
     """Return a command that changes sign at random intervals, (FLIGHT_STEPS,).
 
-    Its sizes are ``smallest`` to 1. hold_steps: the shortest and the longest interval.
+    Args:
+        rng: of intervals, signs and sizes.
+        smallest: least size; the largest is 1.
+        hold_steps: the shortest and the longest interval.
     """
     holds = rng.integers(*hold_steps, size=FLIGHT_STEPS, endpoint=True)
     signs = rng.choice([-1.0, 1.0]) * (-1.0) ** np.arange(FLIGHT_STEPS)
@@ -98,13 +109,21 @@ def switching(
 def start_at(
     attitude: Rotation, hover: float, voltage: float, vel_w: ArrayLike = 0.0, height: float = HEIGHT
 ) -> np.ndarray:
-    """Return a start (21,) with the thrust action ``hover``, above the origin; m/s, m, V."""
-    x = np.zeros(layout.STATE_SIZE)
-    x[layout.POSITION], x[layout.VELOCITY] = [0.0, 0.0, height], vel_w
-    x[layout.QUATERNION] = attitude.as_quat(scalar_first=True, canonical=True)
-    x[layout.APPLIED_ACTION] = [0.0, 0.0, 0.0, hover]
-    x[layout.BATTERY] = voltage
-    return x
+    """Return a start state above the origin, (21,).
+
+    Args:
+        attitude: from body to world frame.
+        hover: applied thrust action.
+        voltage: V.
+        vel_w: m/s.
+        height: m.
+    """
+    state = np.zeros(layout.STATE_SIZE)
+    state[layout.POSITION], state[layout.VELOCITY] = [0.0, 0.0, height], vel_w
+    state[layout.QUATERNION] = attitude.as_quat(scalar_first=True, canonical=True)
+    state[layout.APPLIED_ACTION] = [0.0, 0.0, 0.0, hover]
+    state[layout.BATTERY] = voltage
+    return state
 
 
 def start_state(
@@ -121,7 +140,7 @@ def start_state(
 def _axis_command(
     axis: int, turn: int, number: int, hover: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return two waves on one axis; their kinds alternate by turn, amplitudes cycle by number."""
+    """Return two waves on one axis: their kinds alternate by turn, amplitudes cycle by number."""
     names = ("chirp", "step") if turn % 2 == 0 else ("doublet", "sine")
     command = np.tile([0.0, 0.0, 0.0, hover], (FLIGHT_STEPS, 1))
     for slot, name in enumerate(names):
@@ -171,16 +190,16 @@ def _voltages(
 ) -> np.ndarray:
     """Return the voltages of a kind's flights, (turns, 4), between nearly empty and full.
 
-    Denser towards both ends, which are the most informative on how thrust depends on the voltage.
-    In random order, except for the last of every four, which may be held out: these are spread over
-    the range by turn and kind.
+    They are denser towards both ends, which are the most informative on how thrust depends on the
+    voltage. The order is random, except for the last of every four, which may be held out: these
+    are spread over the range by turn and kind.
     """
-    lowest, count = voltages[0] + RESERVE_V, turns * FLIGHTS_PER_KIND
-    share = 0.5 - 0.5 * np.cos(np.pi * np.arange(count) / (count - 1))
-    levels = lowest + share * (voltages[1] - lowest)
+    lowest_v, count = voltages[0] + RESERVE_V, turns * FLIGHTS_PER_KIND
+    fraction = 0.5 - 0.5 * np.cos(np.pi * np.arange(count) / (count - 1))
+    levels = lowest_v + fraction * (voltages[1] - lowest_v)
     last = np.arange(turns) * FLIGHTS_PER_KIND + KINDS.index(kind) % FLIGHTS_PER_KIND
-    others = rng.permutation(np.delete(levels, last)).reshape(turns, FLIGHTS_PER_KIND - 1)
-    return np.column_stack([others, rng.permutation(levels[last])])
+    other_levels = rng.permutation(np.delete(levels, last)).reshape(turns, FLIGHTS_PER_KIND - 1)
+    return np.column_stack([other_levels, rng.permutation(levels[last])])
 
 
 def script(

@@ -1,4 +1,4 @@
-"""Writing the recording of a log; Rerun is imported only then (extra ``flytrack[viz]``)."""
+"""Writing the recording of a log; Rerun is imported on the first call (``flytrack[viz]``)."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,10 +14,16 @@ def write_flight_recording(
     models: Mapping[str, ModelParameters],
     residuals: Traces | None = None,
 ) -> str:
-    """Write a log and models' flights as a Rerun recording; return why not, "" if written.
+    """Write a log and models' flights as a Rerun recording; return the error, "" if written.
 
-    models, residuals: as for ``trajectories.trajectories_of``. Where nothing is written, a file of
-    that name is removed: it would pass for this log's.
+    If nothing is written, an existing file of that name is removed, because it would look like the
+    recording of this log.
+
+    Args:
+        path: of the recording.
+        log: the flight log.
+        models: as for ``trajectories.trajectories_of``.
+        residuals: as for ``trajectories.trajectories_of``.
     """
     try:
         from flytrack_env.viz_rerun import write_recording
@@ -27,7 +33,7 @@ def write_flight_recording(
     except (
         ImportError,
         ValueError,
-    ) as error:  # Rerun is not installed; what cannot be shown or written
+    ) as error:  # Rerun is not installed; something cannot be shown or written
         path.unlink(missing_ok=True)
         return str(error)
     return ""

@@ -1,4 +1,4 @@
-"""Flight logs: named columns in SI units, the one form of simulated and measured flight.
+"""Flight logs: named columns in SI units, for simulated and measured flights alike.
 
 docs/identification.md lists columns, units and frames: position ``p``, velocity ``v``, acceleration
 ``a`` (0 in hover), world; specific force ``f``, angular velocity ``w``, body; orientation ``q``,
@@ -51,12 +51,12 @@ COLUMNS = (
     *(column for columns in CHANNELS.values() for column in columns),
     *STATED,
 )
-# What flew a log, and what its files say of it in the column ``measured``.
+# Origins of a log, and the values of the column ``measured`` that state them.
 Origin = Literal["measured", "simulated"]
 ORIGINS: dict[float, Origin] = {1.0: "measured", 0.0: "simulated"}
-GAP_STEPS = 1.5  # of the usual step: what lasts longer lacks a sample; loggers jitter by less
+GAP_STEPS = 1.5  # of the usual step: a longer step lacks a sample; loggers jitter by less
 NOMINAL_STEP_S = 0.01  # of a log without two rows
-BETWEEN_S = 1.0  # from the end of a segment to the start of the next, put on one time line
+BETWEEN_S = 1.0  # from the end of a segment to the start of the next, on one time line
 IN_STATE = {  # where a channel is in the handout's state
     "p": POSITION,
     "v": VELOCITY,
@@ -74,13 +74,17 @@ class LogError(ValueError):
 
 @dataclass(frozen=True)
 class FlightLog:
-    """A flight log in memory; what files hold is checked by ``load_log``, this is not.
+    """A flight log in memory. ``load_log`` checks the content of files; this class checks nothing.
 
-    time: (num_rows,) s. channels: of ``CHANNELS``, name -> (num_rows, number of its columns)
-    float64; "u" is always there. segment: (num_rows,) int, equal numbers side by side. source:
-    where it is from, for messages. origin: whether a real drone flew or a simulator; None if nobody
-    says. stated_voltage_v: lowest and highest voltage of the pack in flight, V, where they are
-    stated but ``v_bat`` was not logged.
+    Attributes:
+        time: (num_rows,) s.
+        channels: of ``CHANNELS``, by name, (num_rows, number of columns) float64; "u" is always
+            there.
+        segment: (num_rows,) int; rows of equal number are adjacent.
+        source: where the log is from, for messages.
+        origin: whether a real drone or a simulator flew; None if it is unknown.
+        stated_voltage_v: lowest and highest voltage of the pack in flight, V, if they are stated
+            but ``v_bat`` was not logged.
     """
 
     time: np.ndarray
@@ -103,7 +107,7 @@ class FlightLog:
     def sha256(self) -> str:
         """The hash of the rows, the same in memory and in any file.
 
-        What is stated of the rows does not change it.
+        It does not depend on origin and stated voltages.
         """
         digest = hashlib.sha256()
         segment = np.cumsum(self.is_start())
@@ -131,19 +135,24 @@ class FlightLog:
 
 
 def usual_step(log: FlightLog) -> np.ndarray:
-    """Return the median time between rows of the segment that each row is in, (num_rows,) s."""
+    """Return the median time between rows of each row's segment, (num_rows,) s."""
     starts = np.flatnonzero(log.is_start())
     steps = [np.diff(times) for times in np.split(log.time, starts[1:])]
     all_steps = np.concatenate(steps)
     fallback = float(np.median(all_steps)) if len(all_steps) else NOMINAL_STEP_S
-    medians = [float(np.median(own)) if len(own) else fallback for own in steps]
-    return np.repeat(medians, [len(own) + 1 for own in steps])
+    medians = [
+        float(np.median(segment_steps)) if len(segment_steps) else fallback
+        for segment_steps in steps
+    ]
+    return np.repeat(medians, [len(segment_steps) + 1 for segment_steps in steps])
 
 
 def time_in_line(log: FlightLog, between_s: np.ndarray | float = BETWEEN_S) -> np.ndarray:
-    """Return the time of rows, (num_rows,) s from 0: segments one after the other.
+    """Return the time of rows with segments one after the other, (num_rows,) s from 0.
 
-    between_s: from the end of each segment to the start of the next.
+    Args:
+        between_s: from the end of each segment to the start of the next; one number, or one for
+            each segment.
     """
     starts = np.flatnonzero(log.is_start())
     lengths = np.diff(np.append(starts, len(log)))
@@ -155,9 +164,14 @@ def time_in_line(log: FlightLog, between_s: np.ndarray | float = BETWEEN_S) -> n
 def log_of_states(
     flights: Iterable[tuple[np.ndarray, np.ndarray]], dt: float, source: str = "flight log"
 ) -> FlightLog:
-    """Return the log of a simulator's flights: states (T, 21) and actions (T, 4), a segment each.
+    """Return the log of a simulator's flights, a segment each.
 
-    The first acceleration of a flight is that of the step before it. dt: s.
+    The first acceleration of a flight is that of the step before it.
+
+    Args:
+        flights: states, (T, 21), and actions, (T, 4), of each flight.
+        dt: time between states, s.
+        source: where the flights are from, for messages.
     """
     flights = [
         (np.asarray(states, float), np.asarray(actions, float)) for states, actions in flights

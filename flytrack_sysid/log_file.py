@@ -1,13 +1,11 @@
 """Files of flight logs, ``.npz`` and ``.csv``, checked when read.
 
-The same log gives the same bytes.
+The same log gives the same bytes. The columns are those of ``flytrack_sysid.log``. An ``.npz``
+holds one array of numbers per column. A ``.csv`` has a header of column names, then one row of
+numbers per sample, separated by commas; blank lines are skipped.
 
-Columns of numbers are read from CSV files of any source, gzip-compressed ones too; every refusal
-names the place.
-
-Columns are those of ``flytrack_sysid.log``. An ``.npz`` holds one array of numbers per column; a
-``.csv`` has a header of column names, then one row of numbers, separated by commas, per sample;
-blank lines are skipped.
+``open_csv`` and ``read_columns`` read numbers from CSV files of any source, also gzip-compressed.
+Every error names the file, row and column.
 """
 
 import contextlib
@@ -34,19 +32,21 @@ MAX_BYTES = 512 * 2**20
 PACKED_BYTES, MAX_RATIO = (
     2**24,
     32,
-)  # characters in a compressed file: that, or as many times its bytes
+)  # most characters of a compressed file: that many, or that many times its bytes if more
 MAX_VALUES = (
     56 * 2**20
-)  # all columns at 1 kHz for half an hour; twice as many float64 are below 1 GiB
+)  # all columns at 1 kHz for half an hour; twice as many float64 take less than 1 GiB
 MAX_ROW_LENGTH = 2**16  # characters: thousands of columns
 
 
 def load_log(path: str | Path) -> FlightLog:
     """Return the log in an ``.npz`` or ``.csv`` file; the suffix says which. Nothing is unpickled.
 
-    Without a column ``segment``, all rows are one. Quaternions come back with norm 1. Raises
-    LogError, whose message names file, row and column; rows count from 0, lines of a CSV file from
-    1.
+    Without a column ``segment``, all rows are one segment. Quaternions are normalised.
+
+    Raises:
+        LogError: the file is no valid log; the message names file, row and column. Rows count from
+            0, lines of a CSV file from 1.
     """
     path = Path(path)
     check_name(path)
@@ -59,8 +59,11 @@ def load_log(path: str | Path) -> FlightLog:
 def save_log(path: str | Path, log: FlightLog) -> None:
     """Write a log to an ``.npz`` or ``.csv`` file, atomically; the suffix says which.
 
-    Every float64 comes back the same, and the same log gives the same bytes. Raises LogError for a
-    log that ``load_log`` would refuse, OSError for a file that cannot be written.
+    Reading restores every float64 exactly, and the same log gives the same bytes.
+
+    Raises:
+        LogError: ``load_log`` would refuse the log.
+        OSError: the file cannot be written.
     """
     path = Path(path)
     check_name(path)
@@ -85,7 +88,7 @@ def check_name(path: str | Path) -> None:
 def gaps_of(log: FlightLog) -> np.ndarray:
     """Return the rows after which samples are missing, (num_gaps,) int.
 
-    There the time step is longer than 1.5 times the median step of its segment.
+    After these rows, the time step exceeds 1.5 times the median step of the segment.
     """
     is_inside = log.segment[1:] == log.segment[:-1]
     return np.flatnonzero(is_inside & (np.diff(log.time) > GAP_STEPS * usual_step(log)[:-1]))
@@ -93,29 +96,29 @@ def gaps_of(log: FlightLog) -> np.ndarray:
 
 def describe(log: FlightLog) -> str:
     """Return a few lines on a log: origin, duration, sample interval, gaps, channels, ranges."""
-    inside = ~log.is_start()[1:]
+    is_inside = ~log.is_start()[1:]
     steps = np.diff(log.time)
     absent = [name for name in CHANNELS if name not in log]
     lines = [
         f"{log.source}: {len(log)} rows, {log.is_start().sum()} segments, "
-        f"{steps[inside].sum():.2f} s",
+        f"{steps[is_inside].sum():.2f} s",
         f"origin: {log.origin or 'not marked'}",
         f"channels: {', '.join(log.channels)}; absent: {', '.join(absent) or 'none'}",
     ]
-    if inside.any():
-        median, gaps = np.median(steps[inside]), gaps_of(log)
+    if is_inside.any():
+        median, gaps = np.median(steps[is_inside]), gaps_of(log)
         lines[1:1] = [
             f"sample interval: {median:.4g} s (median), {1.0 / median:.4g} Hz",
             "gaps: none",
         ]
         if len(gaps):
-            longest = gaps[np.argmax(steps[gaps])]
-            lines[2] = f"gaps: {len(gaps)}, longest {steps[longest]:.4g} s, after row {longest}"
+            gap_row = gaps[np.argmax(steps[gaps])]
+            lines[2] = f"gaps: {len(gaps)}, longest {steps[gap_row]:.4g} s, after row {gap_row}"
     return "\n".join([*lines, *_ranges(log)])
 
 
 def _ranges(log: FlightLog) -> list[str]:
-    """Return lines on ranges: commands, and measured speeds, heights, tilts and voltages."""
+    """Return lines on the ranges of commands and of measured speed, tilt, height and voltage."""
     commands = [
         f"{column} {values.min():.3g} to {values.max():.3g}"
         for column, values in zip(CHANNELS["u"], log["u"].T, strict=True)
@@ -144,8 +147,8 @@ def _read_npz(path: Path) -> Table:
     check_names(str(path), list(arrays))
     for name, values in arrays.items():
         if values.dtype.kind not in "iuf" or values.ndim != 1:
-            found = f"an array of {values.dtype}, shape {values.shape}"
-            raise LogError(f"{path}: column {name}: found {found}, expected a row of numbers")
+            description = f"an array of {values.dtype}, shape {values.shape}"
+            raise LogError(f"{path}: column {name}: found {description}, expected a row of numbers")
     return Table(str(path), {name: np.asarray(values, float) for name, values in arrays.items()})
 
 
@@ -158,7 +161,7 @@ def _read_csv(path: Path) -> Table:
 
 
 def _csv_of(columns: dict[str, np.ndarray]) -> bytes:
-    """Return a CSV file with the shortest digits that give each float64 back."""
+    """Return a CSV file with the shortest digits that restore each float64."""
     rows = zip(*(values.tolist() for values in columns.values()), strict=True)
     lines = [",".join(columns), *(",".join(map(repr, row)) for row in rows)]
     return ("\n".join(lines) + "\n").encode()
@@ -168,18 +171,19 @@ def _csv_of(columns: dict[str, np.ndarray]) -> bytes:
 def open_csv(path: Path, delimiter: str = ",") -> Iterator[Any]:
     """Yield the ``csv.reader`` of a file, unpacked if its name ends in .gz.
 
-    Errors become LogErrors.
+    Raises:
+        LogError: the file cannot be read, or is no CSV file.
     """
     rows = None
     try:
         with open_file(path, MAX_BYTES) as file:
             stream: Any = file
-            most_characters = MAX_BYTES
+            max_characters = MAX_BYTES
             if path.suffix == ".gz":
-                most_characters = min(MAX_BYTES, max(PACKED_BYTES, MAX_RATIO * path.stat().st_size))
+                max_characters = min(MAX_BYTES, max(PACKED_BYTES, MAX_RATIO * path.stat().st_size))
                 stream = gzip.GzipFile(fileobj=file)
             with io.TextIOWrapper(stream, encoding="utf-8-sig", newline="") as text:
-                rows = csv.reader(_lines(text, most_characters), delimiter=delimiter, strict=True)
+                rows = csv.reader(_lines(text, max_characters), delimiter=delimiter, strict=True)
                 yield rows
     except (csv.Error, UnicodeDecodeError) as error:
         where = f"{path}: near line {rows.line_num + 1 if rows else 1}"
@@ -188,15 +192,15 @@ def open_csv(path: Path, delimiter: str = ",") -> Iterator[Any]:
         raise LogError(f"{path}: cannot be read: {error_text(error)}") from error
 
 
-def _lines(text: io.TextIOWrapper, most_characters: int) -> Iterator[str]:
-    """Yield the lines of a file; no row has several, so that ``csv`` never reads much at once."""
+def _lines(text: io.TextIOWrapper, max_characters: int) -> Iterator[str]:
+    """Yield the lines of a file; no row may have several, so ``csv`` never reads much at once."""
     num_characters = 0
     while line := text.readline(MAX_ROW_LENGTH):
         num_characters += len(line)
         if len(line) == MAX_ROW_LENGTH:
             raise csv.Error(f"found a row of {MAX_ROW_LENGTH} characters or more, expected fewer")
-        if num_characters > most_characters:
-            raise csv.Error(f"found more than {most_characters} characters, expected at most that")
+        if num_characters > max_characters:
+            raise csv.Error(f"found more than {max_characters} characters, expected at most that")
         if line.count('"') % 2:
             raise csv.Error("found a quote that does not end on its line")
         yield line
@@ -205,12 +209,17 @@ def _lines(text: io.TextIOWrapper, most_characters: int) -> Iterator[str]:
 def read_columns(path: Path, rows: Any, header: list[str], wanted: Iterable[str]) -> Table:
     """Return the wanted columns of the rows after the header; blank rows are skipped.
 
-    header: has each of the wanted columns.
+    Args:
+        path: the file, for messages.
+        rows: the ``csv.reader`` after its header.
+        header: all columns of the file.
+        wanted: the columns to return; the header has each of them.
 
-    Raises: LogError: a row of another length, a cell that is no finite number, more than
-        MAX_VALUES numbers.
+    Raises:
+        LogError: a row has another length, a cell is no finite number, or there are more than
+            ``MAX_VALUES`` numbers.
     """
-    places = {name: header.index(name) for name in wanted}
+    indices = {name: header.index(name) for name in wanted}
     values, lines = array("d"), array("q")
     for cells in filter(None, rows):
         where = f"{path}: row {len(lines)} (line {rows.line_num})"
@@ -218,12 +227,12 @@ def read_columns(path: Path, rows: Any, header: list[str], wanted: Iterable[str]
             raise LogError(
                 f"{where}: found {len(cells)} cells, expected {len(header)} as in the header"
             )
-        values.extend(_number(where, name, cells[place]) for name, place in places.items())
+        values.extend(_number(where, name, cells[index]) for name, index in indices.items())
         lines.append(rows.line_num)
         if len(values) > MAX_VALUES:
             raise LogError(f"{path}: found more than {MAX_VALUES} numbers, expected at most that")
-    columns = np.asarray(values).reshape(-1, len(places)).T
-    return Table(str(path), dict(zip(places, columns, strict=True)), np.asarray(lines))
+    columns = np.asarray(values).reshape(-1, len(indices)).T
+    return Table(str(path), dict(zip(indices, columns, strict=True)), np.asarray(lines))
 
 
 def _number(where: str, column: str, cell: str) -> float:
@@ -233,9 +242,9 @@ def _number(where: str, column: str, cell: str) -> float:
         value = math.nan
     if (
         not math.isfinite(value) or "_" in cell
-    ):  # Python reads 1_000 as a number, other programs do not
-        found = quote_value(cell) if cell.strip() else "an empty cell"
+    ):  # Python reads 1_000 as a number; other programs do not
+        description = quote_value(cell) if cell.strip() else "an empty cell"
         raise LogError(
-            f"{where}, column {quote_name(column)}: found {found}, expected a finite number"
+            f"{where}, column {quote_name(column)}: found {description}, expected a finite number"
         )
     return value

@@ -1,9 +1,9 @@
-"""How a log is replayed within a step, by what flew it: a measured log continuously.
+"""The motion within a step with which a log is replayed; a measured log is continuous.
 
-The likelihoods of the two discrete integrators and of continuous motion differ by less than what a
-model that lacks something leaves, so on measured logs they choose a simulator's step
-(docs/diagnosis.md). Drones move continuously, so only logs that are not measured leave anything to
-choose.
+The likelihoods of the two discrete integrators and of continuous motion differ by less than the
+residuals of an incomplete model, so on measured logs they choose a simulator's step
+(docs/diagnosis.md). Drones move continuously, so a choice remains only for logs that are not
+measured.
 """
 
 from flytrack_env.dynamics import ModelParameters
@@ -16,7 +16,7 @@ HOW_TO_MARK = f"a column {MEASURED!r} says it: 1 for a real drone, 0 for a simul
 def required_motion(log: FlightLog, requested: Motion | None = None) -> Motion | None:
     """Return the motion to replay a log with; None if neither requested nor measured.
 
-    The requested one comes first; a measured log is continuous.
+    A requested motion has precedence; a measured log is continuous.
     """
     if requested is not None:
         return requested
@@ -28,9 +28,12 @@ def motion_notes(
 ) -> list[str]:
     """Return where log, model and request contradict each other on the motion, a sentence each.
 
-    Args: log: what is replayed. model: the model as it was given; None if none was. requested: the
-            motion that was asked for; None if none was. otherwise: how the motion of a log that is
-            not measured comes about, for the note on one that is not marked.
+    Args:
+        log: the replayed log.
+        model: the model as given; None without one.
+        requested: the requested motion; None without a request.
+        otherwise: how the motion of a log that is not measured is chosen, for the note on a log
+            that is not marked.
     """
     required, notes = required_motion(log, requested), []
     if log.origin == "measured" and required not in (None, Motion.CONTINUOUS):
@@ -52,11 +55,11 @@ def motion_notes(
 
 
 def check_same_origin(*logs: FlightLog) -> None:
-    """Raise LogError for logs of which some are measured and others are not, or are not marked."""
+    """Raise LogError if some of the logs are measured and others are not, or are not marked."""
     for log in logs[1:]:
         if log.origin != logs[0].origin:
-            found = f"{log.source} is {_shown(log)} and {logs[0].source} is {_shown(logs[0])}"
-            raise LogError(f"{found}; expected logs of one origin in one command; {HOW_TO_MARK}")
+            origins = f"{log.source} is {_shown(log)} and {logs[0].source} is {_shown(logs[0])}"
+            raise LogError(f"{origins}; expected logs of one origin in one command; {HOW_TO_MARK}")
 
 
 def _shown(log: FlightLog) -> str:

@@ -1,4 +1,4 @@
-"""Checks of a file's columns on their way to a flight log; every refusal names the place."""
+"""Checks of a file's columns that become a flight log; every error names the file and column."""
 
 import difflib
 from collections.abc import Mapping, Sequence
@@ -21,17 +21,19 @@ from flytrack_sysid.log import (
 )
 
 MAX_NORM_ERROR = 1e-2  # of quaternions: estimators drift a little; more is no unit quaternion
-MIN_NORM_ERROR = 1e-12  # below it a norm is 1 up to rounding, and the values stay as they are
+MIN_NORM_ERROR = 1e-12  # below, a norm is 1 up to rounding, and the values are not changed
 COMMAND_MARGIN = 1e-6  # beyond [-1, 1]: rounding by the program that wrote the log
 MAX_NAME_LENGTH = max(map(len, COLUMNS)) + 3  # longer names are similar to none
-MAX_SEGMENT = 2**53  # float64 is exact for whole numbers below it
+MAX_SEGMENT = 2**53  # float64 represents smaller whole numbers exactly
 
 
 class Table(NamedTuple):
-    """The columns of a file, (num_rows,) float64 each, by name.
+    """The columns of a file.
 
-    source: the file, for messages. lines: (num_rows,) int, the line of each row in a text file,
-    else None.
+    Attributes:
+        source: the file, for messages.
+        columns: by name, (num_rows,) float64 each.
+        lines: the line of each row in a text file, (num_rows,) int; None for other files.
     """
 
     source: str
@@ -48,12 +50,16 @@ class Table(NamedTuple):
     ) -> None:
         """Raise LogError about the first row that is not good.
 
-        values: found there; those of the column if None.
+        Args:
+            is_good: (num_rows,) bool.
+            column: name of the column, for the message.
+            expected: expected value in words.
+            values: found values; those of the column if None.
         """
         if not is_good.all():
             row = int(np.argmin(is_good))
-            found = self.columns[column] if values is None else values
-            raise self.error(row, column, f"found {float(found[row])}, expected {expected}")
+            column_values = self.columns[column] if values is None else values
+            raise self.error(row, column, f"found {float(column_values[row])}, expected {expected}")
 
     def select(self, rows: np.ndarray) -> "Table":
         """Return some of the rows, by mask."""
@@ -68,9 +74,9 @@ class Table(NamedTuple):
 
 
 def check_names(source: str, names: Sequence[str]) -> None:
-    """Raise LogError unless the names make up a flight log.
+    """Raise LogError unless the names are those of a flight log.
 
-    Each is known and occurs once, and none of a vector is missing.
+    Each must be known and occur once, and vectors must be complete.
     """
     for name in names:
         if name not in COLUMNS:
@@ -98,7 +104,7 @@ def check_names(source: str, names: Sequence[str]) -> None:
 
 
 def columns_of(time: np.ndarray, channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the columns of time and channels (num_rows, n), in the order of ``CHANNELS``."""
+    """Return the columns of time and channels, (num_rows, n), in the order of ``CHANNELS``."""
     columns = {"t": time}
     for name, names in CHANNELS.items():
         if name in channels:
@@ -107,7 +113,7 @@ def columns_of(time: np.ndarray, channels: Mapping[str, np.ndarray]) -> dict[str
 
 
 def stated_columns(log: FlightLog) -> dict[str, np.ndarray]:
-    """Return the columns of what is stated of a log, the same number in every row."""
+    """Return the columns of ``STATED`` of a log, each with the same number in every row."""
     stated = dict(zip(STATED_VOLTAGES, log.stated_voltage_v or (), strict=False))
     if log.origin is not None:
         stated[MEASURED] = next(
@@ -117,17 +123,19 @@ def stated_columns(log: FlightLog) -> dict[str, np.ndarray]:
 
 
 def log_of_table(table: Table) -> FlightLog:
-    """Return the log that a table holds, with unit quaternions; a table without segments is one.
+    """Return the log in a table, with unit quaternions; a table without segments is one segment.
 
     The names must have passed ``check_names``. Columns are removed from the table as they are
-    copied, so that a large log is not in memory twice. Raises LogError for a value that no log can
-    have, with its place.
+    copied, so that a large log is not in memory twice.
+
+    Raises:
+        LogError: no log can have one of the values; the message names row and column.
     """
     num_rows = len(table.columns["t"])
     for column, values in table.columns.items():
         if len(values) != num_rows:
-            found = f"found {len(values)} rows, expected {num_rows} as in t"
-            raise LogError(f"{table.source}: column {column}: {found}")
+            problem = f"found {len(values)} rows, expected {num_rows} as in t"
+            raise LogError(f"{table.source}: column {column}: {problem}")
     if num_rows == 0:
         raise LogError(f"{table.source}: found no rows, expected at least one")
     hint = "leave out the row of a lost sample, or all columns of what was not measured"
@@ -157,7 +165,7 @@ def log_of_table(table: Table) -> FlightLog:
 
 
 def _stated(table: Table, name: str) -> float | None:
-    """Return the number that a column of ``STATED`` holds in every row; None where it is absent."""
+    """Return the number that a column of ``STATED`` holds in every row; None if it is absent."""
     values = table.columns.pop(name, None)
     if values is None:
         return None
@@ -168,7 +176,7 @@ def _stated(table: Table, name: str) -> float | None:
 
 
 def _origin(table: Table) -> Origin | None:
-    """Return what flew, by the column ``measured``."""
+    """Return the origin that the column ``measured`` states."""
     value = _stated(table, MEASURED)
     if value is not None and value not in ORIGINS:
         raise table.error(
@@ -180,14 +188,14 @@ def _origin(table: Table) -> Origin | None:
 def _stated_voltages(table: Table) -> tuple[float, float] | None:
     """Return the lowest and the highest voltage that are stated for the pack."""
     low, high = (_stated(table, name) for name in STATED_VOLTAGES)
-    if low is None or high is None:  # both, by ``check_names``
+    if low is None or high is None:  # both are None, by ``check_names``
         return None
     if not 0.0 < low < high:
-        found = (
+        problem = (
             f"found {low:g} to {high:g} V, expected a lowest voltage above 0 and a highest above "
             "that"
         )
-        raise table.error(0, ", ".join(STATED_VOLTAGES), found)
+        raise table.error(0, ", ".join(STATED_VOLTAGES), problem)
     return low, high
 
 

@@ -1,7 +1,7 @@
-"""At which voltages a log was flown, and what that says of a model's battery.
+"""The voltages at which a log was flown, and the battery of its craft.
 
-Where ``v_bat`` was not logged, thrust is that of the middle of the pack's stated range, else of the
-model's battery.
+Where ``v_bat`` was not logged, thrust is taken at the middle of the pack's stated range, else of
+the model's battery.
 """
 
 from dataclasses import replace
@@ -13,14 +13,14 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.state import BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_sysid.log import FlightLog
 
-# Percentiles of a logged voltage, so that a lone wrong sample is no range: a pack that falls evenly
-# from 16.7 to 14.4 V keeps all but 12 mV at each end.
+# Percentiles of a logged voltage, so that an isolated wrong sample does not widen the range. A pack
+# that falls evenly from 16.7 to 14.4 V loses only 12 mV at each end.
 LOWEST_PERCENTILE, HIGHEST_PERCENTILE = 0.5, 99.5
-DECIMALS = 3  # of a battery's voltages, V: sensors have two
+DECIMALS = 3  # of a battery's voltages, V; sensors have two
 
 
 def with_voltage(log: FlightLog, model: ModelParameters) -> FlightLog:
-    """Return a log with a voltage; that of the model's battery if neither logged nor stated."""
+    """Return a log with a voltage; that of the model's battery if none is logged or stated."""
     if "v_bat" in log or log.stated_voltage_v is not None:
         return log
     return replace(
@@ -31,14 +31,14 @@ def with_voltage(log: FlightLog, model: ModelParameters) -> FlightLog:
 def assumed_voltage(log: FlightLog) -> float:
     """Return the voltage of a log without ``v_bat``, V.
 
-    It is the middle of what is stated, or else of the handout's battery.
+    It is the middle of the stated range, else of the handout's battery.
     """
     low, high = log.stated_voltage_v or (BATTERY_EMPTY_V, BATTERY_FULL_V)
     return 0.5 * (low + high)
 
 
 def flown_voltages(log: FlightLog) -> tuple[float, float]:
-    """Return the lowest and the highest voltage that a log was flown at, logged or stated, V."""
+    """Return the lowest and the highest voltage of a log, logged or stated, V."""
     if "v_bat" not in log:
         return log.stated_voltage_v or (assumed_voltage(log), assumed_voltage(log))
     low, high = np.percentile(log["v_bat"], [LOWEST_PERCENTILE, HIGHEST_PERCENTILE]).round(DECIMALS)
@@ -46,7 +46,7 @@ def flown_voltages(log: FlightLog) -> tuple[float, float]:
 
 
 def is_within(voltages: tuple[float, float], battery: Battery) -> bool:
-    """Return whether voltages are a battery's, but for what a thrust map may be extrapolated by."""
+    """Return whether voltages are in a battery's range, extended by the allowed extrapolation."""
     margin = MAX_EXTRAPOLATION * float(battery.full_v)
     return (
         voltages[0] >= float(battery.empty_v) - margin
@@ -55,10 +55,10 @@ def is_within(voltages: tuple[float, float], battery: Battery) -> bool:
 
 
 def battery_of_craft(log: FlightLog, battery: Battery) -> Battery:
-    """Return the battery of a log's craft: the model's, unless the log was flown at others.
+    """Return the battery of a log's craft: the model's, unless the log has other voltages.
 
-    Then it goes from the highest voltage of the log down to the lowest, or, of a log that hardly
-    drains it, by as large a share as the model's battery does.
+    In that case it ranges from the highest voltage of the log down to the lowest. If the log hardly
+    drains it, it goes down by the same fraction as the model's battery.
     """
     low, high = flown_voltages(log)
     if is_within((low, high), battery):
@@ -77,8 +77,8 @@ def voltage_notes(log: FlightLog, battery: Battery) -> list[str]:
     """Return notes on an assumed voltage, and on a voltage beyond the model's battery.
 
     Args:
-        log: as it was given, without a voltage that the model lent it.
-        battery: the model's, as it was given.
+        log: as given, without a voltage from the model.
+        battery: the model's, as given.
     """
     notes = []
     if "v_bat" not in log:

@@ -1,7 +1,7 @@
-"""Manoeuvres: flights that answer one question each, from chosen states.
+"""Manoeuvres: flights from chosen states that answer one question each.
 
-The excitation (``flytrack_sysid.excitation``) excites everything a little; a manoeuvre repeats one
-thing: eight flights of 2.5 s. ``MANOEUVRES`` says how to fly each on a real drone.
+The excitation (``flytrack_sysid.excitation``) excites everything a little. A manoeuvre repeats one
+motion in eight flights of 2.5 s. ``MANOEUVRES`` says how to fly each on a real drone.
 """
 
 from collections.abc import Callable, Iterable
@@ -15,23 +15,23 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.state import BATTERY, BATTERY_EMPTY_V, BATTERY_FULL_V
 from flytrack_sysid import excitation
 
-# All manoeuvres have the same length to be comparable. Even: two flights fill a chunk of a
-# diagnosis.
+# All manoeuvres have the same length, so that they are comparable. The number is even, because two
+# flights fill a chunk of a diagnosis.
 FLIGHTS_PER_MANOEUVRE = 8
 SECONDS_PER_MANOEUVRE = FLIGHTS_PER_MANOEUVRE * excitation.FLIGHT_STEPS * excitation.DT_S
 STARTS_V = np.linspace(
     BATTERY_EMPTY_V + excitation.RESERVE_V, BATTERY_FULL_V, FLIGHTS_PER_MANOEUVRE
 )
-SWING_HZ = 1.0  # of a thrust that oscillates about hovering
-HOVER_SWING = 0.05  # of the stick: no pilot holds it still
+SWING_HZ = 1.0  # frequency of a thrust that oscillates about hover
+HOVER_SWING = 0.05  # of the stick: no pilot holds it constant
 VOLTAGE_SWING = 0.5
-STEEPNESS = 0.8  # climb of a leg over its speed along the ground, in turns up and down
-LOW_HEIGHTS = (0.2, 0.35, 0.6, 1.0)  # m: a rotor's radius or two, where the ground is felt
+STEEPNESS = 0.8  # climb of a leg over its ground speed; the sign alternates
+LOW_HEIGHTS = (0.2, 0.35, 0.6, 1.0)  # m: a rotor's radius or two, where ground effect acts
 LOW_SPEED = 2.0  # m/s, of every other low pass
 TILTS_DEG = (20.0, 40.0, 60.0, 80.0)
-QUICK_STEPS = (1, 6)  # how long fast switching is held
-# m/s upwards at the start of flips, whose thrust lifts nothing on average: half of what a flight
-# loses.
+QUICK_STEPS = (1, 6)  # shortest and longest hold of fast switching
+# m/s upwards at the start of flips, whose mean thrust lifts nothing: half of the speed lost in a
+# flight.
 FLIP_CLIMB = 0.5 * 9.8 * excitation.FLIGHT_STEPS * excitation.DT_S
 SPIN_STICKS = (
     *((sign, 0.0, 0.0) for sign in (1.0, -1.0)),
@@ -46,7 +46,12 @@ Flight = Callable[[int, float, np.random.Generator], tuple[np.ndarray, np.ndarra
 
 
 class Manoeuvre(NamedTuple):
-    """A manoeuvre: how to fly it on a real drone, and its flights by number and hover action."""
+    """A manoeuvre.
+
+    Attributes:
+        how: how to fly it on a real drone.
+        flight: returns start and command of a flight by its number and the hover action.
+    """
 
     how: str
     flight: Flight
@@ -95,7 +100,7 @@ def _headings(number: int, hover: float, rng: np.random.Generator) -> tuple[np.n
     "Fly straight legs at 3, 7, 11 and 15 m/s, nose first and sideways, climbing and sinking."
 )
 def _speeds(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return a leg along x or, every other, along y of the body; climbing and sinking by pairs."""
+    """Return a leg along x or y of the body, in turn; pairs climb and sink in turn."""
     speed, yaw_deg = excitation.LEG_SPEEDS[number // 2], 90.0 * rng.integers(4)
     course = np.deg2rad(yaw_deg + 90.0 * (number % 2))
     climb = STEEPNESS * (-1.0) ** (number // 2)
@@ -143,7 +148,7 @@ def _thrust_tilted(
 def _stick_amplitudes(
     number: int, hover: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return roll, then pitch at one amplitude, or yaw, then all axes."""
+    """Return roll, then pitch at one amplitude; or yaw, then all axes."""
     command = _swing(hover, HOVER_SWING, rng)
     slots = slice(excitation.SLOT_STEPS), slice(excitation.SLOT_STEPS, excitation.FLIGHT_STEPS)
     for slot, axes in zip(slots, ((2,), (0, 1, 2)) if number % 2 else ((0,), (1,)), strict=True):
@@ -180,8 +185,8 @@ def hover_action(
 ) -> float:
     """Return the thrust action at which a model's thrust holds its weight, at the mean voltage.
 
-    The nearest end of the stick if none does. Effects are ignored: they matter little to where a
-    flight starts.
+    If no action does, it is the nearest end of the stick. Effects are ignored, because they hardly
+    matter for the start of a flight.
     """
     weight_n = float(model.m) * float(model.g)
     return thrust.hover_action(model.thrust_coeffs, weight_n, 0.5 * sum(voltages))
@@ -195,8 +200,13 @@ def flights_of(
 ) -> list[excitation.ScriptedFlight]:
     """Return the flights of manoeuvres, eight of each, in the order of the names.
 
-    hover: the thrust action that holds the weight. A manoeuvre's flights do not depend on the other
-    names. voltages: of an empty and a full battery, V.
+    The flights of a manoeuvre do not depend on the other names.
+
+    Args:
+        names: of manoeuvres.
+        hover: the thrust action that holds the weight.
+        seed: of random directions and waves.
+        voltages: of an empty and a full battery, V.
 
     Raises:
         KeyError: no manoeuvre of that name.

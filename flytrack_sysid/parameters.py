@@ -1,4 +1,4 @@
-"""Names for every number in a model, for fits, for what is held fixed, and for reports."""
+"""Names for every number in a model, for fits, for fixed parameters and for reports."""
 
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -14,11 +14,11 @@ STICKS = ("roll", "pitch", "yaw", "thrust")
 TAUS = tuple(f"tau_{stick}" for stick in STICKS)
 THRUST_COEFFS = tuple(f"c{power}" for power in range(6))
 MAX_RATES = tuple(f"max_rate_{stick}" for stick in STICKS[:3])
-NO_BATTERY: Any = ()  # in the place of a battery: no number of it is fitted
+NO_BATTERY: Any = ()  # replaces a battery, because none of its numbers is fitted
 DRAIN = "battery_drain_v_per_min"
 BASE = (*TAUS, *THRUST_COEFFS, *MAX_RATES, "m", "g", DRAIN)
-# Where a fit looks for each, and its unit: wide enough for anything that flies at 100 Hz; an answer
-# at an end is refused.
+# The range in which a fit searches each parameter, and its unit. Ranges are wide enough for any
+# craft that flies at 100 Hz; a result at an end is refused.
 TAU_RANGE = Range(1e-3, 0.5, "s")
 RANGES = {
     **dict.fromkeys(TAUS, TAU_RANGE),
@@ -33,23 +33,23 @@ RANGES = {
 
 def names_of(model: ModelParameters) -> tuple[str, ...]:
     """Return the names of all numbers in a model: the base, then ``effect.parameter``."""
-    every = [effect_of(parameters) for parameters in model.effects]
-    return (*BASE, *(f"{effect.name}.{field}" for effect in every for field in effect.ranges))
+    effects = [effect_of(parameters) for parameters in model.effects]
+    return (*BASE, *(f"{effect.name}.{field}" for effect in effects for field in effect.ranges))
 
 
 def base_of(model: ModelParameters) -> tuple[str, ...]:
-    """Return what every fit frees: lags, thrust map, drain, and parameters of the craft.
+    """Return the parameters that every fit frees: lags, thrust map, drain, and those of the craft.
 
-    Lags are left out where an effect takes their place.
+    Lags are left out where an effect replaces them.
     """
-    every = [effect_of(parameters) for parameters in model.effects]
-    taus = () if any("respond" in effect.hooks for effect in every) else TAUS
-    craft = [f"{effect.name}.{field}" for effect in every for field in effect.search.fitted]
+    effects = [effect_of(parameters) for parameters in model.effects]
+    taus = () if any("respond" in effect.hooks for effect in effects) else TAUS
+    craft = [f"{effect.name}.{field}" for effect in effects for field in effect.search.fitted]
     return (*taus, *THRUST_COEFFS, DRAIN, *craft)
 
 
 def range_of(name: str) -> Range:
-    """Return where a fit looks for a parameter, and its unit."""
+    """Return the range in which a fit searches a parameter, and its unit."""
     effect, _, field = name.partition(".")
     return BY_NAME[effect].ranges[field] if field else RANGES[name]
 
@@ -61,34 +61,42 @@ def neutral_value(name: str) -> float:
 
 
 def to_vector(model: ModelParameters) -> np.ndarray:
-    """Return a model's numbers but its battery's, in the order of ``names_of``, float64."""
+    """Return a model's numbers except its battery's, in the order of ``names_of``, float64."""
     leaves = jax.tree.leaves(model._replace(battery=NO_BATTERY))
     return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in leaves])
 
 
 def from_vector(vector: Any, like: ModelParameters) -> ModelParameters:
-    """Return the model of the same structure and battery with these numbers; differentiable."""
+    """Return a model with these numbers, and structure and battery of another; differentiable."""
     leaves, structure = jax.tree.flatten(like._replace(battery=NO_BATTERY))
     sizes = [np.size(leaf) for leaf in leaves]
     ends = np.cumsum(sizes)
-    parts = [vector[end - size : end] for size, end in zip(sizes, ends, strict=True)]
+    split_values = [vector[end - size : end] for size, end in zip(sizes, ends, strict=True)]
     shapes = [np.shape(leaf) for leaf in leaves]
-    reshaped = [jnp.reshape(part, shape) for part, shape in zip(parts, shapes, strict=True)]
+    reshaped = [
+        jnp.reshape(values, shape) for values, shape in zip(split_values, shapes, strict=True)
+    ]
     return jax.tree.unflatten(structure, reshaped)._replace(battery=like.battery)
 
 
 def in_batches(program: Callable[[np.ndarray], Any], values: np.ndarray, size: int) -> np.ndarray:
-    """Run a program, compiled for ``size`` values at once, on all of them, (num_values, ...)."""
-    parts = []
+    """Run a program that is compiled for ``size`` values at once on all values.
+
+    Args:
+        program: returns an array (size, ...) from values (size, ...).
+        values: (num_values, ...).
+        size: number of values in a batch.
+    """
+    results = []
     for begin in range(0, len(values), size):
-        part = values[begin : begin + size]
-        filled = np.concatenate([part, np.repeat(part[-1:], size - len(part), axis=0)])
-        parts.append(np.asarray(program(filled))[: len(part)])
-    return np.concatenate(parts)
+        batch = values[begin : begin + size]
+        padded = np.concatenate([batch, np.repeat(batch[-1:], size - len(batch), axis=0)])
+        results.append(np.asarray(program(padded))[: len(batch)])
+    return np.concatenate(results)
 
 
 def as_float32(model: ModelParameters) -> ModelParameters:
-    """Return the model with the environment's precision: float32 arrays and Python floats."""
+    """Return the model in the environment's precision: float32 arrays and Python floats."""
 
     def leaf(value: Any) -> Any:
         return np.asarray(value, np.float32) if np.ndim(value) else float(np.float32(value))

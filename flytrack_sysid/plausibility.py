@@ -1,7 +1,7 @@
 """Plausibility of a log as a flight: units, gravity and signs, stuck columns, too little data.
 
-The motion by one channel is compared with that by another over windows of 0.1 to 1 s, so that noise
-averages out. Where the motion is too small to tell, no problem is reported.
+Channels that measure the same motion are compared over windows of 0.1 to 1 s, so that noise
+averages out. Where the motion is too small for a decision, no problem is reported.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,25 +17,25 @@ from flytrack_sysid.log import CHANNELS, FlightLog, LogError
 
 WINDOWS_S = (0.1, 0.3, 1.0)  # long against the noise of a sample; short ones for fast manoeuvres
 MIN_WINDOWS = 10
-MIN_CORRELATION = 0.9  # with less in common, the slope may be that of noise
-# Channels of one motion correlate by more unless they contradict each other; and then they must
-# correlate by MIN_CORRELATION if read otherwise. Right logs: 0.97 or more where they move,
-# anything where they do not.
+MIN_CORRELATION = 0.9  # below, the slope may be that of noise
+# Channels of one motion that correlate by less contradict each other. Another reading resolves the
+# contradiction if they then correlate by MIN_CORRELATION. Correct logs: 0.97 or more where the
+# drone moves, any value where it does not.
 CONTRADICTION = 0.5
-STILL = 1e-6  # in any unit: what changes by less does not change
+STILL = 1e-6  # in any unit: a smaller change counts as none
 GRAVITY = float(nominal_parameters().g)  # m/s^2
-TOLERANCE = 0.15  # of a known wrong factor: scale errors of sensors stay well below it
+TOLERANCE = 0.15  # relative, of a known wrong factor; scale errors of sensors are well below it
 MIN_ROWS = 100
 MIN_UPRIGHT_ROWS = 20
 MIN_S = 2.0
 MAX_STEP_S = 0.5  # no log of a drone is as slow as 2 Hz
 PER_S = {"ms": 1e3, "us": 1e6, "ns": 1e9}
 MIN_TURN = 0.3  # rad within a second: more than the bias of a gyroscope at rest integrates to
-FAST_PERCENTILE = 99.0  # of the rates: a lone spike is no unit
+FAST_PERCENTILE = 99.0  # of the rates: an isolated spike does not show a wrong unit
 FASTEST_RATE = float(np.deg2rad(4000.0))  # rad/s, the widest range among common gyroscopes
 HIGHEST_BATTERY_V = 100.0  # drones' batteries end at about 60 V
 LIKELY_BATTERY_V = (2.5, 70.0)  # an empty cell; more than a full pack of 14 in series
-MAX_FORCE_G = 3.0  # median specific force of a flight, in g; racing is below it
+MAX_FORCE_G = 3.0  # median specific force of a flight, in g; racing flights are below it
 MAX_BIAS = 2.5  # m/s^2, of an accelerometer in flight, vibration included
 LONG_FALL_S = 5.0  # no drone falls for longer
 MIN_FORCE_DOWN = 0.5 * GRAVITY  # m/s^2 along -z of the body; drag in a fast climb is less
@@ -45,9 +45,12 @@ BATTERY_UNITS = {1000.0: "mV", 100.0: "hundredths of V", 10.0: "tenths of V"}
 
 
 class Windows(NamedTuple):
-    """Pieces of a log of about one length, none across segments or long gaps; (num_windows,) each.
+    """Windows of about the same length, none across segments or long gaps.
 
-    starts, ends: first row, and the row after the last step. durations: s.
+    Attributes:
+        starts: first row, (num_windows,).
+        ends: row after the last step, (num_windows,).
+        durations: (num_windows,) s.
     """
 
     starts: np.ndarray
@@ -55,67 +58,70 @@ class Windows(NamedTuple):
     durations: np.ndarray
 
     def change_of(self, values: np.ndarray) -> np.ndarray:
-        """Return by how much (num_rows, ...) values grow over each window."""
+        """Return the change of values, (num_rows, ...), over each window."""
         return values[self.ends] - values[self.starts]
 
     def mean_of(self, log: FlightLog, values: np.ndarray) -> np.ndarray:
-        """Return the mean over each window of values (num_rows, n), linear between rows."""
+        """Return the mean of values, (num_rows, n), over each window; linear between rows."""
         steps = np.diff(log.time)[:, None] * 0.5 * (values[1:] + values[:-1])
         integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
         return self.change_of(integral) / self.durations[:, None]
 
 
 def windows_of(log: FlightLog, length_s: float) -> Windows:
-    """Return the windows of a log; those that a gap makes twice as long are left out."""
+    """Return the windows of a log, without those that a gap makes more than twice as long."""
     is_start = log.is_start()
     flight = np.cumsum(is_start) - 1
     since_start = log.time - log.time[is_start][flight]
-    number = np.floor(since_start / length_s)
-    edges = np.flatnonzero(is_start | np.append(True, np.diff(number) > 0))
+    window = np.floor(since_start / length_s)
+    edges = np.flatnonzero(is_start | np.append(True, np.diff(window) > 0))
     starts, ends = edges[:-1], edges[1:]
     durations = log.time[ends] - log.time[starts]
     steps = np.diff(log.time)[~is_start[1:]]
-    longest = 2.0 * max(length_s, np.median(steps)) if len(steps) else 0.0
-    keep = (flight[starts] == flight[ends]) & (durations <= longest)
+    max_duration = 2.0 * max(length_s, np.median(steps)) if len(steps) else 0.0
+    keep = (flight[starts] == flight[ends]) & (durations <= max_duration)
     return Windows(starts[keep], ends[keep], durations[keep])
 
 
 def agreement(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> tuple[float, float]:
-    """Return how well the change of one quantity, and the integral of its rate, agree.
+    """Return how well the change of one quantity and the integral of its rate agree.
+
+    Uses the window length at which both correlate most. Where they are highly correlated, noise in
+    either biases the slope little.
 
     Args:
-        log: where the rows are.
+        log: the log that holds the rows.
         change: a quantity, (num_rows, 3).
-        rate: what should be its derivative, (num_rows, 3).
+        rate: signal that should be its derivative, (num_rows, 3).
 
-    Returns: Their correlation over windows of that length at which they move most alike, nan where
-        they move too little, and the size of the integral over that of the change: noise in either
-        biases it little where they are highly correlated.
+    Returns:
+        correlation: of the changes and the integrals over windows; NaN without enough motion.
+        slope: norm of the integrals over that of the changes; NaN without enough motion.
     """
     best, slope = np.nan, np.nan
     for length_s in WINDOWS_S:
         windows = windows_of(log, length_s)
         if len(windows.starts) < MIN_WINDOWS:
             continue
-        grown = windows.change_of(change) / windows.durations[:, None]
-        summed = windows.mean_of(log, rate)
-        size_grown, size_summed = np.linalg.norm(grown), np.linalg.norm(summed)
-        if min(size_grown, size_summed) < STILL:
+        changes = windows.change_of(change) / windows.durations[:, None]
+        means = windows.mean_of(log, rate)
+        change_norm, mean_norm = np.linalg.norm(changes), np.linalg.norm(means)
+        if min(change_norm, mean_norm) < STILL:
             continue
-        correlation = np.sum(grown * summed) / (size_grown * size_summed)
-        if not correlation < best:  # the first is better than nan
-            best, slope = float(correlation), float(size_summed / size_grown)
+        correlation = np.sum(changes * means) / (change_norm * mean_norm)
+        if not correlation < best:  # also true while ``best`` is NaN
+            best, slope = float(correlation), float(mean_norm / change_norm)
     return best, slope
 
 
 def slope_of(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> float:
-    """Return the ratio of the integral of a rate to a change; NaN if none is clear."""
+    """Return the ratio of a rate's integral to a change; NaN below ``MIN_CORRELATION``."""
     correlation, slope = agreement(log, change, rate)
     return slope if correlation >= MIN_CORRELATION else np.nan
 
 
 def _is_about(value: float, factor: float) -> bool:
-    """Return whether a value is within the tolerance of a known factor; nan is not."""
+    """Return whether a value is within the tolerance of a known factor; False for NaN."""
     return abs(value / factor - 1.0) <= TOLERANCE
 
 
@@ -124,7 +130,7 @@ def _columns(*channels: str) -> str:
 
 
 def _with_time_in_s(log: FlightLog) -> tuple[FlightLog, list[str]]:
-    """Return the log with its time in s, and the problem if it was not."""
+    """Return the log with its time in s, and the problem if it was in another unit."""
     steps = np.diff(log.time)[~log.is_start()[1:]]
     step = np.median(steps) if len(steps) else 0.0
     if step < MAX_STEP_S:
@@ -147,9 +153,9 @@ def _length(log: FlightLog) -> Iterator[str]:
 
 def _commands(log: FlightLog) -> Iterator[str]:
     if np.ptp(log["u"], axis=0).max() <= STILL:
-        found = ", ".join(f"{value:g}" for value in log["u"][0])
+        values = ", ".join(f"{value:g}" for value in log["u"][0])
         yield (
-            f"{_columns('u')}: found {found} in every row, expected commands that move: they look "
+            f"{_columns('u')}: found {values} in every row, expected commands that move: they look "
             "stuck"
         )
 
@@ -158,32 +164,32 @@ def _motion(log: FlightLog) -> Iterator[str]:
     measured = [name for name in ("p", "v", "a", "f", "q", "w") if name in log]
     moving = {name for name in ("u", *measured) if np.ptp(log[name], axis=0).max() > STILL}
     if measured and moving == {"u"}:
-        found = "found the same values in every row while the commands move"
-        yield f"{_columns(*measured)}: {found}: the sensors or their logging look stuck"
+        problem = "found the same values in every row while the commands move"
+        yield f"{_columns(*measured)}: {problem}: the sensors or their logging look stuck"
 
 
 def summed_turns(attitude: Rotation) -> np.ndarray:
-    """Return the sum of the turns between rows about the body's axes, (num_rows, 3) rad."""
+    """Return the sum of the rotations between rows about the body's axes, (num_rows, 3) rad."""
     turns_b = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
     return np.concatenate([np.zeros((1, 3)), np.cumsum(turns_b, axis=0)])
 
 
 def _attitude(log: FlightLog) -> Iterator[str]:
-    """Tell an attitude that is stuck while the rates turn."""
+    """Find an attitude that does not change although the body rates do not vanish."""
     if "q" not in log or "w" not in log:
         return
     windows = windows_of(log, WINDOWS_S[-1])
     turn = np.linalg.norm(windows.mean_of(log, log["w"]), axis=1) * windows.durations
     if np.ptp(log["q"], axis=0).max() <= STILL and len(turn) and turn.max() > MIN_TURN:
-        found = (
+        problem = (
             f"found the same in every row while {_columns('w')} turn by {turn.max():.2g} rad in a "
             "second"
         )
-        yield f"{_columns('q')}: {found}: the attitude looks stuck"
+        yield f"{_columns('q')}: {problem}: the attitude looks stuck"
 
 
 def _pairs(log: FlightLog) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return pairs of channels that measure one motion, as a change and its rate."""
+    """Return pairs of channels that measure the same motion, as a quantity and its rate."""
     pairs = {}
     if "q" in log:
         attitude = Rotation.from_quat(log["q"], scalar_first=True)
@@ -206,9 +212,12 @@ def _changed(
 
 
 def _rolled(quat: np.ndarray, signs: np.ndarray, step: int) -> np.ndarray:
-    """Return quaternions (num_rows, 4) in another order.
+    """Return quaternions with rolled components, (num_rows, 4).
 
-    Some components are negated before and after.
+    Args:
+        quat: (num_rows, 4).
+        signs: factors of 1 or -1, (4,), applied before and after.
+        step: number of places to roll by.
     """
     return np.roll(quat * signs, step, axis=1) * signs
 
@@ -221,9 +230,8 @@ def _as_quaternions(change: Callable[[Rotation], Rotation]) -> Callable[[np.ndar
 
 HALF_TURN = Rotation.from_rotvec([np.pi, 0.0, 0.0])  # about x: between FLU and FRD, z up and NED
 TURN_SIGNS = np.array([1.0, -1.0, -1.0])
-# One mistake each in what a mapping says: the channel, what it looks like, and how to read it
-# right. An order is mistaken before the frames are converted, which may have turned both body and
-# world.
+# Mistakes in a mapping: channel, text of the problem, and a function that corrects the log. A wrong
+# quaternion order precedes the conversion of frames, which may have turned both body and world.
 CONVENTIONS: tuple[tuple[str, str, Callable[[FlightLog], FlightLog]], ...] = (
     (
         "q",
@@ -272,7 +280,7 @@ CONVENTIONS: tuple[tuple[str, str, Callable[[FlightLog], FlightLog]], ...] = (
 
 
 def _conventions(log: FlightLog) -> Iterator[str]:
-    """Compare what measures one motion twice, and tell how to read it so that all of it agrees."""
+    """Compare channels that measure the same motion, and find the reading by which they agree."""
     if not _pairs(log) or ("f" in log and any(_force_sign(log))):
         return
     before = {name: agreement(log, *pair)[0] for name, pair in _pairs(log).items()}
@@ -283,28 +291,30 @@ def _conventions(log: FlightLog) -> Iterator[str]:
         if channel not in log:
             continue
         after = {name: agreement(log, *pair)[0] for name, pair in _pairs(read_right(log)).items()}
-        cured = [
+        resolved_pairs = [
             name
             for name in before
             if before[name] < CONTRADICTION and after[name] >= MIN_CORRELATION
         ]
         is_harmed = any(
-            after[name] < min(before[name], MIN_CORRELATION) for name in before if name not in cured
+            after[name] < min(before[name], MIN_CORRELATION)
+            for name in before
+            if name not in resolved_pairs
         )
-        if cured and not is_harmed:
-            resolved.setdefault(", ".join(cured), []).append(f"{channel} {text}")
-    # Those that resolve most explain the log best.
-    most = max((len(names.split(", ")) for names in resolved), default=0)
+        if resolved_pairs and not is_harmed:
+            resolved.setdefault(", ".join(resolved_pairs), []).append(f"{channel} {text}")
+    # Readings that resolve the most pairs explain the log best.
+    max_pairs = max((len(names.split(", ")) for names in resolved), default=0)
     for names, readings in resolved.items():
-        if len(names.split(", ")) == most:
+        if len(names.split(", ")) == max_pairs:
             channel = readings[0].partition(" ")[0]
-            shown = ", ".join(
+            pairs = ", ".join(
                 f"{name} correlate by {before[name]:.2f}" for name in names.split(", ")
             )
-            agree = "; or if ".join(dict.fromkeys(readings))
+            advice = "; or if ".join(dict.fromkeys(readings))
             yield (
-                f"{_columns(channel)}: found motion that contradicts itself ({shown}); it agrees "
-                f"if {agree}"
+                f"{_columns(channel)}: found motion that contradicts itself ({pairs}); it agrees "
+                f"if {advice}"
             )
             return
 
@@ -317,14 +327,14 @@ def _rates(log: FlightLog) -> Iterator[str]:
             log, summed_turns(Rotation.from_quat(log["q"], scalar_first=True)), log["w"]
         )
         if _is_about(slope, np.rad2deg(1.0)):
-            found = f"found {slope:.3g} for the rates over those by {_columns('q')}, expected 1"
-            yield f"{_columns('w')}: {found}: this looks like deg/s, not rad/s"
+            problem = f"found {slope:.3g} for the rates over those by {_columns('q')}, expected 1"
+            yield f"{_columns('w')}: {problem}: this looks like deg/s, not rad/s"
             return
     fast = np.percentile(np.linalg.norm(log["w"], axis=1), FAST_PERCENTILE)
     if fast > FASTEST_RATE:
-        found = f"found a {FAST_PERCENTILE:g}th percentile of {fast:.0f}"
+        problem = f"found a {FAST_PERCENTILE:g}th percentile of {fast:.0f}"
         expected = f"expected at most {FASTEST_RATE:.0f} rad/s, all that gyroscopes measure"
-        yield f"{_columns('w')}: {found}, {expected}: this looks like deg/s"
+        yield f"{_columns('w')}: {problem}, {expected}: this looks like deg/s"
 
 
 def _acceleration(log: FlightLog) -> Iterator[str]:
@@ -337,8 +347,8 @@ def _acceleration(log: FlightLog) -> Iterator[str]:
     changes = windows.change_of(log["v"]) / windows.durations[:, None]
     offset = float(np.median((windows.mean_of(log, log["a"]) - changes)[:, 2]))
     if abs(offset - GRAVITY) <= MAX_BIAS:
-        found = f"found {offset:.3g} m/s^2 more than v_z changes by, expected 0 in hover"
-        yield f"a_z: {found}: gravity looks left in, as an accelerometer measures it"
+        problem = f"found {offset:.3g} m/s^2 more than v_z changes by, expected 0 in hover"
+        yield f"a_z: {problem}: gravity looks left in, as an accelerometer measures it"
 
 
 def _force(log: FlightLog) -> Iterator[str]:
@@ -348,25 +358,25 @@ def _force(log: FlightLog) -> Iterator[str]:
 
 
 def _force_unit(log: FlightLog) -> Iterator[str]:
-    """Compare the size of specific force with that by velocity, or with what keeps a drone up."""
+    """Compare the specific force with that from the velocity, or with the weight."""
     windows = windows_of(log, WINDOWS_S[0])
     if len(windows.starts) < MIN_WINDOWS:
         return
-    found = float(np.median(np.linalg.norm(windows.mean_of(log, log["f"]), axis=1)))
-    if found > MAX_FORCE_G:
+    median_size = float(np.median(np.linalg.norm(windows.mean_of(log, log["f"]), axis=1)))
+    if median_size > MAX_FORCE_G:
         return
-    problem = f"{_columns('f')}: found a median size of {found:.3g}"
+    problem = f"{_columns('f')}: found a median size of {median_size:.3g}"
     if "v" in log:
         force_w = windows.change_of(log["v"]) / windows.durations[:, None] + np.array(
             [0.0, 0.0, GRAVITY]
         )
         expected = float(np.median(np.linalg.norm(force_w, axis=1)))
-        if _is_about(found * GRAVITY, expected):
+        if _is_about(median_size * GRAVITY, expected):
             yield f"{problem}, expected {expected:.3g} m/s^2 by {_columns('v')}: this looks like g"
         return
     starts = np.flatnonzero(log.is_start())
-    longest = np.max(log.time[np.append(starts[1:], len(log)) - 1] - log.time[starts])
-    if found >= 1.0 - TOLERANCE and longest >= LONG_FALL_S:
+    longest_s = np.max(log.time[np.append(starts[1:], len(log)) - 1] - log.time[starts])
+    if median_size >= 1.0 - TOLERANCE and longest_s >= LONG_FALL_S:
         yield f"{problem}, expected about {GRAVITY:.3g} m/s^2 to stay in the air: this looks like g"
 
 
@@ -376,18 +386,18 @@ def _force_sign(log: FlightLog) -> Iterator[str]:
         body_z_w = Rotation.from_quat(log["q"], scalar_first=True).apply([0.0, 0.0, 1.0])
         force_z = force_z[body_z_w[:, 2] >= UPRIGHT]
     if len(force_z) >= MIN_UPRIGHT_ROWS and np.median(force_z) <= -MIN_FORCE_DOWN:
-        found = f"found a median of {np.median(force_z):.3g} m/s^2 where upright"
-        yield f"f_z: {found}, expected about {GRAVITY:.3g}: z looks as if it pointed down"
+        problem = f"found a median of {np.median(force_z):.3g} m/s^2 where upright"
+        yield f"f_z: {problem}, expected about {GRAVITY:.3g}: z looks as if it pointed down"
 
 
 def _battery(log: FlightLog) -> Iterator[str]:
-    found = float(np.median(log["v_bat"])) if "v_bat" in log else 0.0
-    if found > HIGHEST_BATTERY_V:
+    median_v = float(np.median(log["v_bat"])) if "v_bat" in log else 0.0
+    if median_v > HIGHEST_BATTERY_V:
         low, high = LIKELY_BATTERY_V
-        units = [unit for factor, unit in BATTERY_UNITS.items() if low <= found / factor <= high]
+        units = [unit for factor, unit in BATTERY_UNITS.items() if low <= median_v / factor <= high]
         guess = f"this looks like {' or '.join(units)}" if units else "no battery has that"
         yield (
-            f"v_bat: found a median of {found:.5g}, expected at most {HIGHEST_BATTERY_V:g} V: "
+            f"v_bat: found a median of {median_v:.5g}, expected at most {HIGHEST_BATTERY_V:g} V: "
             f"{guess}"
         )
 
@@ -407,10 +417,10 @@ CHECKS = (
 
 
 def find_problems(log: FlightLog) -> list[str]:
-    """Return what in a log cannot be true of a flight, a sentence each; empty if nothing.
+    """Return the problems of a log that no flight can have, a sentence each; empty if none.
 
-    Each names the source, the columns, what was found, and why it looks wrong. Where time is not in
-    s, the other checks see it corrected.
+    Each sentence names the source, the columns, what was found, and why it looks wrong. If the time
+    is not in s, the other checks use the corrected time.
     """
     log, problems = _with_time_in_s(log)
     problems = [*problems, *(problem for check in CHECKS for problem in check(log))]
@@ -418,7 +428,7 @@ def find_problems(log: FlightLog) -> list[str]:
 
 
 def check_plausible(log: FlightLog) -> None:
-    """Raise LogError unless a log may be of a flight; the message has one line for each problem."""
+    """Raise LogError for a log that no flight can have; the message has a line for each problem."""
     problems = find_problems(log)
     if problems:
         raise LogError("\n".join(problems))

@@ -1,9 +1,8 @@
 """A log made ready for replay: on even steps, gaps filled with rows that count for nothing.
 
-Commands are what a replay is driven by, so a lost row matters twice: its measurements are missing,
-and so is the command that was given in it. Filled rows get commands in between their neighbours,
-and how far off those may be is carried along (``command_doubt``), so that rows where it matters can
-be left out.
+Commands drive a replay, so a lost row matters twice: its measurements are missing, and so is its
+command. Filled rows get commands interpolated between their neighbours. ``command_doubt`` holds the
+standard deviation of the error of these commands, so that rows where it matters can be left out.
 """
 
 from dataclasses import replace
@@ -19,26 +18,35 @@ from flytrack_sysid.resample import interpolate, interpolate_quaternions
 from flytrack_sysid.split import blocks_of, cut_evenly
 
 MAX_FILLED_S = 0.1  # after a longer gap a new flight begins
-# Without voltage thrust is off by another share in each flight, and the velocity runs away with it.
+# Without a voltage, thrust has another relative error in each flight, and so the velocity drifts.
 WINDOW_WITHOUT_VOLTAGE_S = 1.25
 WINDOW_S = 2.5  # over which increments of velocity and attitude are followed
 PADDED_TO = 1024  # rows: logs of about the same length share one compiled program
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
-# An applied action known worse than this counts for nothing: half a gyro's noise at full stick.
+# Rows with a more uncertain applied action count for nothing: half a gyro's noise at full stick.
 MAX_DOUBT = 0.005
-APPLIED_UNKNOWN = 1.0  # standard deviation of an applied action that nothing is known of
+APPLIED_UNKNOWN = 1.0  # standard deviation of an unknown applied action
 
 
 class Record(NamedTuple):
-    """Rows of a replay, padded; row k is followed by row k + 1 after ``step_s``.
+    """Rows of a replay, padded; row k + 1 follows row k after ``step_s``.
 
-    source_row: (num_rows,) int, the log's row, -1 for filled ones and padding. step_s: (num_rows,)
-    s. command: (num_rows, 4). command_doubt: (num_rows, 4), how far off the command may be
-    (standard deviation). begins: (num_rows,) bool, a flight starts here. is_applied_known:
-    (num_rows,) bool, ``applied`` was measured here. applied: (num_rows, 4). pos_w, vel_w:
-    (num_rows, 3). quat: (num_rows, 4). battery_v: (num_rows,). Where a channel is absent: 0,
-    upright, ``assumed_voltage``. piece: (num_rows,) int, numbers of stretches of at most 2.5 s,
-    none across blocks. time_s: (num_rows,) s, since the log began, of several each.
+    Absent channels are 0, the attitude upright, and the voltage ``assumed_voltage``.
+
+    Attributes:
+        source_row: the log's row; -1 for filled rows and padding, (num_rows,) int.
+        step_s: time to the next row, (num_rows,) s.
+        command: (num_rows, 4).
+        command_doubt: standard deviation of the command's error, (num_rows, 4).
+        begins: a flight starts here, (num_rows,) bool.
+        is_applied_known: ``applied`` was measured here, (num_rows,) bool.
+        applied: applied action, (num_rows, 4).
+        pos_w: (num_rows, 3) m.
+        vel_w: (num_rows, 3) m/s.
+        quat: (num_rows, 4).
+        battery_v: (num_rows,) V.
+        piece: number of the stretch of at most 2.5 s, none across blocks, (num_rows,) int.
+        time_s: since the log began; of several logs, since each began, (num_rows,) s.
     """
 
     source_row: np.ndarray
@@ -56,26 +64,37 @@ class Record(NamedTuple):
     time_s: np.ndarray
 
 
-def _new_times(log: FlightLog, usual: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return times with gaps filled, the log's row at or before each, and where a flight begins."""
+def _new_times(
+    log: FlightLog, usual_step_s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the times of a log with gaps filled.
+
+    Args:
+        log: with segments on one time line.
+        usual_step_s: of each row's segment, (num_rows,) s.
+
+    Returns:
+        times: (num_new_rows,) s.
+        rows: the log's row; -1 - row for rows filled after it.
+        begins: where a flight begins, (num_new_rows,) bool.
+    """
     steps = np.diff(log.time, append=log.time[-1])
     ends = np.append(log.segment[1:] != log.segment[:-1], True)
     is_long = ~ends & (steps > MAX_FILLED_S)
-    is_gap = ~ends & ~is_long & (steps > GAP_STEPS * usual)
-    pieces = np.where(is_gap, np.round(steps / usual).astype(int), 1)
-    pieces = np.maximum(pieces, 1)
-    row = np.repeat(np.arange(len(log)), pieces)
-    part = np.arange(len(row)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    times = log.time[row] + part * (steps / pieces)[row]
-    begins = (part == 0) & np.append(True, (ends | is_long)[:-1])[row]
-    return times, np.where(part == 0, row, -1 - row), begins
+    is_gap = ~ends & ~is_long & (steps > GAP_STEPS * usual_step_s)
+    num_parts = np.where(is_gap, np.round(steps / usual_step_s).astype(int), 1)
+    num_parts = np.maximum(num_parts, 1)
+    row = np.repeat(np.arange(len(log)), num_parts)
+    index_in_step = np.arange(len(row)) - np.repeat(np.cumsum(num_parts) - num_parts, num_parts)
+    times = log.time[row] + index_in_step * (steps / num_parts)[row]
+    begins = (index_in_step == 0) & np.append(True, (ends | is_long)[:-1])[row]
+    return times, np.where(index_in_step == 0, row, -1 - row), begins
 
 
 def _doubts(log: FlightLog, pieces: np.ndarray) -> np.ndarray:
-    """Return how far a command in the gap after each row may be off, (num_rows, 4).
+    """Return the standard deviation of commands filled in after each row, (num_rows, 4).
 
-    A command that changes evenly is off by nothing, one that jumps somewhere in the gap by half the
-    jump.
+    It is 0 for a command that changes evenly, and half the jump for one that jumps in the gap.
     """
     change = np.diff(log["u"], axis=0, append=log["u"][-1:])
     # To the next row of the same flight, per step; the last row of a flight has none.
@@ -88,7 +107,7 @@ def _doubts(log: FlightLog, pieces: np.ndarray) -> np.ndarray:
 
 
 def _velocity(log: FlightLog) -> np.ndarray:
-    """Return the velocity, or what positions say of it; 0 without either."""
+    """Return the velocity, measured or differentiated from positions; 0 without either."""
     if "v" in log:
         return log["v"]
     velocity = np.zeros((len(log), 3))
@@ -100,11 +119,13 @@ def _velocity(log: FlightLog) -> np.ndarray:
 
 
 class Filled(NamedTuple):
-    """A log with rows added in its gaps, in between their neighbours.
+    """A log with rows interpolated in its gaps.
 
-    log: segments end where a gap is too long to be filled. source_row: (num_rows,) int, the row of
-    the log as it was; -1 for added ones. behind: (num_rows,) int, that row or the one before the
-    gap. command_doubt: (num_rows, 4), standard deviation of how far a command may be off.
+    Attributes:
+        log: the filled log; segments end where a gap is too long to be filled.
+        source_row: the row of the original log; -1 for added rows, (num_rows,) int.
+        behind: that row, or the row before the gap, (num_rows,) int.
+        command_doubt: standard deviation of the command's error, (num_rows, 4).
     """
 
     log: FlightLog
@@ -115,36 +136,36 @@ class Filled(NamedTuple):
 
 def fill_gaps(log: FlightLog) -> Filled:
     """Return a log without gaps."""
-    usual = usual_step(log)
-    in_line = replace(log, time=time_in_line(log, usual[log.is_start()]))
-    times, rows, begins = _new_times(in_line, usual)
-    measured = rows >= 0
-    behind = np.where(measured, rows, -1 - rows)
+    usual_step_s = usual_step(log)
+    in_line = replace(log, time=time_in_line(log, usual_step_s[log.is_start()]))
+    times, rows, begins = _new_times(in_line, usual_step_s)
+    is_measured = rows >= 0
+    behind = np.where(is_measured, rows, -1 - rows)
     pieces = np.bincount(behind, minlength=len(log))
     channels = {}
     for name, values in log.channels.items():
-        between = interpolate_quaternions if name == "q" else interpolate
-        channels[name], _ = between(in_line.time, values, times)
-        channels[name][measured] = values[rows[measured]]
+        interpolate_channel = interpolate_quaternions if name == "q" else interpolate
+        channels[name], _ = interpolate_channel(in_line.time, values, times)
+        channels[name][is_measured] = values[rows[is_measured]]
     filled = replace(
         log,
         time=times - (in_line.time - log.time)[behind],
         channels=channels,
         segment=np.cumsum(begins) - 1,
     )
-    doubt = np.where(measured[:, None], 0.0, _doubts(log, pieces)[behind])
-    return Filled(filled, np.where(measured, rows, -1), behind, doubt)
+    doubt = np.where(is_measured[:, None], 0.0, _doubts(log, pieces)[behind])
+    return Filled(filled, np.where(is_measured, rows, -1), behind, doubt)
 
 
 def record_of(filled: Filled) -> Record:
     """Return a log without gaps as a record, without padding and in one piece."""
     log, begins = filled.log, filled.log.is_start()
     zeros = np.zeros((len(log), 3))
-    is_first_row = np.append(True, np.diff(log.time) < 0.0)  # of several logs as one
+    is_first_row = np.append(True, np.diff(log.time) < 0.0)  # of each log, where several are one
     after_gap = np.append(False, filled.source_row[:-1] < 0) & (filled.source_row >= 0)
     return Record(
         source_row=filled.source_row,
-        # To the next row of the flight; the usual step at its end.
+        # To the next row of the flight; the usual step at the flight's end.
         step_s=np.where(
             np.append(begins[1:], True), usual_step(log), np.diff(log.time, append=log.time[-1])
         ),
@@ -172,7 +193,7 @@ def make_record(log: FlightLog) -> Record:
 
 
 def _padded(record: Record) -> Record:
-    """Return the record with rows added that start nothing and count for nothing."""
+    """Return the record with rows appended that are never scored."""
     missing = -len(record.source_row) % PADDED_TO
 
     def pad(values: np.ndarray) -> np.ndarray:
@@ -186,10 +207,14 @@ def _padded(record: Record) -> Record:
 
 
 def is_applied_certain(record: Record, tau: np.ndarray) -> np.ndarray:
-    """Return where a replay's applied action is known well enough to judge by, (num_rows, 4).
+    """Return where a replay's applied action is certain enough to score errors, (num_rows, 4).
 
-    Doubt is from commands that were lost and from what was applied when a flight began; both are
-    forgotten with the lags ``tau``, (4,) s.
+    Uncertainty comes from lost commands and from the applied action at the start of a flight. Both
+    decay with the lags.
+
+    Args:
+        record: the rows of the replay.
+        tau: lags of roll, pitch, yaw and thrust, (4,) s.
     """
     keep = np.exp(-record.step_s[:, None] / tau)
     enters = (1.0 - keep) ** 2 * record.command_doubt**2
@@ -205,17 +230,21 @@ def is_applied_certain(record: Record, tau: np.ndarray) -> np.ndarray:
 
 
 def measured_channels(log: FlightLog, record: Record, gravity: float) -> dict[str, np.ndarray]:
-    """Return what a log measured on the record's rows, by channel; anything in filled rows.
+    """Return a log's measured channels on the record's rows; values in filled rows are arbitrary.
 
-    ``f`` comes from ``a`` where there is no accelerometer, ``p`` only without ``v``. Without ``q``
-    nothing in the world frame can be compared.
+    ``f`` is computed from ``a`` where there is no accelerometer; ``p`` is included only without
+    ``v``. Without ``q`` no channel in the world frame is included.
     """
     row = record.source_row
-    own = {name: log[name][row] for name in ("w", "q", "v", "v_bat", "f") if name in log}
+    channels = {name: log[name][row] for name in ("w", "q", "v", "v_bat", "f") if name in log}
     if "f" not in log and "a" in log and "q" in log:
         before = np.roll(record.quat, 1, axis=0)
         force_w = log["a"][row] + np.array([0.0, 0.0, gravity])
-        own["f"] = Rotation.from_quat(before, scalar_first=True).inv().apply(force_w)
+        channels["f"] = Rotation.from_quat(before, scalar_first=True).inv().apply(force_w)
     if "v" not in log and "p" in log:
-        own["p"] = log["p"][row]
-    return own if "q" in log else {name: own[name] for name in own if name not in ("v", "p")}
+        channels["p"] = log["p"][row]
+    return (
+        channels
+        if "q" in log
+        else {name: channels[name] for name in channels if name not in ("v", "p")}
+    )

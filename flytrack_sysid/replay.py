@@ -1,7 +1,7 @@
 """Replaying a flight log through the simulator's own step, row after row.
 
-The measured attitude, velocity, position and voltage are fed in at every row, so that one error in
-the model does not spoil all channels. The applied action, the body rates and the effects' memories
+Every row is fed the measured attitude, velocity, position and voltage, so that one error in the
+model does not affect all channels. The applied action, the body rates and the effects' memories
 follow from the commands, which are known exactly. The fit, the validation and the diagnosis all
 replay logs with ``replay``.
 """
@@ -25,9 +25,12 @@ from flytrack_sysid.record import Record
 class Step(NamedTuple):
     """One replayed step.
 
-    It leads from ``before``, the drone as measured at ``row``, to ``moved.after``, as modelled.
-
-    memories: of the effects, before the step.
+    Attributes:
+        row: the row of the log.
+        before: the drone as measured at this row.
+        memories: of the effects, before the step.
+        moved: result of the step; ``moved.after`` is the drone as modelled.
+        model: the model of the step.
     """
 
     row: Record
@@ -61,7 +64,7 @@ def measured_drone(row: Record, applied: Action, rates_b: Vec3) -> Drone:
 
 
 class ReplayState(NamedTuple):
-    """What a replay carries from row to row; memories: of the effects."""
+    """The state of a replay between rows; ``memories`` are those of the effects."""
 
     applied: Action
     rates_b: Vec3
@@ -69,7 +72,7 @@ class ReplayState(NamedTuple):
 
 
 def start_replay(model: ModelParameters, row: Record) -> ReplayState:
-    """Return a state to begin with at a row at which a flight begins."""
+    """Return the initial state at a row at which a flight begins."""
     drone = measured_drone(row, Action(*row.applied), Vec3(*jnp.zeros_like(row.vel_w)))
     memories = start_memories(model.effects, drone, MAX_DELAY_STEPS)
     return ReplayState(drone.applied, drone.rates_b, memories)
@@ -84,16 +87,16 @@ def replay(
     extras: Any = None,
     is_gyro_fed: bool = False,
 ) -> tuple[ReplayState, Any]:
-    """Return the state after some rows, and what ``observe`` makes of the model's step from each.
+    """Return the state after some rows, and the values of ``observe`` for the step from each row.
 
-    Differentiable in the model. In float64 inside ``jax.enable_x64(True)``.
+    Differentiable in the model. It computes in float64 inside ``jax.enable_x64(True)``.
 
     Args:
-        model: what is replayed.
-        state: before the first row; of no effect where a flight begins there.
+        model: the replayed model.
+        state: before the first row; unused where a flight begins there.
         record: rows of a log.
-        gyro_b: (num_rows, 3) rad/s, with which a flight starts, or every step if ``is_gyro_fed``;
-            where it is NaN, a flight starts with the rates of the sticks.
+        gyro_b: rates with which a flight starts, or every step if ``is_gyro_fed``, (num_rows, 3)
+            rad/s; where they are NaN, a flight starts with the rates of the sticks.
         observe: called with a step and the row's part of ``extras``.
         extras: a tree of leaves (num_rows, ...).
         is_gyro_fed: whether every step starts with the measured rates.
@@ -108,8 +111,8 @@ def replay(
         first_b = where_true(jnp.isnan(gyro[0]), steady_b, Vec3(*gyro))
         rates_b = first_b if is_gyro_fed else where_true(row.begins, first_b, state.rates_b)
         before = measured_drone(row, applied, rates_b)
-        # As logged, which it is where a flight begins: past commands then depend on no model of a
-        # batch.
+        # The logged action, which is the applied one where a flight begins: so past commands depend
+        # on no model of a batch.
         begun = before._replace(applied=Action(*row.applied))
         memories = where_true(
             row.begins, start_memories(model.effects, begun, MAX_DELAY_STEPS), state.memories

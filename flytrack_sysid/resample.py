@@ -1,4 +1,4 @@
-"""Samples of several clocks on one time base, without smoothing or filling of gaps."""
+"""Resampling of channels from several clocks to one time base, without smoothing or gap filling."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -13,7 +13,12 @@ HELD = ("u", *SETPOINTS, "own_attitude", "motors")
 
 
 class Samples(NamedTuple):
-    """Times, s, increasing, and values (num_rows, n) of a channel."""
+    """Samples of a channel.
+
+    Attributes:
+        times: increasing, (num_rows,) s.
+        values: (num_rows, n).
+    """
 
     times: np.ndarray
     values: np.ndarray
@@ -22,23 +27,30 @@ class Samples(NamedTuple):
 def _brackets(times: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the rows before and after each time, and whether both are near, (num_at,) each.
 
-    Near: at most three usual steps of the channel lie between the two rows.
+    Both rows are near if at most three usual steps of the channel lie between them.
     """
     after = np.clip(np.searchsorted(times, at, side="left"), 1, max(len(times) - 1, 1))
     if len(times) < 2:
         return np.zeros(len(at), int), np.zeros(len(at), int), np.zeros(len(at), bool)
-    longest = MAX_BRIDGE_STEPS * np.median(np.diff(times))
+    max_gap_s = MAX_BRIDGE_STEPS * np.median(np.diff(times))
     is_exact = (times[after] == at) | (times[after - 1] == at)
     is_inside = (times[0] <= at) & (at <= times[-1])
-    return after - 1, after, is_inside & (is_exact | (times[after] - times[after - 1] <= longest))
+    return after - 1, after, is_inside & (is_exact | (times[after] - times[after - 1] <= max_gap_s))
 
 
 def interpolate(
     times: np.ndarray, values: np.ndarray, at: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return linearly interpolated values (num_at, n) and where they are known, (num_at,) bool.
+    """Return linearly interpolated values, exact at the times of samples, and where they are known.
 
-    values: (num_rows, n). Exact at a sample's own time.
+    Args:
+        times: of the samples, (num_rows,) s.
+        values: (num_rows, n).
+        at: times to interpolate at, (num_at,) s.
+
+    Returns:
+        values: (num_at, n).
+        is_known: (num_at,) bool.
     """
     before, after, is_known = _brackets(times, at)
     span = np.where(after > before, times[after] - times[before], 1.0)
@@ -49,7 +61,7 @@ def interpolate(
 def interpolate_quaternions(
     times: np.ndarray, quat: np.ndarray, at: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return quaternions (num_at, 4) on the arcs between neighbours, and where they are known."""
+    """Return quaternions, (num_at, 4), on the arcs between neighbours, and where they are known."""
     _, _, is_known = _brackets(times, at)
     if len(times) < 2:
         return np.tile(quat[:1], (len(at), 1)), is_known
@@ -58,48 +70,61 @@ def interpolate_quaternions(
 
 
 def hold(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the last of the values (num_rows, n) up to each time, and where it is known.
+    """Return the last value up to each time, as commands are held, and where it is known.
 
-    Commands act like this.
+    A value is known if it is at most three usual steps of the channel old.
 
-    Known: not older than three usual steps of the channel. Returns (num_at, n), (num_at,) bool.
+    Args:
+        times: of the samples, (num_rows,) s.
+        values: (num_rows, n).
+        at: times to sample at, (num_at,) s.
+
+    Returns:
+        values: (num_at, n).
+        is_known: (num_at,) bool.
     """
     last = np.searchsorted(times, at, side="right") - 1
-    longest = MAX_BRIDGE_STEPS * (np.median(np.diff(times)) if len(times) > 1 else np.inf)
-    is_known = (last >= 0) & (at - times[np.maximum(last, 0)] <= longest)
+    max_age_s = MAX_BRIDGE_STEPS * (np.median(np.diff(times)) if len(times) > 1 else np.inf)
+    is_known = (last >= 0) & (at - times[np.maximum(last, 0)] <= max_age_s)
     return values[np.maximum(last, 0)], is_known
 
 
 def slow_channels(samples: Mapping[str, Samples]) -> list[str]:
-    """Return a sentence on each channel but the battery that is too slow for a rate loop."""
-    found = []
+    """Return a sentence on each channel, except the battery, that is too slow for a rate loop."""
+    sentences = []
     for name, (times, _) in samples.items():
         step_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
         if step_s > SLOW_STEP_S and name != "v_bat":
-            how = "held" if name in HELD else "interpolated"
-            found.append(
-                f"{name} at {1.0 / step_s:.3g} Hz, {how} in between: faster dynamics do not show "
-                "in it"
+            method = "held" if name in HELD else "interpolated"
+            sentences.append(
+                f"{name} at {1.0 / step_s:.3g} Hz, {method} in between: faster dynamics do not "
+                "show in it"
             )
-    return found
+    return sentences
 
 
 def on_one_base(
     samples: Mapping[str, Samples], base: np.ndarray
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return channels (num_base, n) at the times of the base, and where all of them are known.
+    """Return channels at the times of a base, and where all of them are known.
 
-    The latter is (num_base,) bool.
+    Commands are held, attitudes are interpolated on the arc, other channels linearly. The battery
+    changes slowly, so its ends are held and its gaps do not matter.
 
-    Commands are held, attitudes interpolated on the arc, others linearly. The battery changes
-    slowly: its ends are held, and gaps do not matter.
+    Args:
+        samples: by channel.
+        base: times of the rows, (num_base,) s.
+
+    Returns:
+        channels: by name, (num_base, n).
+        is_known: (num_base,) bool.
     """
     channels, is_known = {}, np.ones(len(base), bool)
     for name, (times, values) in samples.items():
         if name == "v_bat":
             channels[name] = np.interp(base, times, values[:, 0])[:, None]
             continue
-        look_up = hold if name in HELD else interpolate_quaternions if name == "q" else interpolate
-        channels[name], is_there = look_up(times, values, base)
-        is_known &= is_there
+        resample = hold if name in HELD else interpolate_quaternions if name == "q" else interpolate
+        channels[name], is_known_here = resample(times, values, base)
+        is_known &= is_known_here
     return channels, is_known

@@ -1,4 +1,4 @@
-"""Time from a stick step to half of the response, by axis: delay, lags and limits together."""
+"""Time from a step of a stick to half of the response, by axis: delay, lags and limits together."""
 
 from typing import Any
 
@@ -17,19 +17,22 @@ from flytrack_sysid.trace_cache import keep_trace
 
 SMALL_STEP, FULL_STEP = 1e-3, 1.0  # of a stick, from its centre; no limit acts on the small one
 STEP_S, WATCHED_S = 1e-3, 1.5
-FRAME_S = 0.01  # of a loop that is fed by frames of a receiver, in place of the step
+FRAME_S = 0.01  # step of a loop that gets its commands from frames of a receiver
 HALF = 0.5
 HEIGHT_M = 1e3  # far from the ground
 BATCH = 8  # models at once
 
 
 def half_response_s(model: ModelParameters, stick_step: float = SMALL_STEP) -> np.ndarray:
-    """Return the times, (4,) s, from a step of each stick to half of the steady change.
+    """Return the times from a step of each stick to half of the steady change, (4,) s.
 
-    The sticks are roll, pitch, yaw and thrust; the responses are the body rates and the thrust of a
-    drone that moves continuously. Delays of its sensors are not included. NaN where the response
-    takes longer than 1.5 s, or there is none. stick_step: from the centre, which for thrust is half
-    a stick.
+    The sticks are roll, pitch, yaw and thrust. The responses are the body rates and the thrust of a
+    drone that moves continuously. Delays of sensors are not included. A time is NaN if the response
+    takes longer than 1.5 s, or if there is none.
+
+    Args:
+        model: the drone.
+        stick_step: from the centre, which for thrust is half a stick.
     """
     with jax.enable_x64(True):
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
@@ -41,9 +44,12 @@ def half_responses(vectors: np.ndarray, like: ModelParameters, stick_step: float
 
     Call it inside ``jax.enable_x64(True)``.
 
-    vectors: (num_models, parameters), in the order of ``parameters.names_of(like)``.
+    Args:
+        vectors: in the order of ``parameters.names_of(like)``, (num_models, num_parameters).
+        like: a model of the same structure.
+        stick_step: from the centre.
     """
-    return in_batches(lambda part: _half_responses(part, like, stick_step), vectors, BATCH)
+    return in_batches(lambda batch: _half_responses(batch, like, stick_step), vectors, BATCH)
 
 
 @keep_trace
@@ -52,11 +58,15 @@ def _half_responses(vectors: jax.Array, like: ModelParameters, stick_step: jax.A
 
 
 def _of_model(model: ModelParameters, stick_step: jax.Array) -> jax.Array:
-    """Return the times of the four sticks, (4,) s; dead times come before all else and only add."""
+    """Return the times of the four sticks, (4,) s; dead times precede all else and only add."""
     dead_s = jnp.stack(jnp.broadcast_arrays(*dead_times(model.effect("command_delay"))))
-    others = tuple(one for one in model.effects if not isinstance(one, CommandDelay))
-    prompt = model._replace(effects=others, motion=Motion.CONTINUOUS, battery_drain_v_per_min=0.0)
-    return dead_s + jax.vmap(lambda stick: _of_stick(prompt, stick, stick_step))(
+    other_effects = tuple(
+        effect for effect in model.effects if not isinstance(effect, CommandDelay)
+    )
+    undelayed = model._replace(
+        effects=other_effects, motion=Motion.CONTINUOUS, battery_drain_v_per_min=0.0
+    )
+    return dead_s + jax.vmap(lambda stick: _of_stick(undelayed, stick, stick_step))(
         jnp.eye(ACTION_SIZE)
     )
 
@@ -64,7 +74,10 @@ def _of_model(model: ModelParameters, stick_step: jax.Array) -> jax.Array:
 def _of_stick(model: ModelParameters, stick: jax.Array, stick_step: jax.Array) -> jax.Array:
     """Return the time of one stick, s, for a drone held in place.
 
-    stick: a row of the unit matrix.
+    Args:
+        model: without delay of the commands.
+        stick: row of the unit matrix, (4,).
+        stick_step: from the centre.
     """
     drone = _standing(model)
     has_loop = acts(model.effects, "respond")
@@ -90,14 +103,14 @@ def _of_stick(model: ModelParameters, stick: jax.Array, stick_step: jax.Array) -
 
 
 def _standing(model: ModelParameters) -> Drone:
-    """Return a level drone at rest with all sticks centred, turning as it steadily does."""
-    still, zero = Vec3(*jnp.zeros(3)), jnp.zeros(())
+    """Return a level drone at rest with all sticks centred, at its steady body rates."""
+    zero_vector, zero = Vec3(*jnp.zeros(3)), jnp.zeros(())
     drone = Drone(
         pos_w=Vec3(zero, zero, zero + HEIGHT_M),
-        vel_w=still,
-        acc_w=still,
+        vel_w=zero_vector,
+        acc_w=zero_vector,
         quat=Quaternion(zero + 1.0, zero, zero, zero),
-        rates_b=still,
+        rates_b=zero_vector,
         applied=Action(*jnp.zeros(ACTION_SIZE)),
         battery_v=zero + model.battery.voltage(0.5),
     )
@@ -105,12 +118,13 @@ def _standing(model: ModelParameters) -> Drone:
 
 
 def _first_crossing(shares: jax.Array) -> jax.Array:
-    """Return after how many steps shares, (num_steps,), first pass a half; NaN if never.
+    """Return the number of steps after which shares first reach a half; NaN if they never do.
 
-    The first share is that after one step.
+    Args:
+        shares: of the steady change, from the first step on, (num_steps,).
     """
     shares = jnp.concatenate([jnp.zeros(1), shares])
     is_past = shares >= HALF
-    place = jnp.argmax(is_past)
-    before, after = shares[place - 1], shares[place]
-    return jnp.where(is_past.any(), place - (after - HALF) / (after - before), jnp.nan)
+    index = jnp.argmax(is_past)
+    before, after = shares[index - 1], shares[index]
+    return jnp.where(is_past.any(), index - (after - HALF) / (after - before), jnp.nan)

@@ -1,4 +1,4 @@
-"""Scripts: flights to be flown, and their ``.npz`` files, an array for each field of ``Script``."""
+"""Scripts: flights to fly, and their ``.npz`` files with an array for each field of ``Script``."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,7 +16,7 @@ from flytrack_sysid.manoeuvres import MANOEUVRES
 SUFFIX = ".npz"
 MAX_BYTES = 64 * 2**20  # in the file, and as float64: thousands of flights of 2.5 s
 MAX_NORM_ERROR = 1e-3  # of a start's quaternion
-ROUNDING = 1e-6  # of numbers that were float32
+ROUNDING = 1e-6  # of numbers converted from float32
 
 
 class ScriptError(ValueError):
@@ -24,7 +24,13 @@ class ScriptError(ValueError):
 
 
 class Script(NamedTuple):
-    """Flights to be flown: manoeuvre names (N,), starts (N, 21), commands (N, T, 4) per 0.01 s."""
+    """Flights to fly.
+
+    Attributes:
+        kinds: names of manoeuvres, (N,).
+        starts: states, (N, 21).
+        commands: one each 0.01 s, (N, T, 4).
+    """
 
     kinds: tuple[str, ...]
     starts: np.ndarray
@@ -40,23 +46,24 @@ def script_of(flights: Iterable[excitation.ScriptedFlight]) -> Script:
 def check_script(script: Script, source: str = "script") -> None:
     """Raise ScriptError unless a script can be flown; the message says source, flight and array."""
     kinds, starts, commands = script
-    number, (low, high) = len(kinds), excitation.SCRIPT_HEIGHTS
-    is_shaped = starts.shape == (number, STATE_SIZE) and commands.shape[::2] == (
-        number,
+    num_flights, (low, high) = len(kinds), excitation.SCRIPT_HEIGHTS
+    is_shaped = starts.shape == (num_flights, STATE_SIZE) and commands.shape[::2] == (
+        num_flights,
         ACTION_SIZE,
     )
     if (
-        number == 0
+        num_flights == 0
         or not is_shaped
         or commands.ndim != 3
         or commands.shape[1] < excitation.MIN_STEPS
     ):
-        found = (
-            f"{number} kinds, starts of shape {starts.shape}, commands of shape {commands.shape}"
+        shapes = (
+            f"{num_flights} kinds, starts of shape {starts.shape}, commands of shape "
+            f"{commands.shape}"
         )
-        fewest = f"{excitation.MIN_STEPS} or more"
-        expected = f"(N,), (N, {STATE_SIZE}) and (N, {fewest}, {ACTION_SIZE}), N >= 1"
-        raise ScriptError(f"{source}: found {found}, expected {expected}")
+        min_steps = f"{excitation.MIN_STEPS} or more"
+        expected = f"(N,), (N, {STATE_SIZE}) and (N, {min_steps}, {ACTION_SIZE}), N >= 1"
+        raise ScriptError(f"{source}: found {shapes}, expected {expected}")
     norm_error = np.abs(np.linalg.norm(starts[:, QUATERNION], axis=1) - 1.0)
     envelope = f"at most {excitation.MAX_SPEED:g} m/s, {low:g} to {high:g} m, and a voltage"
     checks = {
@@ -81,8 +88,9 @@ def _are_sticks(values: np.ndarray) -> np.ndarray:
 def save_script(path: str | Path, script: Script) -> None:
     """Write a script to an ``.npz`` file, atomically; the same script gives the same bytes.
 
-    Raises ScriptError for one that ``load_script`` would refuse, OSError for a file that cannot be
-    written.
+    Raises:
+        ScriptError: ``load_script`` would refuse the script.
+        OSError: the file cannot be written.
     """
     check_name(path)
     check_script(script, str(path))
@@ -90,7 +98,7 @@ def save_script(path: str | Path, script: Script) -> None:
 
 
 def check_name(path: str | Path) -> None:
-    """Raise ScriptError for a file that is not .npz, before there is a script."""
+    """Raise ScriptError for a file name that ``save_script`` would refuse, without a script."""
     if Path(path).suffix.lower() != SUFFIX:
         raise ScriptError(f"{path}: found suffix {Path(path).suffix!r}, expected {SUFFIX}")
 
@@ -104,9 +112,9 @@ def load_script(path: str | Path) -> Script:
         raise ScriptError(f"{path}: not a script, or damaged: {error_text(error)}") from error
     for name in Script._fields:
         if name not in arrays or arrays[name].dtype.kind not in ("U" if name == "kinds" else "iuf"):
-            found = f"an array of {arrays[name].dtype}" if name in arrays else "none"
+            description = f"an array of {arrays[name].dtype}" if name in arrays else "none"
             raise ScriptError(
-                f"{path}: {name}: found {found}, expected texts of kinds, else numbers"
+                f"{path}: {name}: found {description}, expected texts of kinds, else numbers"
             )
     kinds, starts, commands = (arrays[name] for name in Script._fields)
     script = Script(tuple(kinds.ravel().tolist()), starts.astype(float), commands.astype(float))

@@ -7,34 +7,45 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.log import FlightLog
 
-# Standard deviations at level 1; gyro and accelerometer as on a drone whose motors run.
+# Standard deviations at level 1; gyro and accelerometer are those of a drone with running motors.
 GYRO_NOISE = 0.1  # rad/s
 ACCELEROMETER_NOISE = 1.5  # m/s^2
 VELOCITY_NOISE = 0.05  # m/s
 POSITION_NOISE = 0.01  # m
 ATTITUDE_NOISE_DEG = 0.5
-# Quantisation of the log, at any level: 16 bits over 2000 deg/s and 16 g; mm/s, mm, 10 mV.
+# Quantisation of the log, at any level: 16 bits over +-2000 deg/s and +-16 g; mm/s, mm, 10 mV.
 GYRO_STEP = 4000.0 / 2**16 * np.pi / 180.0  # rad/s
 ACCELEROMETER_STEP = 32.0 * 9.80665 / 2**16  # m/s^2
 VELOCITY_STEP, POSITION_STEP, QUATERNION_STEP, BATTERY_STEP = 1e-3, 1e-3, 1e-4, 0.01
-LOST_ROWS = 0.02  # share, at level 1
+LOST_ROWS = 0.02  # fraction of the rows, at level 1
 
 
 def specific_force_b(log: FlightLog, gravity: float) -> np.ndarray:
-    """Return the specific force of the step to each row, body axes before it, (num_rows, 3) m/s^2.
+    """Return the specific force of the step to each row, (num_rows, 3) m/s^2.
 
-    In the first row of a segment, where no step is known, in its own attitude. gravity: m/s^2.
+    It is in the body axes before the step. In the first row of a segment, where no step is known,
+    it is in the body axes of the row itself.
+
+    Args:
+        log: with attitude and acceleration.
+        gravity: m/s^2.
     """
-    before = np.arange(len(log)) - np.where(log.is_start(), 0, 1)
-    attitude = Rotation.from_quat(log["q"][before], scalar_first=True)
+    row_before = np.arange(len(log)) - np.where(log.is_start(), 0, 1)
+    attitude = Rotation.from_quat(log["q"][row_before], scalar_first=True)
     return attitude.inv().apply(log["a"] + np.array([0.0, 0.0, gravity]))
 
 
 def measure(log: FlightLog, level: float, gravity: float, rng: np.random.Generator) -> FlightLog:
-    """Return a log as sensors would have written it: noisy, quantised, with rows lost.
+    """Return a log as sensors would measure it: noisy, quantised, with lost rows.
 
-    level: 1 for the noise of this module, 0 for none. Accelerations become an accelerometer's
-    specific force, and the applied action, which is not measured, is absent.
+    Accelerations become an accelerometer's specific force. The applied action, which is not
+    measured, is absent.
+
+    Args:
+        log: simulated states.
+        level: 1 for the noise of this module, 0 for none.
+        gravity: m/s^2.
+        rng: of noise and lost rows.
     """
 
     def noisy(values: np.ndarray, noise: float, step: float) -> np.ndarray:

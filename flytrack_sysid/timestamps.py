@@ -1,7 +1,7 @@
 """Time stamps as loggers write them, read to one increasing time line.
 
-A stamp is judged by its neighbours on both sides, not by the latest one before it: what does not
-fit is left out, and where the stamps themselves jump, a new segment begins. A stream is a series of
+A stamp is compared with its neighbours on both sides, not only with the one before it. Stamps that
+do not fit are left out, and where the stamps jump, a new segment begins. A stream is a series of
 rows in the order in which they were written, with the stamps of one clock.
 """
 
@@ -13,44 +13,44 @@ import numpy as np
 
 from flytrack_sysid.log import LogError
 
-# Longer steps begin a new segment. 1 s: no window of replay or prediction is longer; 10 steps:
+# Longer steps begin a new segment. 1 s: no window of replay or prediction is longer. 10 steps:
 # batteries and other topics at 1 Hz lose single samples without a pause.
 MAX_GAP_S, MAX_GAP_STEPS = 1.0, 10.0
-# Stamps in a row that are left out between neighbours which fit each other: a tenth of a second at
-# 250 Hz.
+# Maximum number of successive stamps that are left out between neighbours that fit each other: a
+# tenth of a second at 250 Hz.
 MAX_STRAY_ROWS = 25
 # Fewer rows between two jumps are strays, not a segment: no estimate can use 10 rows.
 MIN_SEGMENT_ROWS = 10
 MIN_SEGMENT_FRACTION = 0.5  # of the longest one, for streams that have less than 20 rows
-# Rows that stay on both sides of strays have to be as far apart as the rows between them usually
-# are; else the clock was set back, and the rows are further apart than their stamps. 0.9: to pass
-# for strays, a clock that is set back by n rows would need 10 n rows, so more than 2 rows do not
-# pass within MAX_STRAY_ROWS.
+# Rows kept on both sides of strays must be as far apart in time as their number of rows usually
+# takes. Otherwise the clock was set back, and the rows are further apart than their stamps. 0.9: a
+# clock that is set back by n rows would look like strays only over 10 n rows, which is more than
+# MAX_STRAY_ROWS for more than 2 rows.
 MIN_SPAN_FRACTION = 0.9
-MAX_REORDERED_ROWS = 2  # swapped or repeated rows span less, and move the time by two steps at most
+MAX_REORDERED_ROWS = 2  # swapped or repeated rows span less; they move time by at most two steps
 ROLL_OVERS_S = (
     2**32 * 1e-6,
     2**32 * 1e-3,
 )  # of 32-bit counters of us (71.6 min) and of ms (49.7 days)
-MAX_UNSET_STEPS = 3.0  # from a first stamp of 0: after a longer step, it meant "not set"
-# Between a sample and its recording: transport takes ms, clocks that count from elsewhere differ by
-# minutes.
+MAX_UNSET_STEPS = 3.0  # a longer step after a first stamp of 0 shows that it meant "not set"
+# Between a sample and its recording: transport takes ms; clocks that count from other moments
+# differ by minutes.
 MAX_LATENCY_S = 1.0
-# Of a clock that is read: sorted out of more jumps, what remains would be chance.
+# Jumps per row, and in all, of a clock that is read: with more, the rows kept would be arbitrary.
 MAX_BREAK_FRACTION, MIN_BREAKS = 0.25, 10
-# a pack's voltage changes by less than 0.1 V a cell in a minute at rest
+# A pack's voltage changes by less than 0.1 V a cell in a minute at rest.
 MAX_BATTERY_DISTANCE_S = 60.0
 
 
 class Clock(NamedTuple):
-    """The stamps of a stream that can be trusted.
+    """The valid stamps of a stream.
 
     Attributes:
-        is_used: which rows have such a stamp, (num_rows,) bool.
+        is_used: which rows have a valid stamp, (num_rows,) bool.
         times: of those rows, s, without roll-over, increasing within an epoch.
         epochs: of those rows, int from 0: how often the clock was set back before.
         max_gap_s: longer steps separate segments; infinite for events.
-        faults: number of rows or places by what was found there.
+        faults: number of rows or jumps by the kind of fault.
     """
 
     is_used: np.ndarray
@@ -98,8 +98,9 @@ def read_clock(source: str, name: str, stamps: np.ndarray, are_events: bool = Fa
         stamps: in the order in which the rows were written, s, (num_rows,).
         are_events: rows are written when something happens, so that any gap is possible.
 
-    Returns: The clock; rows that are repeated or that do not fit their neighbours are not used. It
-        has at least one row.
+    Returns:
+        The clock, with at least one row. Rows that are repeated or that do not fit their neighbours
+        are not used.
 
     Raises:
         LogError: no stamp is a finite number, or a quarter of them do not fit the one before.
@@ -121,11 +122,11 @@ def read_clock(source: str, name: str, stamps: np.ndarray, are_events: bool = Fa
     steps = np.diff(stamps[rows])
     breaks = np.flatnonzero((steps <= 0.0) | (steps > max_gap_s)) + 1
     if len(breaks) > max(MIN_BREAKS, MAX_BREAK_FRACTION * len(rows)):
-        found = (
+        problem = (
             f"found {len(breaks)} jumps in {len(rows)} stamps, expected steps of up to "
             f"{max_gap_s:.3g} s"
         )
-        raise LogError(f"{source}: time of {name}: {found}")
+        raise LogError(f"{source}: time of {name}: {problem}")
     times, is_kept, is_start, faults[ROLL_OVER] = _join_runs(
         stamps[rows], breaks, step_s, max_gap_s
     )
@@ -147,7 +148,7 @@ def read_clock(source: str, name: str, stamps: np.ndarray, are_events: bool = Fa
 
 
 def _count_unset(stamps: np.ndarray) -> int:
-    """Return how many stamps at the beginning are 0 because the clock was not set yet."""
+    """Return the number of stamps at the beginning that are 0 because the clock was not set yet."""
     num_zeros = int(np.argmax(stamps != 0.0)) if np.any(stamps != 0.0) else 0
     step_s = _usual_step(stamps[num_zeros:])
     is_far = num_zeros > 0 and step_s > 0.0 and abs(stamps[num_zeros]) > MAX_UNSET_STEPS * step_s
@@ -171,8 +172,11 @@ def _join_runs(
         step_s: the usual step.
         max_gap_s: the longest step within a segment.
 
-    Returns: The times without roll-over, s; which rows are kept; which rows begin a piece,
-        (num_rows,) each; and the number of roll-overs.
+    Returns:
+        times: without roll-over, (num_rows,) s.
+        is_kept: which rows are kept, (num_rows,) bool.
+        is_start: which rows begin a piece, (num_rows,) bool.
+        num_rolls: number of roll-overs.
     """
     times, is_kept = stamps.copy(), np.ones(len(stamps), bool)
     is_start = np.zeros(len(stamps), bool)
@@ -198,9 +202,18 @@ def _join_runs(
 def _cheapest_joint(
     times: np.ndarray, tail: np.ndarray, head: np.ndarray, step_s: float, max_gap_s: float
 ) -> tuple[int, int, float] | None:
-    """Return the last row of the tail, the first of the head that fits it, and the roll-over, s.
+    """Return the pair of rows that joins two runs with the fewest rows left out.
 
-    The pair leaves out the fewest rows; None if no pair fits.
+    Args:
+        times: (num_rows,) s.
+        tail: last rows of the run before.
+        head: first rows of the run after.
+        step_s: the usual step.
+        max_gap_s: the longest step within a segment.
+
+    Returns:
+        The row of the tail, the row of the head, and the roll-over between them, s; None if no pair
+        fits.
     """
     removed = np.arange(len(tail))[::-1, None] + np.arange(len(head))
     rows_apart = head - tail[:, None]
@@ -271,12 +284,12 @@ def _check_common(
         if times[0] - base_times[-1] <= distance_s and base_times[0] - times[-1] <= distance_s:
             return
     ranges = [f"{times[0]:.6f} to {times[-1]:.6f} s" for times in (clock.times, base_clock.times)]
-    found = f"found {ranges[0]}, that of {base} {ranges[1]}"
+    problem = f"found {ranges[0]}, that of {base} {ranges[1]}"
     raise LogError(
-        f"{source}: clock of {name}: {found}; expected times in common, counted from one moment"
+        f"{source}: clock of {name}: {problem}; expected times in common, counted from one moment"
     )
 
 
 def number_segments(times: np.ndarray, max_gap_s: float) -> np.ndarray:
-    """Return the segment of each row, (num_rows,) int; a step above ``max_gap_s`` begins one."""
+    """Return the segment of each row, (num_rows,) int; a step above ``max_gap_s`` starts one."""
     return np.cumsum(np.diff(times, prepend=times[:1]) > max_gap_s)

@@ -1,9 +1,9 @@
 """Traced programs on the disk, so that the next process need not trace them again.
 
-To trace a program of all effects takes longer than to read what it compiles to: JAX finds compiled
-programs by their code, which has to be traced first. So the code is kept beside them
-(``jax.export``), by the sources of what may be traced, the structure of the arguments and their
-shapes.
+Tracing a program of all effects takes longer than loading its compiled form, and JAX finds compiled
+programs by their code, which requires a trace. So the traced code is stored beside them
+(``jax.export``). Its key is the sources of all code that may be traced, and the structure and
+shapes of the arguments.
 """
 
 import contextlib
@@ -21,17 +21,17 @@ from flytrack_env import fusion
 from flytrack_env.compile_cache import FOLDER
 from flytrack_env.files import write_atomically
 
-UNKEPT = "LearnedLaw"  # an effect whose structure the text of a tree does not tell
+UNKEPT = "LearnedLaw"  # an effect whose structure the text of a tree does not determine
 
 
 def keep_trace(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return ``jax.jit`` of a function of trees of arrays whose traces are kept on the disk.
+    """Return ``jax.jit`` of a function of trees of arrays, with traces stored on the disk.
 
-    Only where compiled programs are kept, too (``flytrack_env.compile_cache``), and only for calls
-    that are not traced themselves.
+    Traces are stored only where compiled programs are stored, too (``flytrack_env.compile_cache``),
+    and only for calls that are not traced themselves.
     """
     program = jax.jit(function)
-    known: dict[Any, Callable[..., Any]] = {}
+    programs: dict[Any, Callable[..., Any]] = {}
 
     @functools.wraps(function)
     def call(*args: Any) -> Any:
@@ -40,11 +40,11 @@ def keep_trace(function: Callable[..., Any]) -> Callable[..., Any]:
         if folder is None or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return program(*args)
         types = map(jax.typeof, leaves)
-        kinds = tuple((one.shape, one.dtype) for one in types)
+        kinds = tuple((kind.shape, kind.dtype) for kind in types)
         key = structure, kinds, jax.config.read("jax_enable_x64")
-        if key not in known:
-            known[key] = _load(function, structure, kinds, Path(folder) / "traced")
-        return known[key](*leaves)
+        if key not in programs:
+            programs[key] = _load(function, structure, kinds, Path(folder) / "traced")
+        return programs[key](*leaves)
 
     return call
 
@@ -52,7 +52,7 @@ def keep_trace(function: Callable[..., Any]) -> Callable[..., Any]:
 def _load(
     function: Callable[..., Any], structure: Any, kinds: tuple[Any, ...], folder: Path
 ) -> Callable[..., Any]:
-    """Return the program of leaves, from the disk or traced and put there."""
+    """Return the program of leaves, loaded from the disk, or traced and stored there."""
 
     def of_leaves(*leaves: Any) -> Any:
         return function(*jax.tree.unflatten(structure, leaves))
@@ -62,20 +62,20 @@ def _load(
     if UNKEPT in text:
         return program
     path = folder / _digest(function, text, kinds)
-    kept = _read(path)
-    if kept is not None:
-        exported = jax.export.deserialize(kept)
+    stored = _read(path)
+    if stored is not None:
+        exported = jax.export.deserialize(stored)
     else:
         shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds]
         exported = jax.export.export(program)(*shapes)
         content = exported.serialize()
-        with contextlib.suppress(OSError):  # a full disk, or a folder that is begun afresh
+        with contextlib.suppress(OSError):  # a full disk, or a folder that is being recreated
             write_atomically(path, hashlib.sha256(content).digest() + content)
     return jax.jit(exported.call)
 
 
 def _read(path: Path) -> bytearray | None:
-    """Return a trace on the disk; None if there is none, or a damaged one."""
+    """Return a trace on the disk; None if it is missing or damaged."""
     try:
         content = path.read_bytes()
     except OSError:
@@ -86,14 +86,21 @@ def _read(path: Path) -> bytearray | None:
 
 
 def _digest(function: Callable[..., Any], structure: str, kinds: tuple[Any, ...]) -> str:
-    """Return the name of a trace: whatever the code depends on."""
+    """Return the file name of a trace: a digest of everything that the code depends on."""
     settings = (
         jax.config.read("jax_enable_x64"),
         jax.default_backend(),
         os.environ.get(fusion.SWITCH),
     )
-    parts = (_sources(), function.__module__, function.__qualname__, structure, kinds, settings)
-    return hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()
+    dependencies = (
+        _sources(),
+        function.__module__,
+        function.__qualname__,
+        structure,
+        kinds,
+        settings,
+    )
+    return hashlib.sha256("\n".join(map(str, dependencies)).encode()).hexdigest()
 
 
 @functools.cache

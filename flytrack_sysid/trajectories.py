@@ -1,8 +1,8 @@
 """Trajectories of a flight log, as measured and as models fly it. Needs ``flytrack[viz]``.
 
-At the measured drone are the specific forces that models do not explain, means over 0.1 s in the
-world frame. A model flies by itself under the logged commands, and starts anew from a measured row
-every second.
+The measured drone shows the specific forces that models do not explain: means over 0.1 s in the
+world frame. A model flies freely under the logged commands, and restarts from a measured row every
+second.
 """
 
 from collections.abc import Mapping
@@ -29,11 +29,11 @@ from flytrack_sysid.prediction import (
 )
 from flytrack_sysid.record import fill_gaps
 
-WINDOW_S = 0.1  # of means: long enough for noise to average out, short beside a manoeuvre
+WINDOW_S = 0.1  # of means: long enough to average out noise, short against a manoeuvre
 RESTART_S = 1.0  # of free flight: the horizon of the report's first sentence
-AWAY_M = 10.0  # from the measured path: a model that is farther off has diverged
-# Of one flight: 1 min at 100 Hz. Its path is most of a recording, and grows with the power 1.5 of
-# its rows.
+AWAY_M = 10.0  # from the measured path: a model that is farther away has diverged
+# 1 min at 100 Hz. The path is most of a recording, and its size grows with the power 1.5 of the
+# number of rows.
 MAX_ROWS = 6000
 
 
@@ -44,7 +44,10 @@ class RecordingError(ValueError):
 class _Timed(NamedTuple):
     """A log with a position, and its rows on one time line.
 
-    time_s: (num_rows,) s, of segments one after the other. every: one row of so many is shown.
+    Attributes:
+        log: the log.
+        time_s: with segments one after the other, (num_rows,) s.
+        every: only each n-th row is shown.
     """
 
     log: FlightLog
@@ -57,9 +60,15 @@ def trajectories_of(
 ) -> list[Trajectory]:
     """Return the trajectories of a log: measured, and one of each model that can fly it.
 
-    models: by the names to show. residuals: of these models (``traces``), if they are known. Of
-    more than 6000 rows every n-th is shown. Raises RecordingError for a log without rows or without
-    attitude.
+    Of more than 6000 rows only each n-th is shown.
+
+    Args:
+        log: the flight log.
+        models: by the names to show.
+        residuals: of these models (``traces``); computed if None.
+
+    Raises:
+        RecordingError: the log has no rows or no attitude.
     """
     if not len(log) or "q" not in log:
         content = f"channels {', '.join(log.channels)}" if len(log) else "no rows"
@@ -76,18 +85,19 @@ def trajectories_of(
         if residuals is None
         else {name: force_w(residuals, name, timed.time_s) for name in models}
     )
-    forces_w = {name: one for name, one in forces_w.items() if np.isfinite(one).any()}
-    found = [_measured(timed, f"measured{remark}", forces_w)]
+    forces_w = {name: values for name, values in forces_w.items() if np.isfinite(values).any()}
+    trajectories = [_measured(timed, f"measured{remark}", forces_w)]
     if "p" in log or "v" in log:
-        flown = [_free_flight(timed, name, model) for name, model in models.items()]
-        found += [one for one in flown if one is not None]
-    return found
+        flights = [_free_flight(timed, name, model) for name, model in models.items()]
+        trajectories += [flight for flight in flights if flight is not None]
+    return trajectories
 
 
 def position_of(log: FlightLog) -> tuple[np.ndarray, str]:
     """Return world positions, (num_rows, 3) m, and a remark on their origin, "" if measured.
 
-    Without them, the integrated velocity of each segment from 0 on; 0 without velocity, too.
+    Without measured positions, they are the integrated velocity of each segment, from 0; without a
+    velocity, they are 0.
     """
     if "p" in log:
         return log["p"], ""
@@ -100,7 +110,7 @@ def position_of(log: FlightLog) -> tuple[np.ndarray, str]:
 
 
 def states_of(channels: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return channels (..., size) as states (..., 21), with unit quaternions; NaN if absent."""
+    """Return channels, (..., size), as states, (..., 21), with unit quaternions; NaN if absent."""
     states = np.full((*next(iter(channels.values())).shape[:-1], STATE_SIZE), np.nan)
     for name in IN_STATE.keys() & channels.keys():
         states[..., IN_STATE[name]] = channels[name]
@@ -112,24 +122,27 @@ def states_of(channels: Mapping[str, np.ndarray]) -> np.ndarray:
 def force_w(residuals: Traces, model: str, time_s: np.ndarray) -> np.ndarray:
     """Return the specific force that a model does not explain, (num_rows, 3) m/s^2, world frame.
 
-    It is a mean over 0.1 s.
+    It is a mean over 0.1 s; NaN where no row is scored.
 
-    NaN where nothing is judged. time_s: (num_rows,) of the log, as of ``time_in_line``.
+    Args:
+        residuals: of the models.
+        model: name of the model.
+        time_s: time of the log's rows as of ``time_in_line``, (num_rows,) s.
     """
     force = np.full((len(time_s), 3), np.nan)
     time_s = time_s[residuals.row]
     columns, counts = zip(
         *(residuals.column(model, f"force_world_{axis}") for axis in "xyz"), strict=True
     )
-    parts = np.column_stack([*columns, np.ones(len(time_s))])
-    # By duration, so that the noise of velocities cancels between the ends of a window.
-    is_scored = counts[0] & np.isfinite(parts).all(axis=1)
+    forces_and_one = np.column_stack([*columns, np.ones(len(time_s))])
+    # Weighted by duration, so that only velocity noise at the ends of a window remains.
+    is_scored = counts[0] & np.isfinite(forces_and_one).all(axis=1)
     weight = np.where(is_scored, np.diff(time_s, prepend=time_s[:1]), 0.0)[:, None]
-    summed = np.cumsum(np.where(weight > 0.0, parts * weight, 0.0), axis=0)
-    summed = np.concatenate([np.zeros((1, 4)), summed])
+    integral = np.cumsum(np.where(weight > 0.0, forces_and_one * weight, 0.0), axis=0)
+    integral = np.concatenate([np.zeros((1, 4)), integral])
     begin = np.searchsorted(time_s, time_s - 0.5 * WINDOW_S)
     end = np.searchsorted(time_s, time_s + 0.5 * WINDOW_S, side="right")
-    total = summed[end] - summed[begin]
+    total = integral[end] - integral[begin]
     has_any = weight[:, 0] > 0.0
     force[residuals.row[has_any]] = total[has_any, :3] / total[has_any, 3:]
     return force
@@ -138,8 +151,8 @@ def force_w(residuals: Traces, model: str, time_s: np.ndarray) -> np.ndarray:
 def _measured(timed: _Timed, name: str, residuals_w: Mapping[str, np.ndarray]) -> Trajectory:
     """Return the trajectory as it was measured."""
     log, starts = timed.log, timed.log.is_start()
-    first = np.flatnonzero(starts)[np.cumsum(starts) - 1]
-    rows = np.flatnonzero((np.arange(len(log)) - first) % timed.every == 0)
+    segment_start = np.flatnonzero(starts)[np.cumsum(starts) - 1]
+    rows = np.flatnonzero((np.arange(len(log)) - segment_start) % timed.every == 0)
     return Trajectory(
         name=name,
         states=states_of(log.channels)[rows],
@@ -152,7 +165,7 @@ def _measured(timed: _Timed, name: str, residuals_w: Mapping[str, np.ndarray]) -
 
 
 def _starts_and_ends(prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows where free flights start, one a second, and where the next one takes over."""
+    """Return the rows where free flights start, one a second, and where the next ones start."""
     log, can_start = prediction.log, prediction.is_settled & prediction.is_measured
     half_step = 0.5 * prediction.step_s
     edges = np.append(np.flatnonzero(log.is_start()), len(log))
@@ -160,15 +173,15 @@ def _starts_and_ends(prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
     for first, end in pairwise(edges):
         rows = first + np.flatnonzero(can_start[first:end])
         if len(rows):
-            wanted = np.arange(log.time[rows[0]], log.time[rows[-1]] + half_step, RESTART_S)
-            own = rows[np.unique(np.searchsorted(log.time[rows], wanted - half_step))]
-            starts.append(own)
-            ends.append(np.append(own[1:], end))
+            wanted_s = np.arange(log.time[rows[0]], log.time[rows[-1]] + half_step, RESTART_S)
+            segment_starts = rows[np.unique(np.searchsorted(log.time[rows], wanted_s - half_step))]
+            starts.append(segment_starts)
+            ends.append(np.append(segment_starts[1:], end))
     return np.concatenate(starts), np.concatenate(ends)
 
 
 def _free_flight(timed: _Timed, name: str, model: ModelParameters) -> Trajectory | None:
-    """Return a model's free flight, restarted every second; None where the log lacks its start."""
+    """Return a model's free flight, restarted every second; None if no row can start one."""
     model = with_neutral_effects(model, BY_NAME)  # so that one program flies all models
     if inputs_that_lack(model, timed.log)["p"]:
         return None
@@ -179,41 +192,41 @@ def _free_flight(timed: _Timed, name: str, model: ModelParameters) -> Trajectory
         return None
     steps = np.arange(1 + int(np.ceil(MAX_S / prediction.step_s)))
     rows = starts[:, None] + steps
-    flown = free_flights(prediction, starts, rows[:, 1:])
-    begun = {channel: log[channel][starts[:, None]] for channel in FLOWN if channel in log}
-    states = np.concatenate([states_of(begun), states_of(flown)], axis=1)
+    predicted = free_flights(prediction, starts, rows[:, 1:])
+    initial = {channel: log[channel][starts[:, None]] for channel in FLOWN if channel in log}
+    states = np.concatenate([states_of(initial), states_of(predicted)], axis=1)
     is_before, rows = rows < ends[:, None], np.minimum(rows, len(log) - 1)
     with np.errstate(over="ignore", invalid="ignore"):
         away_m = np.linalg.norm(states[..., POSITION] - log["p"][rows], axis=-1)
     is_finite = np.all(
-        [np.isfinite(states[..., IN_STATE[one]]).all(axis=-1) for one in FLOWN], axis=0
+        [np.isfinite(states[..., IN_STATE[channel]]).all(axis=-1) for channel in FLOWN], axis=0
     )
     is_near = is_finite & (away_m < AWAY_M)
     is_near[:, 0] = True
     num_diverged = int((is_before & ~is_near).any(axis=1).sum())
-    # Measured rows, until the next start or until it diverges.
+    # Measured rows until the next start, or until the model diverges.
     is_shown = (
         is_before & np.logical_and.accumulate(is_near, axis=1) & (filled.source_row[rows] >= 0)
     )
     is_shown &= steps % timed.every == 0
-    shown, states, restarts = (
+    shown_rows, states, restarts = (
         filled.source_row[rows[is_shown]],
         states[is_shown],
         is_shown.nonzero()[1] == 0,
     )
-    if shown[0] > 0:  # begin with the log's first row, so that all have one clock
-        first = states_of(
+    if shown_rows[0] > 0:  # begin with the log's first row, so that all trajectories share a clock
+        first_state = states_of(
             {channel: timed.log[channel][:1] for channel in FLOWN if channel in timed.log}
         )
-        shown, restarts = np.append(0, shown), np.append(True, restarts)
-        states = np.concatenate([first, states])
+        shown_rows, restarts = np.append(0, shown_rows), np.append(True, restarts)
+        states = np.concatenate([first_state, states])
     return Trajectory(
         name=name,
         states=states,
         actions=np.full(
-            (len(shown), ACTION_SIZE), np.nan
-        ),  # the log's: one line would hide another
-        time_s=timed.time_s[shown],
+            (len(shown_rows), ACTION_SIZE), np.nan
+        ),  # the same as the log's: one line would hide the other
+        time_s=timed.time_s[shown_rows],
         ended=f"the log ends; anew every {RESTART_S:g} s"
         + (f"; diverged {num_diverged} times" if num_diverged else ""),
         restarts=restarts,

@@ -1,4 +1,4 @@
-"""Readers of other people's flight logs: CSV by a mapping file, PX4 ULog, Betaflight blackbox."""
+"""Readers of other programs' flight logs: CSV by a mapping file, PX4, Betaflight and others."""
 
 from flytrack_sysid.importing.importer import FORMATS, Imported, import_log
 from flytrack_sysid.importing.mapping import load_mapping

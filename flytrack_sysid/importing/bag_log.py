@@ -1,6 +1,6 @@
 """Bags of topics: MCAP files, bags of ROS 2 and ROS 1, read by mcap and rosbags.
 
-A mapping names the fields: a column is a topic and a field of its messages, as in
+A mapping names the fields. A column is a topic and a field of its messages, as in
 ``/imu/data:angular_velocity.x`` or ``/rc:channels[0]``.
 """
 
@@ -26,8 +26,10 @@ MAX_BYTES = 2**30
 def read_bag(path: Path, mapping: Mapping) -> ImportedFlight:
     """Return the flight in a bag, by a mapping of its topics' fields; SI units and our frames.
 
-    Messages are at the times in their headers, else at those of their recording. Raises LogError
-    for what is no bag, or lacks a topic or a field that the mapping names.
+    The times of messages are those in their headers, else those of their recording.
+
+    Raises:
+        LogError: the file is no bag, or lacks a topic or a field that the mapping names.
     """
     wanted: dict[str, list[str]] = {}
     for channel in mapping.channels:
@@ -55,20 +57,20 @@ def read_bag(path: Path, mapping: Mapping) -> ImportedFlight:
     for topic, field, kind in notes["missing"]:
         where = f"{path}: topic {quote_name(topic)}: field {quote_name(field)}"
         raise LogError(f"{where}: not a number in messages of type {quote_name(kind)}")
-    names = [found["topic"] for found in notes["found"]]
+    names = [topic["topic"] for topic in notes["found"]]
     for topic in wanted:
         if topic not in names:
             listed = ", ".join(map(quote_name, notes["topics"]))[:MAX_LIST_LENGTH] or "no topics"
             raise LogError(f"{path}: topic {quote_name(topic)}: no messages; found {listed}")
-    topics, said = [], []
-    for found, rows in zip(notes["found"], arrays, strict=True):
-        columns = [TIMESTAMP, RECORDED, *(f"{found['topic']}:{field}" for field in found["fields"])]
+    topics, remarks = [], []
+    for entry, rows in zip(notes["found"], arrays, strict=True):
+        columns = [TIMESTAMP, RECORDED, *(f"{entry['topic']}:{field}" for field in entry["fields"])]
         topics.append(Table(str(path), dict(zip(columns, rows.T, strict=True))))
-        if not found["is_stamped"]:
-            name = quote_name(found["topic"])
-            said.append(
+        if not entry["is_stamped"]:
+            name = quote_name(entry["topic"])
+            remarks.append(
                 f"{path}: topic {name}: no stamps in its messages: times are those of their "
                 "recording"
             )
     flight = flight_of_topics(str(path), topics, mapping)
-    return flight._replace(notes=(*said, *flight.notes))
+    return flight._replace(notes=(*remarks, *flight.notes))

@@ -1,8 +1,8 @@
 """Betaflight blackbox logs (``.bbl``, ``.bfl``), decoded by orangebox.
 
-Betaflight's body frame is ours: x forward, y left, z up; so is its accelerometer's sign (+1 g at
-rest), and positive yaw is to the left. docs/real_logs.md says how that was checked on a real log.
-Attitude is there since Betaflight 2025.12; there is no velocity.
+Betaflight's body frame is ours: x forward, y left, z up. Its accelerometer's sign is ours, too (+1
+g at rest), and positive yaw is to the left. docs/real_logs.md says how a real log confirmed this.
+Logs have the attitude since Betaflight 2025.12, and no velocity.
 """
 
 import json
@@ -28,27 +28,26 @@ from flytrack_sysid.log_table import Table, columns_of, log_of_table
 from flytrack_sysid.timestamps import number_segments, put_on_one_line, read_clock
 
 FIRMWARE = "Betaflight"
-MAX_BYTES = 2**29  # of a flash chip
+MAX_BYTES = 2**29  # size of a flash chip
 FIRST_BYTES = b"H Product:Blackbox"
-END_OF_LOG = b"E\xffEnd of log\0"  # the event that a logger writes last
+END_OF_LOG = b"E\xffEnd of log\0"  # last event that a logger writes
 STICKS = tuple(f"setpoint[{axis}]" for axis in range(4))
 GYRO = tuple(f"gyroADC[{axis}]" for axis in range(3))
 ACCELEROMETER = tuple(f"accSmooth[{axis}]" for axis in range(3))
 ATTITUDE = tuple(f"imuQuaternion[{axis}]" for axis in range(3))
-# of x, y, z of a quaternion whose w is at least 0 (Betaflight's blackbox.c)
+# Scale of x, y, z of a quaternion whose w is at least 0 (Betaflight's blackbox.c).
 UNIT_QUATERNION = 32767.0
 BATTERY = "vbatLatest"
 FULL_THROTTLE = 1000.0  # setpoint[3] at full throttle; 0 at none
 FINE = 10.0  # units in one deg/s where blackbox_high_resolution is set
 MICROSECOND = UNITS["time"]["us"]
 MAX_SETTING = 1e9
-MAX_LIST_LENGTH = 1000  # characters of names of fields in a message
+MAX_LIST_LENGTH = 1000  # characters of a list of field names in a message
 PERCENT = 100.0
-# past full stick: smoothing by a Butterworth filter overshoots a step by 4.3 %
+# Past full stick: smoothing by a Butterworth filter overshoots a step by 4.3 %.
 MAX_OVERSHOOT = 0.05
 NUM_MOTORS = 4
-# Settings that stand between throttle, voltage and thrust: name, what is neutral, what the setting
-# does.
+# Settings that change how thrust follows from throttle and voltage: name, neutral values, effect.
 THRUST_SETTINGS = (
     ("vbat_sag_compensation", (0,), "motors get more at a low voltage"),
     ("thrust_linear", (0,), "motors get less at low throttle"),
@@ -59,11 +58,11 @@ THRUST_SETTINGS = (
 def read_betaflight(path: Path, mapping: Mapping) -> list[ImportedFlight]:
     """Return the flights in a blackbox file, one for each log in it.
 
-    Their channels are commands, rates, specific force and voltage.
+    Their channels are commands, rates, specific force and voltage; docs/real_logs.md describes
+    them. A log that cannot be used is left out, and a note says why.
 
-    docs/real_logs.md says what the channels are. A log that cannot be used is left out, and a note
-    says why. Raises LogError for what is no blackbox file of Betaflight 4, or has no log that can
-    be used.
+    Raises:
+        LogError: the file is no blackbox file of Betaflight 4, or has no log that can be used.
     """
     content = read_log_file(path, MAX_BYTES, FIRST_BYTES, "a Betaflight blackbox log")
     is_cut_off = [END_OF_LOG not in log for log in content.split(FIRST_BYTES)[1:]]
@@ -71,10 +70,10 @@ def read_betaflight(path: Path, mapping: Mapping) -> list[ImportedFlight]:
     cut_off = [number for number in numbers if is_cut_off[number - 1]]
     decoded, frames = decode(str(path), "betaflight", path, numbers, cut_off)
     flights, left_out = [], list[LogError]()
-    for number, found, rows in zip(numbers, decoded, frames, strict=True):
+    for number, log_notes, rows in zip(numbers, decoded, frames, strict=True):
         source = str(path) if len(is_cut_off) == 1 else f"{path}, log {number}"
         try:
-            flights.append(_read_log(source, found, rows, mapping))
+            flights.append(_read_log(source, log_notes, rows, mapping))
         except LogError as error:
             left_out.append(error)
     if not flights:
@@ -86,12 +85,19 @@ def read_betaflight(path: Path, mapping: Mapping) -> list[ImportedFlight]:
 def _read_log(
     source: str, notes: dict[str, Any], frames: np.ndarray, mapping: Mapping
 ) -> ImportedFlight:
-    """Return the flight in one log; notes: ``headers`` and the ``names`` of the frames' fields."""
+    """Return the flight in one log.
+
+    Args:
+        source: the log, for messages.
+        notes: of the log, as ``decoders.decode_betaflight`` returns them.
+        frames: (num_frames, num_fields).
+        mapping: selects rows and states the craft.
+    """
     headers, names = _Headers(source, notes["headers"]), notes["names"]
     cut_off = "cut off: found no end-of-log event"
     if not len(frames):
-        why = f"{cut_off}, and no whole frame" if notes["num_bytes_left"] else "found no frames"
-        raise LogError(f"{source}: {why}, expected at least one")
+        problem = f"{cut_off}, and no whole frame" if notes["num_bytes_left"] else "found no frames"
+        raise LogError(f"{source}: {problem}, expected at least one")
     revision = str(headers.values.get("Firmware revision", "none"))
     if not revision.startswith(FIRMWARE):
         raise headers.error(
@@ -101,15 +107,15 @@ def _read_log(
         if name not in names:
             listed = ", ".join(map(quote_name, names))[:MAX_LIST_LENGTH]
             raise LogError(f"{source}: field {name}: missing; found {listed}")
-    said = [f"{quote_name(revision)}, {len(frames)} frames"]
+    remarks = [f"{quote_name(revision)}, {len(frames)} frames"]
     if notes["num_bytes_left"]:
-        left = f"the last {notes['num_bytes_left']} bytes"
-        said.append(f"{cut_off}; {len(frames)} whole frames used, {left} are none")
+        remainder = f"the last {notes['num_bytes_left']} bytes"
+        remarks.append(f"{cut_off}; {len(frames)} whole frames used, {remainder} are none")
     if notes["num_undecoded"]:
-        said.append(f"{notes['num_undecoded']} frames before the first full one left out")
+        remarks.append(f"{notes['num_undecoded']} frames before the first full one left out")
     columns = dict(zip(names, frames.T, strict=True))
     clock = read_clock(source, "the frames", columns["time"] * MICROSECOND)
-    said += clock.describe("the frames")
+    remarks += clock.describe("the frames")
     times = put_on_one_line(source, {"frames": clock}, "frames")["frames"]
     table = Table(source, columns).select(clock.is_used)
     craft = mapping.craft
@@ -117,19 +123,19 @@ def _read_log(
         craft = craft._replace(max_rate_deg_s=headers.full_stick_deg_s())
     full = np.array([*(craft.max_rate_deg_s or ()), FULL_THROTTLE])
     channels, about_attitude = _channels(table, headers)
-    said += about_attitude
+    remarks += about_attitude
     channels["u"], clipped = _commands(table, headers, full)
     if mapping.rules.motors_as_thrust:
         channels["u"][:, 3] = _thrust_of_motors(table, headers)
         clipped.append("thrust command: the mean of the motors")
     columns = columns_of(times - times[0], channels)
     columns["segment"] = number_segments(times, clock.max_gap_s)
-    said += [*clipped, *_motors(table, headers)]
+    remarks += [*clipped, *_motors(table, headers)]
     if "f" not in channels:
-        said.append("no accelerometer in the log: nothing is asked of the specific force")
-    said += [*headers.stick_curve(), *headers.thrust_settings()]
+        remarks.append("no accelerometer in the log: nothing is asked of the specific force")
+    remarks += [*headers.stick_curve(), *headers.thrust_settings()]
     log = log_of_table(table._replace(columns=columns))
-    return ImportedFlight(log, craft, tuple(f"{source}: {text}" for text in said))
+    return ImportedFlight(log, craft, tuple(f"{source}: {text}" for text in remarks))
 
 
 class _Headers:
@@ -143,15 +149,17 @@ class _Headers:
         return LogError(f"{self.source}: header {name}: {text}")
 
     def numbers(self, name: str, size: int, default: list[float] | None = None) -> list[float]:
-        """Return the numbers of a setting, 0 or more, or the default of an absent one."""
+        """Return the numbers of a setting, each 0 or more; the default of an absent setting."""
         value: Any = self.values.get(name, default)
-        found = value if isinstance(value, list) else [value]
-        is_valid = all(isinstance(one, (int, float)) and 0 <= one < MAX_SETTING for one in found)
-        if len(found) != size or not is_valid:
+        values = value if isinstance(value, list) else [value]
+        is_valid = all(
+            isinstance(number, (int, float)) and 0 <= number < MAX_SETTING for number in values
+        )
+        if len(values) != size or not is_valid:
             raise self.error(
                 name, f"found {quote_value(value)}, expected {size} numbers of at least 0"
             )
-        return [float(one) for one in found]
+        return [float(number) for number in values]
 
     def rate_unit_deg_s(self) -> float:
         """Return the rate that one unit of setpoints and gyroscope means, deg/s."""
@@ -170,14 +178,14 @@ class _Headers:
         return roll, pitch, yaw
 
     def rates_type(self) -> str:
-        """Return which rates the sticks have."""
+        """Return the type of the sticks' rates."""
         number = int(self.numbers("rates_type", 1)[0])
         if number >= len(RATES_TYPES):
             raise self.error("rates_type", f"found {number}, expected below {len(RATES_TYPES)}")
         return RATES_TYPES[number]
 
     def stick_curve(self) -> list[str]:
-        """Return a note on the curve from a pilot's sticks to setpoints, which are the commands."""
+        """Return a note on the curve from a pilot's sticks to the setpoints (our commands)."""
         if not {"rc_rates", "rc_expo"} <= self.values.keys():
             return []
         settings = [self.numbers(name, 3) for name in ("rc_rates", "rates", "rc_expo")]
@@ -194,31 +202,33 @@ class _Headers:
         ]
 
     def thrust_settings(self) -> list[str]:
-        """Return notes on settings that change which thrust a throttle means."""
-        found = []
+        """Return notes on settings that change the thrust at a throttle."""
+        notes = []
         for name, neutral, effect in THRUST_SETTINGS:
             value = self.numbers(name, 1, [0.0])[0]
             if value not in neutral:
-                found.append(f"{name} {value:g}: {effect}; the thrust curve has it in it")
+                notes.append(f"{name} {value:g}: {effect}; the thrust curve has it in it")
         kind, percent = (
             self.numbers(f"throttle_limit_{part}", 1, [default])[0]
             for part, default in (("type", 0.0), ("percent", PERCENT))
         )
         if kind and percent != PERCENT:
-            how = {1.0: "scaled to", 2.0: "clipped at"}.get(kind, "limited to")
-            found.append(
-                f"throttle_limit: the throttle is {how} {percent:g} %, and a command of 1 is more"
+            limited = {1.0: "scaled to", 2.0: "clipped at"}.get(kind, "limited to")
+            notes.append(
+                f"throttle_limit: the throttle is {limited} {percent:g} %, and a command of 1 is "
+                "more"
             )
-        return found
+        return notes
 
 
 def _commands(table: Table, headers: _Headers, full: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Return commands (num_rows, 4) and a note if some are clipped.
+    """Return commands, (num_rows, 4), and a note if some are clipped.
 
-    full: the setpoints at full stick, (4,).
+    Setpoints that exceed full stick by more than the overshoot of smoothing are not clipped, so
+    that ``log_of_table`` refuses them.
 
-    What is further past full stick than smoothing overshoots is left, for ``log_of_table`` to
-    refuse.
+    Args:
+        full: the setpoints at full stick, (4,).
     """
     per_unit = headers.rate_unit_deg_s()
     units = np.array([per_unit, per_unit, per_unit, 1.0])
@@ -232,34 +242,36 @@ def _commands(table: Table, headers: _Headers, full: np.ndarray) -> tuple[np.nda
     num_past = np.count_nonzero(is_past.any(axis=1))
     if not num_past:
         return clipped, []
-    most = f"at most {PERCENT * (size[is_past].max() - 1.0):.2g} % past it"
-    return clipped, [f"{num_past} rows clipped to full stick: smoothed setpoints overshoot, {most}"]
+    largest = f"at most {PERCENT * (size[is_past].max() - 1.0):.2g} % past it"
+    return clipped, [
+        f"{num_past} rows clipped to full stick: smoothed setpoints overshoot, {largest}"
+    ]
 
 
 def _channels(table: Table, headers: _Headers) -> tuple[dict[str, np.ndarray], list[str]]:
     """Return the sensors' channels of the log, and notes."""
-    found = {"w": table.matrix(GYRO) * headers.rate_unit_deg_s() * PER_DEGREE}
+    channels = {"w": table.matrix(GYRO) * headers.rate_unit_deg_s() * PER_DEGREE}
     if all(name in table.columns and np.any(table.columns[name]) for name in ACCELEROMETER):
         g_unit = headers.numbers("acc_1G", 1)[0]
         if g_unit == 0.0:
             raise headers.error("acc_1G", "found 0, expected what the accelerometer shows at 1 g")
-        found["f"] = table.matrix(ACCELEROMETER) * GRAVITY / g_unit
+        channels["f"] = table.matrix(ACCELEROMETER) * GRAVITY / g_unit
     if BATTERY in table.columns:
-        found["v_bat"] = table.matrix([BATTERY]) * UNITS["voltage"]["cV"]
+        channels["v_bat"] = table.matrix([BATTERY]) * UNITS["voltage"]["cV"]
     vector = (
         table.matrix(ATTITUDE) / UNIT_QUATERNION if table.columns.keys() >= set(ATTITUDE) else None
     )
     if vector is None or not np.any(vector):
-        return found, []
+        return channels, []
     size = np.linalg.norm(vector, axis=1, keepdims=True)
-    found["q"] = np.column_stack(
+    channels["q"] = np.column_stack(
         [np.sqrt(np.maximum(1.0 - size**2, 0.0)), vector / np.maximum(size, 1.0)]
     )
-    return found, []
+    return channels, []
 
 
 def _motors(table: Table, headers: _Headers) -> list[str]:
-    """Return notes on the motors: how many there are, and how often one is at its end."""
+    """Return notes on the number of motors, and on how often one is at its upper end."""
     names = [name for name in table.columns if name.startswith("motor[")]
     if not names:
         return []
@@ -271,7 +283,7 @@ def _motors(table: Table, headers: _Headers) -> list[str]:
 
 
 def _thrust_of_motors(table: Table, headers: _Headers) -> np.ndarray:
-    """Return thrust commands (num_rows,): -1 and 1 are the ends of the motors' mean output."""
+    """Return thrust commands, (num_rows,): -1 and 1 are the ends of the motors' mean output."""
     low, high = headers.numbers("motorOutput", 2)
     names = [name for name in table.columns if name.startswith("motor[")]
     if not names or high <= low:

@@ -1,7 +1,7 @@
 """Betaflight's settings: the rate at full stick, and stick curve and rate loop as effects.
 
-Source: ``apply...Rates`` in Betaflight 4.6, src/main/fc/rc.c, and controlrate_profile.h. The loop's
-body is still to be fitted.
+Source: ``apply...Rates`` in Betaflight 4.6, src/main/fc/rc.c, and controlrate_profile.h. The
+settings do not state the craft's body in the loop; a fit has to determine it.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,12 +11,12 @@ from flytrack_env.effects import ActualRates, BetaflightLoop, BetaflightRates, Q
 
 RATES_TYPES = ("BETAFLIGHT", "RACEFLIGHT", "KISS", "ACTUAL", "QUICK")
 PERCENT = 100.0
-STEEP_RC_RATE, STEEP_SLOPE = 2.0, 14.54  # above this RC rate, the curve gets steeper
+STEEP_RC_RATE, STEEP_SLOPE = 2.0, 14.54  # the curve is steeper above this RC rate
 BETAFLIGHT_RATE_DEG_S = KISS_RATE_DEG_S = 200.0  # at RC rate 1
 TENS = 10.0  # deg/s in one unit of the other types' settings
 QUICK_RATE_DEG_S = 2.0  # per unit of RC rate
-MIN_REMAINDER = 0.01  # of 1 less the super rate, as the firmware bounds it
-# What the effect of the loop has as it comes; a craft that differs is flown by another loop.
+MIN_REMAINDER = 0.01  # lower bound of 1 minus the super rate, as in the firmware
+# Settings that the effect of the loop assumes; a craft with other settings has another loop.
 ASSUMED = {
     "mixer_type": "LEGACY",
     "tpa_mode": "D",
@@ -27,11 +27,11 @@ ASSUMED = {
     "transient_throttle_limit": "0",
     "feedforward_transition": "0",
 }
-# A racer of 5 inch, before anything was fitted.
+# A racer of 5 inch, before any fit.
 GENERIC = BetaflightLoop(20.0, 20.0, 2.0, 2.0, 0.02, 0.5)
 SETTINGS = BetaflightLoop._fields[
     BetaflightLoop._fields.index("p_roll") :
-]  # before them: the craft
+]  # the fields before are of the craft
 MIN_SMOOTHING_HZ, SMOOTHING, TENTHS = 15, 1.5, 10.0
 
 
@@ -42,8 +42,11 @@ def full_stick_rate(
 
     Expo does not change it.
 
-    rc_rate, super_rate, limit_deg_s: as in the log's headers ``rc_rates``, ``rates``,
-    ``rate_limits``.
+    Args:
+        rates_type: one of ``RATES_TYPES``.
+        rc_rate: as in the log's header ``rc_rates``.
+        super_rate: as in the log's header ``rates``.
+        limit_deg_s: as in the log's header ``rate_limits``.
     """
     remainder = max(1.0 - super_rate / PERCENT, MIN_REMAINDER)
     rate = rc_rate / PERCENT
@@ -59,56 +62,64 @@ def full_stick_rate(
 
 
 def stick_curve(rates_type: str, axes: Sequence[Sequence[float]]) -> Any:
-    """Return the effect that bends sticks as the rate settings do.
+    """Return the effect with the stick curve of the rate settings.
 
-    None for rate types without such an effect, and for straight settings.
+    Assumption: no rate limit is below the rate at full stick, and Quick rates do not apply expo to
+    the stick (``quick_rates_rc_expo`` is OFF, the default).
 
-    axes: of roll, pitch, yaw, the rates and the expo as in the log's headers ``rc_rates``,
-    ``rates``, ``rc_expo``. Assumption: no rate limit is below the rate at full stick, and Quick
-    rates leave the expo out of the stick (``quick_rates_rc_expo`` is OFF, as it comes).
+    Args:
+        rates_type: one of ``RATES_TYPES``.
+        axes: of roll, pitch and yaw, the values of the log's headers ``rc_rates``, ``rates`` and
+            ``rc_expo``.
+
+    Returns:
+        The effect; None for rate types without one, and for linear curves.
     """
     rc_rates, super_rates, expos = zip(*axes, strict=True)
 
     def bends(slope_deg_s: float) -> list[float]:
         slopes = [slope_deg_s * rc_rate for rc_rate in rc_rates]  # about the centre, deg/s
         return [
-            1.0 - slope / max(slope, TENS * top)
-            for slope, top in zip(slopes, super_rates, strict=True)
+            1.0 - slope / max(slope, TENS * super_rate)
+            for slope, super_rate in zip(slopes, super_rates, strict=True)
         ]
 
-    shares = [expo / PERCENT for expo in expos]
+    expo_fractions = [expo / PERCENT for expo in expos]
     if rates_type == "ACTUAL":
-        curve: Any = ActualRates(*bends(TENS), *shares)
+        curve: Any = ActualRates(*bends(TENS), *expo_fractions)
     elif rates_type == "QUICK":
-        curve = QuickRates(*bends(QUICK_RATE_DEG_S), *shares)
+        curve = QuickRates(*bends(QUICK_RATE_DEG_S), *expo_fractions)
     elif rates_type == "BETAFLIGHT":
-        most = 1.0 - MIN_REMAINDER
-        curve = BetaflightRates(*(min(rate / PERCENT, most) for rate in super_rates), *shares)
+        max_fraction = 1.0 - MIN_REMAINDER
+        curve = BetaflightRates(
+            *(min(rate / PERCENT, max_fraction) for rate in super_rates), *expo_fractions
+        )
     else:
         return None
     return curve if any(getattr(curve, name) for name in effect_of(curve).notable) else None
 
 
 def rate_loop(value: Callable[[str], str], frames_hz: float) -> BetaflightLoop | None:
-    """Return the effect of a craft's settings; None if its firmware's loop is not that effect's.
+    """Return the rate loop with a craft's settings; None if they select another loop.
 
-    value: of a setting, by its name on the command line. frames_hz: how often the receiver's frames
-    come, which should be how often a log has commands.
+    Args:
+        value: returns a setting by its name on the command line.
+        frames_hz: rate of the receiver's frames, which should be that of the commands in a log.
     """
     if any(value(name) not in ("", expected) for name, expected in ASSUMED.items()):
         return None
-    found = {name: float(value(name)) for name in SETTINGS if value(name)}
+    settings = {name: float(value(name)) for name in SETTINGS if value(name)}
     for stem in ("gyro_lpf1", "dterm_lpf1"):
-        if not found[f"{stem}_dyn_min_hz"]:  # then the filter does not follow throttle
+        if not settings[f"{stem}_dyn_min_hz"]:  # the filter does not follow throttle
             cutoff_hz = float(value(f"{stem}_static_hz"))
-            found |= {f"{stem}_dyn_min_hz": cutoff_hz, f"{stem}_dyn_max_hz": cutoff_hz}
+            settings |= {f"{stem}_dyn_min_hz": cutoff_hz, f"{stem}_dyn_max_hz": cutoff_hz}
     if value("iterm_relax") == "OFF":
-        found["iterm_relax_cutoff"] = 0.0
-    found["sticks_hz"] = _smoothing(value, "setpoint", "rc_smoothing_auto_factor", frames_hz)
-    found["throttle_hz"] = _smoothing(
+        settings["iterm_relax_cutoff"] = 0.0
+    settings["sticks_hz"] = _smoothing(value, "setpoint", "rc_smoothing_auto_factor", frames_hz)
+    settings["throttle_hz"] = _smoothing(
         value, "throttle", "rc_smoothing_auto_factor_throttle", frames_hz
     )
-    return GENERIC._replace(**found)
+    return GENERIC._replace(**settings)
 
 
 def _smoothing(value: Callable[[str], str], channel: str, factor: str, frames_hz: float) -> float:

@@ -1,8 +1,8 @@
 """Commands from attitude or torque setpoints or motor outputs, where a log has no rate setpoints.
 
-An attitude controller asks for rates in proportion to the error of the attitude, so these are the
-rate commands. A rate controller asks for a torque in proportion to the error of the rates; the
-torque over that gain, on top of the measured rates, is the rate command. Gains are stated in the
+An attitude controller commands rates in proportion to the attitude error, so the rate command is
+that error times the gain. A rate controller commands a torque in proportion to the rate error, so
+the rate command is the measured rate plus the torque over the gain. Gains are stated in the
 mapping, or identified from the log.
 """
 
@@ -21,20 +21,22 @@ from flytrack_sysid.plausibility import MIN_ROWS
 from flytrack_sysid.timestamps import MAX_GAP_S
 
 AXES = ("roll", "pitch", "yaw")
-FLYING_THRUST = -0.9  # command: with less, it may stand on the ground, where rates do not follow
-# Of the rate loop, while an attitude gain is identified: lags and delays, s.
+FLYING_THRUST = -0.9  # command: below, it may stand on the ground, where rates do not follow
+# Candidate lags and delays, s, of the rate loop while an attitude gain is identified.
 LAGS_S, DELAYS_S = (0.0, 0.02, 0.04, 0.06, 0.1, 0.15), (0.0, 0.01, 0.02, 0.03, 0.04)
 MIN_CORRELATION = 0.7  # of the rates with those of an identified attitude gain
-MIN_EXPLAINED = 0.9  # of the variance of torques, which a controller computes without noise
+MIN_EXPLAINED = 0.9  # of the torques' variance: a controller computes torques without noise
 
 
 class CommandRules(NamedTuple):
     """How commands follow from setpoints of attitude or torque, and from motors.
 
-    attitude_gain: rad/s per rad, of roll, pitch, yaw, 0 to identify it. rate_gain: N m per rad/s,
-    None to identify it. motors_as_thrust: their mean replaces the thrust command. motor_torque: N m
-    about x, y, z by each motor at its upper end, (3, num_motors), None where torques are logged or
-    not known.
+    Attributes:
+        attitude_gain: of roll, pitch, yaw (rad/s per rad); 0 to identify one.
+        rate_gain: of roll, pitch, yaw (N m per rad/s); None to identify it.
+        motors_as_thrust: the mean of the motors replaces the thrust command.
+        motor_torque: about x, y, z by each motor at its upper end, (3, num_motors) N m; None where
+            torques are logged or unknown.
     """
 
     attitude_gain: tuple[float, ...] = (0.0, 0.0, 0.0)
@@ -50,18 +52,26 @@ def commands_of(
     rules: CommandRules,
     max_rate_deg_s: tuple[float, ...] | None,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return a flight's commands (num_rows, 4) in [-1, 1], and notes on assumptions and clipping.
+    """Return a flight's commands, (num_rows, 4) in [-1, 1], and notes on assumptions and clipping.
 
-    channels: of ``CHANNELS``, and ``attitude_command`` (roll, pitch, yaw, rad), ``own_attitude``
-    (as the autopilot estimates it), ``torque_command`` (N m), ``reference_rates`` (rad/s),
-    ``thrust_command`` (-1 to 1) and ``motors`` (0 to 1), (num_rows, n) each. Raises LogError for
-    what is missing or cannot be identified.
+    Args:
+        source: the log, for messages.
+        time: (num_rows,) s.
+        channels: of ``CHANNELS``, and ``attitude_command`` (roll, pitch, yaw, rad),
+            ``own_attitude`` (the autopilot's estimate, rad), ``torque_command`` (N m),
+            ``reference_rates`` (rad/s), ``thrust_command`` (-1 to 1) and ``motors`` (0 to 1),
+            (num_rows, n) each.
+        rules: how commands follow from these channels.
+        max_rate_deg_s: rates of roll, pitch, yaw at a command of 1; None if unknown.
+
+    Raises:
+        LogError: something is missing or cannot be identified.
     """
     notes: tuple[str, ...] = ()
     if "motors" in channels:
         notes += (f"{source}: {saturation(channels['motors'].max(axis=1) >= 1.0)}",)
-    thrust, said = _thrust(source, channels, rules)
-    notes += said
+    thrust, new_notes = _thrust(source, channels, rules)
+    notes += new_notes
     if "u" in channels:
         commands = np.column_stack([channels["u"][:, :3], thrust])
     else:
@@ -70,9 +80,11 @@ def commands_of(
                 f"{source}: craft.max_rate_deg_s: missing in the mapping: which rates are a "
                 "command of 1?"
             )
-        rates, said = _rates(source, time, {**channels, "thrust_command": thrust[:, None]}, rules)
+        rates, new_notes = _rates(
+            source, time, {**channels, "thrust_command": thrust[:, None]}, rules
+        )
         commands = np.column_stack([rates / (np.array(max_rate_deg_s) * PER_DEGREE), thrust])
-        notes += said
+        notes += new_notes
     is_past = np.any(np.abs(commands) > 1.0 + COMMAND_MARGIN, axis=1)
     if is_past.any():
         notes += (
@@ -84,7 +96,7 @@ def commands_of(
 def _thrust(
     source: str, channels: Channels[str, np.ndarray], rules: CommandRules
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the thrust commands (num_rows,), and notes."""
+    """Return the thrust commands, (num_rows,), and notes."""
     if rules.motors_as_thrust:
         if "motors" not in channels:
             raise LogError(
@@ -104,7 +116,7 @@ def _thrust(
 def _rates(
     source: str, time: np.ndarray, channels: Channels[str, np.ndarray], rules: CommandRules
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the rate commands (num_rows, 3), rad/s, and a note on the assumption."""
+    """Return the rate commands, (num_rows, 3) rad/s, and a note on the assumption."""
     if rules.motor_torque is not None and "motors" in channels:
         channels = {
             **channels,
@@ -120,12 +132,12 @@ def _rates(
     if "attitude_command" not in channels:
         raise LogError(f"{source}: found neither rate, attitude nor torque commands in the mapping")
     errors = _attitude_errors(source, channels)
-    gains, how = rules.attitude_gain, "given"
+    gains, origin = rules.attitude_gain, "given"
     if min(gains) == 0.0:
-        gains, how = _identified_attitude_gain(source, time, channels, errors, gains)
+        gains, origin = _identified_attitude_gain(source, time, channels, errors, gains)
     note = (
         f"{source}: rate commands: errors of the attitude, times gains of {_listed(gains)} 1/s "
-        f"({how})"
+        f"({origin})"
     )
     note += "; what else the attitude controller adds is left out"
     return errors * np.array(gains), (note,)
@@ -144,15 +156,15 @@ def _listed(values: tuple[float, ...]) -> str:
 
 
 def _attitude_errors(source: str, channels: Channels[str, np.ndarray]) -> np.ndarray:
-    """Return setpoints less the attitude, as Euler angles, (num_rows, 3) rad.
+    """Return the setpoints minus the attitude, as Euler angles, (num_rows, 3) rad.
 
-    Common autopilots do so.
+    Common autopilots define the error like this.
     """
-    own = channels.get("own_attitude")
-    if own is None:
+    attitude = channels.get("own_attitude")
+    if attitude is None:
         _check_there(source, channels, "q")
-        own = Rotation.from_quat(channels["q"], scalar_first=True).as_euler("ZYX")[:, ::-1]
-    errors = channels["attitude_command"] - own
+        attitude = Rotation.from_quat(channels["q"], scalar_first=True).as_euler("ZYX")[:, ::-1]
+    errors = channels["attitude_command"] - attitude
     return np.mod(errors + np.pi, 2.0 * np.pi) - np.pi
 
 
@@ -163,9 +175,14 @@ def _identified_attitude_gain(
     errors: np.ndarray,
     given: tuple[float, ...],
 ) -> tuple[tuple[float, ...], str]:
-    """Return each axis's gain, rad/s per rad, at which lagged, delayed errors fit the rates best.
+    """Return the gains at which lagged, delayed attitude errors fit the rates best, and a note.
 
-    A note on the gains comes second.
+    Args:
+        source: the log, for messages.
+        time: (num_rows,) s.
+        channels: as for ``commands_of``.
+        errors: of the attitude, (num_rows, 3) rad.
+        given: stated gains, rad/s per rad; those of 0 are identified.
     """
     _check_there(source, channels, "w")
     if len(time) < MIN_ROWS:
@@ -182,23 +199,23 @@ def _identified_attitude_gain(
         rates = channels["w"][is_flying, axis] - channels["w"][is_flying, axis].mean()
         for delay_s in DELAYS_S:
             delay = round(delay_s / step_s)
-            late = np.concatenate([np.zeros(delay), errors[: len(errors) - delay, axis]])
+            delayed = np.concatenate([np.zeros(delay), errors[: len(errors) - delay, axis]])
             for lag_s in LAGS_S:
                 decay = np.exp(-step_s / lag_s) if lag_s else 0.0
-                shown = lfilter([1.0 - decay], [1.0, -decay], late)[is_flying]
-                shown = shown - shown.mean()
-                size = np.linalg.norm(shown) * np.linalg.norm(rates)
-                correlation = float(shown @ rates / size) if size else 0.0
+                response = lfilter([1.0 - decay], [1.0, -decay], delayed)[is_flying]
+                response = response - response.mean()
+                size = np.linalg.norm(response) * np.linalg.norm(rates)
+                correlation = float(response @ rates / size) if size else 0.0
                 if correlation > best:
-                    best, gain = correlation, float(shown @ rates / (shown @ shown))
+                    best, gain = correlation, float(response @ rates / (response @ response))
         if not best >= MIN_CORRELATION:
-            found = (
+            problem = (
                 f"rates correlate with the attitude error by {best:.2f}, expected "
                 f"{MIN_CORRELATION} or more"
             )
             raise LogError(
-                f"{source}: attitude_command.gain: cannot be identified for {name}: {found}; state "
-                "it"
+                f"{source}: attitude_command.gain: cannot be identified for {name}: {problem}; "
+                "state it"
             )
         gains.append(gain)
         correlations.append(best)
@@ -209,61 +226,64 @@ def _identified_attitude_gain(
 def _rates_of_the_law(
     source: str, time: np.ndarray, channels: Channels[str, np.ndarray]
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the rates (num_rows, 3) that torque setpoints track by their law, and a note.
+    """Return the rates that torque setpoints track by their law, (num_rows, 3) rad/s, and a note.
 
     Source: Lee, Leok, McClamroch, CDC 2010, with an integral as in Crazyflie's firmware:
-    torque = -KR e - Kw (w - w_reference) - KI integral(e) + constant, which is Kw times the error
-    of the rates from w_reference - KR/Kw e. All factors are identified. Assumption: integral and
-    constant hold against a steady torque, such as that of uneven motors.
+    torque = -KR e - Kw (w - w_reference) - KI integral(e) + constant. Without the last two terms
+    this is Kw times the error of the rates from w_reference - KR/Kw e. All factors are identified.
+    Assumption: integral and constant balance a steady torque, such as that of uneven motors.
     """
     if "attitude_command" not in channels:
         where = f"{source}: torque_command.rate_gain: missing"
         raise LogError(f"{where}; only with setpoints of attitude it can be identified")
     errors = _rotation_errors(source, channels)
-    steps_s = np.where(np.diff(time) > MAX_GAP_S, 0.0, np.diff(time))  # nothing is known of pauses
+    steps_s = np.where(np.diff(time) > MAX_GAP_S, 0.0, np.diff(time))  # pauses are unknown
     steps = steps_s[:, None] * 0.5 * (errors[1:] + errors[:-1])
     integrals = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     reference = channels.get("reference_rates", np.zeros_like(errors))
     rates = channels["w"] - reference
-    ratios, gains, explained = [], [], []
+    ratios, gains, explained_by_axis = [], [], []
     for axis, name in enumerate(AXES):
         torque = channels["torque_command"][:, axis]
-        parts = (errors[:, axis], rates[:, axis], integrals[:, axis], np.ones(len(time)))
-        design = np.stack(parts, axis=1)
+        regressors = (errors[:, axis], rates[:, axis], integrals[:, axis], np.ones(len(time)))
+        design = np.stack(regressors, axis=1)
         weights = np.linalg.lstsq(design, torque, rcond=None)[0]
-        share = (
+        explained_variance = (
             1.0 - float(np.var(torque - design @ weights) / np.var(torque))
             if np.ptp(torque)
             else 0.0
         )
-        if not share >= MIN_EXPLAINED or weights[1] >= 0.0:
-            found = (
-                f"attitude and rates explain {share:.0%} of the torque, expected "
+        if not explained_variance >= MIN_EXPLAINED or weights[1] >= 0.0:
+            problem = (
+                f"attitude and rates explain {explained_variance:.0%} of the torque, expected "
                 f"{MIN_EXPLAINED:.0%}"
             )
             where = f"{source}: torque_command.rate_gain: cannot be identified for {name}"
-            raise LogError(f"{where}: {found}; state it")
+            raise LogError(f"{where}: {problem}; state it")
         ratios.append(float(weights[0] / weights[1]))
         gains.append(-float(weights[1]))
-        explained.append(f"{share:.1%}")
-    how = (
+        explained_by_axis.append(f"{explained_variance:.1%}")
+    identified = (
         f"identified with Kw {_listed(tuple(gains))} N m s/rad; the law explains "
-        f"{', '.join(explained)}"
+        f"{', '.join(explained_by_axis)}"
     )
     assumed = "reference rates, and attitude errors times KR/Kw of the torque setpoints' law"
     left_out = "its integral, which holds against steady torques, is left out"
-    note = f"{source}: rate commands: {assumed}, {_listed(tuple(ratios))} 1/s ({how}); {left_out}"
+    note = (
+        f"{source}: rate commands: {assumed}, {_listed(tuple(ratios))} 1/s ({identified}); "
+        f"{left_out}"
+    )
     return reference - np.array(ratios) * errors, (note,)
 
 
 def _rotation_errors(source: str, channels: Channels[str, np.ndarray]) -> np.ndarray:
-    """Return the attitude error of the torque setpoints' law, body axes, (num_rows, 3)."""
-    own = channels.get("own_attitude")
-    if own is None:
+    """Return the attitude error in the torque setpoints' law, body axes, (num_rows, 3)."""
+    estimate = channels.get("own_attitude")
+    if estimate is None:
         _check_there(source, channels, "q")
         attitude = Rotation.from_quat(channels["q"], scalar_first=True)
     else:
-        attitude = Rotation.from_euler("ZYX", own[:, ::-1])
+        attitude = Rotation.from_euler("ZYX", estimate[:, ::-1])
     turn = (
         Rotation.from_euler("ZYX", channels["attitude_command"][:, ::-1]).inv() * attitude
     ).as_matrix()

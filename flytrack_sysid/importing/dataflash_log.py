@@ -1,7 +1,7 @@
 """ArduPilot's DataFlash logs (``.bin``), decoded by pymavlink: NED and FRD converted to our frames.
 
-Source of messages, fields and units: ardupilot.org/copter/docs/logmessages.html. A message that
-comes from several sensors has an instance.
+Source of messages, fields and units: ardupilot.org/copter/docs/logmessages.html. Messages of
+several sensors are numbered by an instance.
 """
 
 from pathlib import Path
@@ -28,7 +28,7 @@ GYROSCOPE, ACCELEROMETER = ("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")
 RATES, SETPOINTS, THROTTLE = ("R", "P", "Y"), ("RDes", "PDes", "YDes"), "AOut"
 QUATERNION, EULER_DEG = ("Q1", "Q2", "Q3", "Q4"), ("Roll", "Pitch", "Yaw")
 VELOCITY, POSITION = ("VN", "VE", "VD"), ("PN", "PE", "PD")
-HEALTH = ("GH", "AH")  # 1: gyroscope and accelerometer of this instance are healthy
+HEALTH = ("GH", "AH")  # 1: the gyroscope or accelerometer of this instance is healthy
 NUM_OUTPUTS = 14  # C1 to C14 of RCOU
 FIELDS: dict[str, tuple[str, ...]] = {
     "RATE": (*RATES, *SETPOINTS, THROTTLE),
@@ -39,8 +39,8 @@ FIELDS: dict[str, tuple[str, ...]] = {
     "BAT": ("Volt",),
     "RCOU": tuple(f"C{number}" for number in range(1, NUM_OUTPUTS + 1)),
 }
-# Full stick of roll, pitch, yaw, deg/s: the rate of acro mode (before 4.1: a gain, with the degrees
-# of the firmware's full stick), and the limit of other modes, 0 for none. The larger one counts.
+# Full stick of roll, pitch, yaw, deg/s, is the larger of two: the rate of acro mode (before 4.1: a
+# gain, with the degrees of the firmware's full stick), and the limit of other modes, 0 for none.
 ACRO_RATES = (
     ("ACRO_RP_RATE", "ACRO_RP_P"),
     ("ACRO_RP_RATE", "ACRO_RP_P"),
@@ -48,7 +48,7 @@ ACRO_RATES = (
 )
 RATE_LIMITS = ("ATC_RATE_R_MAX", "ATC_RATE_P_MAX", "ATC_RATE_Y_MAX")
 FULL_STICK_DEG = 45.0
-# FRAME_CLASS of what is no quadcopter, and SERVOn_FUNCTION of the motors 1 to 8, and 9 to 12.
+# Values of FRAME_CLASS that mean no quadcopter; of SERVOn_FUNCTION for motors 1 to 8, and 9 to 12.
 FRAMES = {
     2: "a hexacopter",
     3: "an octocopter",
@@ -59,14 +59,15 @@ FRAMES = {
 }
 MOTOR_FUNCTIONS = (*range(33, 41), *range(82, 86))
 NUM_MOTORS = 4
-# MOT_PWM_MIN, MOT_PWM_MAX, us, and MOT_SPIN_MIN, MOT_SPIN_MAX, between them, as the firmware comes.
+# Defaults of the firmware: MOT_PWM_MIN and MOT_PWM_MAX in us, MOT_SPIN_MIN and MOT_SPIN_MAX as
+# fractions between them.
 MOTOR_DEFAULTS = {
     "MOT_PWM_MIN": 1000.0,
     "MOT_PWM_MAX": 2000.0,
     "MOT_SPIN_MIN": 0.15,
     "MOT_SPIN_MAX": 0.95,
 }
-MIN_HEALTHY_FRACTION = 0.5  # of the rows of an instance say so: the sensor of most of the flight
+MIN_HEALTHY_FRACTION = 0.5  # of an instance's rows: the sensor is healthy for most of the flight
 
 
 class _Message(NamedTuple):
@@ -77,10 +78,12 @@ class _Message(NamedTuple):
 
 
 def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
-    """Return the flight in a DataFlash log: commands, rates, attitude, and what else it has.
+    """Return the flight in a DataFlash log: commands, rates, attitude, and its other channels.
 
-    docs/real_logs.md says which messages the channels are of. Raises LogError for what is no such
-    log, is not of a copter, or lacks rates and their setpoints.
+    docs/real_logs.md lists the messages of the channels.
+
+    Raises:
+        LogError: the file is no such log, is not of a copter, or lacks rates and their setpoints.
     """
     read_log_file(path, MAX_BYTES, FIRST_BYTES, "an ArduPilot log (DataFlash)", len(FIRST_BYTES))
     notes, arrays = decode(
@@ -88,14 +91,14 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
     )
     _check_vehicle(path, notes["texts"], notes["parameters"])
     messages: dict[str, list[_Message]] = {}
-    for found, rows in zip(notes["found"], arrays, strict=True):
-        message = _Message(found["instance"], dict(zip(found["fields"], rows.T, strict=True)))
-        messages.setdefault(found["name"], []).append(message)
+    for instance, rows in zip(notes["found"], arrays, strict=True):
+        message = _Message(instance["instance"], dict(zip(instance["fields"], rows.T, strict=True)))
+        messages.setdefault(instance["name"], []).append(message)
     parameters: dict[str, float] = notes["parameters"]
-    said = _airframe(parameters)
+    remarks = _airframe(parameters)
     if notes["is_cut_off"]:
-        said.append("cut off: used up to the last whole message")
-    chosen = {name: _choose(name, instances, said) for name, instances in messages.items()}
+        remarks.append("cut off: used up to the last whole message")
+    chosen = {name: _choose(name, instances, remarks) for name, instances in messages.items()}
     for name in ("RATE",):
         if name not in chosen or any(field not in chosen[name] for field in (TIME, *FIELDS[name])):
             listed = (
@@ -108,9 +111,9 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
     craft = mapping.craft
     if craft.max_rate_deg_s is None:
         craft = craft._replace(
-            max_rate_deg_s=_full_stick_deg_s(path, parameters, chosen["RATE"], said)
+            max_rate_deg_s=_full_stick_deg_s(path, parameters, chosen["RATE"], remarks)
         )
-    channels = _channels(chosen, parameters, np.array(craft.max_rate_deg_s), said)
+    channels = _channels(chosen, parameters, np.array(craft.max_rate_deg_s), remarks)
     topics = [
         Table(str(path), {TIMESTAMP: fields[TIME] * UNITS["time"]["us"], **_named(name, fields)})
         for name, fields in chosen.items()
@@ -119,7 +122,7 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
     flight = flight_of_topics(
         str(path), topics, mapping._replace(channels=tuple(channels), craft=craft)
     )
-    return flight._replace(notes=(*(f"{path}: {text}" for text in said), *flight.notes))
+    return flight._replace(notes=(*(f"{path}: {text}" for text in remarks), *flight.notes))
 
 
 def _named(message: str, fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -127,7 +130,7 @@ def _named(message: str, fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]
 
 
 def _check_vehicle(path: Path, texts: list[str], parameters: dict[str, float]) -> None:
-    """Raise LogError for the log of another vehicle, as its messages of text name the firmware."""
+    """Raise LogError for the log of another vehicle; its text messages name the firmware."""
     for text in texts:
         for vehicle in OTHER_VEHICLES:
             if text.startswith(vehicle):
@@ -139,7 +142,7 @@ def _check_vehicle(path: Path, texts: list[str], parameters: dict[str, float]) -
 
 
 def _airframe(parameters: dict[str, float]) -> list[str]:
-    """Return a note if the log's own parameters say that the craft is no quadcopter."""
+    """Return a note if the log's parameters say that the craft is no quadcopter."""
     frame = FRAMES.get(int(parameters.get("FRAME_CLASS", 0)))
     num_motors = sum(
         _function(parameters, number) in MOTOR_FUNCTIONS for number in range(1, NUM_OUTPUTS + 1)
@@ -150,36 +153,36 @@ def _airframe(parameters: dict[str, float]) -> list[str]:
 
 
 def _function(parameters: dict[str, float], output: int) -> int:
-    """Return what an output drives, 0 if nothing."""
+    """Return the number of the function that an output has; 0 for none."""
     return int(parameters.get(f"SERVO{output}_FUNCTION", 0))
 
 
-def _choose(name: str, instances: list[_Message], said: list[str]) -> dict[str, np.ndarray]:
-    """Return the fields of the first healthy instance of a message, and note the others."""
+def _choose(name: str, instances: list[_Message], remarks: list[str]) -> dict[str, np.ndarray]:
+    """Return the fields of the first healthy instance of a message; append remarks on others."""
     instances = sorted(instances, key=lambda message: message.instance)
     if name == "BAT":
-        instances = [_without_zeros(message, said) for message in instances]
-    is_good = [_is_healthy(name, message.fields) for message in instances]
-    best = instances[is_good.index(True) if any(is_good) else 0]
+        instances = [_without_zeros(message, remarks) for message in instances]
+    is_healthy = [_is_healthy(name, message.fields) for message in instances]
+    best = instances[is_healthy.index(True) if any(is_healthy) else 0]
     if len(instances) > 1:
         others = [
-            f"{message.instance}{'' if good else ' (not healthy)'}"
-            for message, good in zip(instances, is_good, strict=True)
+            f"{message.instance}{'' if healthy else ' (not healthy)'}"
+            for message, healthy in zip(instances, is_healthy, strict=True)
             if message is not best
         ]
-        said.append(f"instance {best.instance} of {name} is used, not {', '.join(others)}")
-    if not any(is_good):
-        said.append(f"no instance of {name} says that it is healthy")
+        remarks.append(f"instance {best.instance} of {name} is used, not {', '.join(others)}")
+    if not any(is_healthy):
+        remarks.append(f"no instance of {name} says that it is healthy")
     return best.fields
 
 
-def _without_zeros(message: _Message, said: list[str]) -> _Message:
-    """Return a battery's rows with NaN for voltages of 0 or less: no voltage was measured there."""
+def _without_zeros(message: _Message, remarks: list[str]) -> _Message:
+    """Return a battery's rows with NaN for voltages of 0 or less, which are not measured."""
     volts = message.fields.get("Volt", np.zeros(0))
     is_measured = volts > 0.0
     if not is_measured.all():
         count = f"{np.sum(~is_measured)} of {len(volts)} voltages of battery {message.instance}"
-        said.append(f"{count} are not above 0: not measured")
+        remarks.append(f"{count} are not above 0: not measured")
     return message._replace(fields={**message.fields, "Volt": np.where(is_measured, volts, np.nan)})
 
 
@@ -192,14 +195,14 @@ def _is_healthy(name: str, fields: dict[str, np.ndarray]) -> bool:
 
 
 def _full_stick_deg_s(
-    path: Path, parameters: dict[str, float], rate: dict[str, np.ndarray], said: list[str]
+    path: Path, parameters: dict[str, float], rate: dict[str, np.ndarray], remarks: list[str]
 ) -> tuple[float, float, float]:
-    """Return the roll, pitch and yaw rates at a command of 1, deg/s, no less than any setpoint."""
+    """Return the rates of roll, pitch and yaw at a command of 1, deg/s, at least any setpoint."""
     full_stick = []
     for (acro, gain), limit, setpoint in zip(ACRO_RATES, RATE_LIMITS, SETPOINTS, strict=True):
-        stated = parameters.get(acro, FULL_STICK_DEG * parameters.get(gain, 0.0))
-        known = max(stated, parameters.get(limit, 0.0))
-        if known <= 0.0:
+        acro_rate = parameters.get(acro, FULL_STICK_DEG * parameters.get(gain, 0.0))
+        stated_limit = max(acro_rate, parameters.get(limit, 0.0))
+        if stated_limit <= 0.0:
             missing = (
                 f"{path}: parameters {acro}, {gain} and {limit}: missing, so full stick is unknown"
             )
@@ -207,11 +210,12 @@ def _full_stick_deg_s(
         largest = float(
             np.max(np.abs(rate[setpoint]), initial=0.0, where=np.isfinite(rate[setpoint]))
         )
-        if largest > known:
-            said.append(
-                f"{setpoint} reaches {largest:.4g} deg/s: full stick is that, not {known:.4g} deg/s"
+        if largest > stated_limit:
+            remarks.append(
+                f"{setpoint} reaches {largest:.4g} deg/s: full stick is that, not "
+                f"{stated_limit:.4g} deg/s"
             )
-        full_stick.append(max(known, largest))
+        full_stick.append(max(stated_limit, largest))
     roll, pitch, yaw = full_stick
     return roll, pitch, yaw
 
@@ -220,16 +224,16 @@ def _channels(
     messages: dict[str, dict[str, np.ndarray]],
     parameters: dict[str, float],
     full_deg_s: np.ndarray,
-    said: list[str],
+    remarks: list[str],
 ) -> list[Channel]:
     """Return the channels of the messages that a log has."""
 
     def columns_of(message: str, fields: tuple[str, ...]) -> tuple[str, ...]:
         """Return the columns of a message; none if the log lacks one of them."""
-        there = messages.get(message, {})
+        fields_logged = messages.get(message, {})
         return (
             tuple(f"{message}.{field}" for field in fields)
-            if {TIME, *fields} <= there.keys()
+            if {TIME, *fields} <= fields_logged.keys()
             else ()
         )
 
@@ -247,14 +251,16 @@ def _channels(
     gyroscope = vector("w", "IMU", GYROSCOPE)
     is_fast = len(messages["RATE"][TIME]) >= len(messages.get("IMU", {}).get(TIME, ()))
     rates = vector("w", "RATE", RATES, PER_DEGREE) if is_fast or not gyroscope else gyroscope
-    said.append(f"rates of {rates[0].table}, which has more samples than other messages with rates")
-    found = [Channel("RATE", "u", columns_of("RATE", (*SETPOINTS, THROTTLE)), commands), *rates]
-    found += vector("f", "IMU", ACCELEROMETER)
-    found += vector("v", "XKF1", VELOCITY) + vector("p", "XKF1", POSITION)
-    found += _attitude(columns_of("XKQ", QUATERNION), columns_of("ATT", EULER_DEG))
+    remarks.append(
+        f"rates of {rates[0].table}, which has more samples than other messages with rates"
+    )
+    channels = [Channel("RATE", "u", columns_of("RATE", (*SETPOINTS, THROTTLE)), commands), *rates]
+    channels += vector("f", "IMU", ACCELEROMETER)
+    channels += vector("v", "XKF1", VELOCITY) + vector("p", "XKF1", POSITION)
+    channels += _attitude(columns_of("XKQ", QUATERNION), columns_of("ATT", EULER_DEG))
     volts = columns_of("BAT", ("Volt",))
     if volts and np.any(np.isfinite(messages["BAT"]["Volt"])):
-        found.append(Channel("BAT", "v_bat", volts, lambda table: table.matrix(volts)))
+        channels.append(Channel("BAT", "v_bat", volts, lambda table: table.matrix(volts)))
     outputs = [
         number
         for number in range(1, NUM_OUTPUTS + 1)
@@ -263,11 +269,11 @@ def _channels(
     motors = columns_of(
         "RCOU", tuple(f"C{number}" for number in outputs or range(1, NUM_MOTORS + 1))
     )
-    return [*found, *_motors(motors, parameters)]
+    return [*channels, *_motors(motors, parameters)]
 
 
 def _attitude(quaternion: tuple[str, ...], euler: tuple[str, ...]) -> list[Channel]:
-    """Return the attitude: the quaternion of the estimator, else Euler angles, deg."""
+    """Return the channel of the attitude, from the estimator's quaternion or Euler angles, deg."""
 
     def convert(table: Table) -> np.ndarray:
         if quaternion:
@@ -281,13 +287,13 @@ def _attitude(quaternion: tuple[str, ...], euler: tuple[str, ...]) -> list[Chann
 
 
 def _motors(columns: tuple[str, ...], parameters: dict[str, float]) -> list[Channel]:
-    """Return the motors' outputs, 0 to 1 between the ends that the firmware uses in flight."""
-    known: dict[str, Any] = {
-        name: parameters.get(name) or usual for name, usual in MOTOR_DEFAULTS.items()
+    """Return the channel of motor outputs, 0 to 1 between the firmware's ends in flight."""
+    settings: dict[str, Any] = {
+        name: parameters.get(name) or default for name, default in MOTOR_DEFAULTS.items()
     }
-    low_us, high_us = known["MOT_PWM_MIN"], known["MOT_PWM_MAX"]
+    low_us, high_us = settings["MOT_PWM_MIN"], settings["MOT_PWM_MAX"]
     low, high = (
-        low_us + known[name] * (high_us - low_us) for name in ("MOT_SPIN_MIN", "MOT_SPIN_MAX")
+        low_us + settings[name] * (high_us - low_us) for name in ("MOT_SPIN_MIN", "MOT_SPIN_MAX")
     )
     if not columns or high <= low:
         return []

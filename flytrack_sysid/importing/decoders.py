@@ -1,8 +1,8 @@
 """Decoders of other programs' logs: pyulog, orangebox, pymavlink, mcap, rosbags, run by a sandbox.
 
-A small file can make some of them run forever or exhaust the memory (an interval of 0; arrays of
-arrays). This file is imported alone there, so it imports nothing of this package. A decoder takes
-its arguments, the path first, and returns an ``.npz`` of notes (JSON) and arrays.
+A small file can make some of these packages run forever or exhaust the memory (an interval of 0;
+arrays of arrays). The sandbox imports this file alone, so it imports nothing of this package. A
+decoder takes its arguments, the path first, and returns an ``.npz`` of notes (JSON) and arrays.
 """
 
 import io
@@ -17,19 +17,19 @@ from typing import Any
 
 import numpy as np
 
-ULOG_HEADER_BYTES = 3  # before every message: its size and type
-DATAFLASH_MESSAGE = b"\xa3\x95"  # before every message
+ULOG_HEADER_BYTES = 3  # each message begins with its size and type
+DATAFLASH_MESSAGE = b"\xa3\x95"  # each message begins with these bytes
 INSTANCES = (
     "I",
     "C",
     "Instance",
     "Inst",
-)  # of ArduPilot: fields that number sensors, estimators, batteries
-MAX_TEXTS = 1000  # messages of text, whose first ones name the firmware
+)  # fields of ArduPilot that number sensors, estimators, batteries
+MAX_TEXTS = 1000  # text messages; the first ones name the firmware
 WHOLE_FILE_COMPRESSION = re.compile(
     r"^\s*compression_mode:\s*[\"']?FILE\b", re.IGNORECASE | re.MULTILINE
 )
-MAIN_FRAME = "I"  # of Betaflight: the frame type whose fields the others repeat
+MAIN_FRAME = "I"  # frame type of Betaflight whose fields the other types repeat
 
 
 def _pack(notes: Any, arrays: list[np.ndarray]) -> bytes:
@@ -43,17 +43,21 @@ def _pack(notes: Any, arrays: list[np.ndarray]) -> bytes:
 def decode_ulog(arguments: Any, _: bytes) -> bytes:
     """Return fields of a PX4 log's topics, of all their instances.
 
-    arguments: path, and the wanted fields by topic. The arrays are float64, (num_rows,). The notes
-    have their topics, instances and fields (``fields``), ``parameters`` (finite numbers),
-    ``is_damaged`` and ``is_cut_off``.
+    Args:
+        arguments: path, and the wanted fields by topic.
+
+    Returns:
+        Notes: ``fields``: topic, instance and field of each array; ``parameters``: finite numbers
+            by name; ``is_damaged``; ``is_cut_off``.
+        Arrays: float64, (num_rows,) each.
     """
     import pyulog
 
     path, wanted = arguments
     with open(path, "rb") as file:
-        counted = _CountedReads(file)
-        ulog = pyulog.ULog(counted, list(wanted))
-    found = {
+        reads = _CountedReads(file)
+        ulog = pyulog.ULog(reads, list(wanted))
+    columns = {
         (data.name, int(data.multi_id), field): data.data[field].astype(float)
         for data in sorted(ulog.data_list, key=lambda data: data.multi_id)
         for field in wanted.get(data.name, ())
@@ -65,16 +69,16 @@ def decode_ulog(arguments: Any, _: bytes) -> bytes:
         if isinstance(value, (int, float)) and math.isfinite(value)
     }
     notes = {
-        "fields": list(found),
+        "fields": list(columns),
         "parameters": parameters,
         "is_damaged": bool(ulog.file_corruption),
-        "is_cut_off": counted.is_cut_off,
+        "is_cut_off": reads.is_cut_off,
     }
-    return _pack(notes, list(found.values()))
+    return _pack(notes, list(columns.values()))
 
 
 class _CountedReads:
-    """A binary file that records whether a read met the end of the file; pyulog does not tell."""
+    """A binary file that records whether a read met the end of the file, unlike pyulog."""
 
     def __init__(self, file: Any):
         self.file, self.is_cut_off = file, False
@@ -82,7 +86,7 @@ class _CountedReads:
     def read(self, size: int) -> bytes:
         """Return the next bytes; fewer at the end of the file."""
         data: bytes = self.file.read(size)
-        is_header = size == ULOG_HEADER_BYTES  # a whole log ends where the next one would begin
+        is_header = size == ULOG_HEADER_BYTES  # a whole log ends where a header would begin
         self.is_cut_off |= len(data) < size and not (is_header and not data)
         return data
 
@@ -91,19 +95,22 @@ class _CountedReads:
 
 
 def decode_betaflight(arguments: Any, _: bytes) -> bytes:
-    """Return the main frames of a blackbox file's logs, (num_frames, num_fields) float64 each.
+    """Return the main frames of a blackbox file's logs.
 
-    arguments: path, numbers of the logs, from 1, and which of them are cut off: these end where no
-    whole frame can be decoded. The notes have each log's ``headers``, the fields' ``names``,
-    ``num_undecoded``: frames before the first full one, changes from a frame that was lost, and
-    ``num_bytes_left``: what follows the last whole frame of a log that is cut off.
+    Args:
+        arguments: path, numbers of the logs, from 1, and numbers of those that are cut off: these
+            end where no whole frame can be decoded.
+
+    Returns:
+        Notes, of each log: ``headers``; ``names`` of the fields; ``num_undecoded``: number of
+            frames before the first full one, which are changes from a lost frame;
+            ``num_bytes_left``: number of bytes after the last whole frame of a log that is cut off.
+        Arrays: (num_frames, num_fields) float64, one for each log.
     """
     import orangebox
 
     path, numbers, cut_off = arguments
-    logging.getLogger("orangebox").setLevel(
-        logging.CRITICAL
-    )  # it warns of events that it does not know
+    logging.getLogger("orangebox").setLevel(logging.CRITICAL)  # it warns of unknown events
     notes, arrays = [], []
     for number in numbers:
         parser = orangebox.Parser.load(path, number)
@@ -132,10 +139,14 @@ def decode_betaflight(arguments: Any, _: bytes) -> bytes:
 def decode_dataflash(arguments: Any, _: bytes) -> bytes:
     """Return fields of the messages of an ArduPilot log.
 
-    arguments: path, and the wanted fields by message. The arrays are those of each instance of each
-    message found, (num_messages, num_fields) float64. The notes have of those ``found`` the
-    ``name`` of the message, its ``instance`` (0 without one) and its ``fields``; ``parameters``, as
-    they are at first; ``texts``; and ``is_cut_off``: the last message is not whole.
+    Args:
+        arguments: path, and the wanted fields by message.
+
+    Returns:
+        Notes: ``found``: for each array, the ``name`` of the message, its ``instance`` (0 without
+            one) and its ``fields``; ``parameters``: their first values; ``texts``; ``is_cut_off``:
+            the last message is not whole.
+        Arrays: (num_messages, num_fields) float64, one for each instance of each message.
     """
     from pymavlink.DFReader import DFReader_binary
 
@@ -162,7 +173,7 @@ def decode_dataflash(arguments: Any, _: bytes) -> bytes:
         values.setdefault((name, instance), array("d")).extend(
             float(getattr(message, field)) for field in fields[name]
         )
-    found = [
+    instances = [
         {"name": name, "instance": instance, "fields": fields[name]} for name, instance in values
     ]
     arrays = [
@@ -174,14 +185,14 @@ def decode_dataflash(arguments: Any, _: bytes) -> bytes:
         if len(offsets)
     ]
     end = max(ends, default=0)
-    # Flash memory is padded behind the last message, but not with the beginning of another.
+    # Flash memory is padded after the last message, but not with the beginning of another message.
     is_cut_off = end > reader.data_len or reader.data_map[end : end + 2] == DATAFLASH_MESSAGE
-    notes = {"found": found, "parameters": parameters, "texts": texts, "is_cut_off": is_cut_off}
+    notes = {"found": instances, "parameters": parameters, "texts": texts, "is_cut_off": is_cut_off}
     return _pack(notes, arrays)
 
 
 def _whole_frames(parser: Any, is_cut_off: bool) -> Iterator[Any]:
-    """Yield the frames of a blackbox log; of one that is cut off, only the whole ones."""
+    """Yield the frames of a blackbox log; only the whole frames of a log that is cut off."""
     try:
         yield from parser.frames()
     except (TypeError, IndexError, ValueError, OverflowError):  # raised at the end of the bytes
@@ -192,12 +203,16 @@ def _whole_frames(parser: Any, is_cut_off: bool) -> Iterator[Any]:
 def decode_bag(arguments: Any, _: bytes) -> bytes:
     """Return fields of a bag's topics: a folder of ROS 2, a ``.bag`` of ROS 1, an ``.mcap`` file.
 
-    arguments: path, and the wanted fields by topic, as in ``pose.position.x`` or ``axes[0]``. The
-    arrays are those of each topic found, (num_messages, 2 + num_fields) float64: time and time of
-    recording, s from 1 s before the first recording, and the fields; the time is NaN where a sender
-    that stamps others did not. The notes have all ``topics`` of the bag; of those ``found`` their
-    name, their ``fields``, and whether they are ``stamped`` by the sender; and the fields that are
-    ``missing``, as [topic, field, type of the messages].
+    Args:
+        arguments: path, and the wanted fields by topic, as in ``pose.position.x`` or ``axes[0]``.
+
+    Returns:
+        Notes: ``topics``: all topics of the bag; ``found``: for each array, its ``topic``, its
+            ``fields``, and whether the sender stamps messages (``is_stamped``); ``missing``: absent
+            fields, as [topic, field, type of the messages].
+        Arrays: (num_messages, 2 + num_fields) float64, one for each topic: time and time of
+            recording, s from 1 s before the first recording, and the fields. The time is NaN for
+            single messages without a stamp.
     """
     path, wanted = arguments
     messages = _mcap_messages if Path(path).suffix == ".mcap" else _bag_messages
@@ -223,14 +238,14 @@ def decode_bag(arguments: Any, _: bytes) -> bytes:
         stamp_s = (stamp_ns - first_ns) * 1e-9 if stamp_ns > 0 else math.nan
         values[topic].extend((stamp_s, (time_ns - first_ns) * 1e-9))
         values[topic].extend(float(_part(message, field)) for field in fields[topic])
-    found = [
+    found_topics = [
         {"topic": name, "fields": fields[name], "is_stamped": is_stamped[name]} for name in fields
     ]
     arrays = [np.array(values[name], float).reshape(-1, 2 + len(fields[name])) for name in fields]
     for name, rows in zip(fields, arrays, strict=True):
         if not is_stamped[name]:
             rows[:, 0] = rows[:, 1]
-    return _pack({"topics": sorted(topics), "found": found, "missing": missing}, arrays)
+    return _pack({"topics": sorted(topics), "found": found_topics, "missing": missing}, arrays)
 
 
 class UnsupportedError(Exception):
@@ -238,7 +253,7 @@ class UnsupportedError(Exception):
 
 
 def _bag_messages(path: str, wanted: list[str]) -> Iterator[tuple[str, str, int, Any]]:
-    """Yield topic, type, recording time, ns, and content; None as content of unwanted topics."""
+    """Yield topic, type, recording time (ns) and content; None as content of unwanted topics."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -251,19 +266,19 @@ def _bag_messages(path: str, wanted: list[str]) -> Iterator[tuple[str, str, int,
         connections = [
             connection for connection in reader.connections if connection.topic in wanted
         ]
-        if connections:  # none would mean all
+        if connections:  # an empty list would mean all
             for connection, time_ns, raw in reader.messages(connections):
                 message = reader.deserialize(raw, connection.msgtype)
                 yield connection.topic, connection.msgtype, time_ns, message
 
 
 def _mcap_messages(path: str, wanted: list[str]) -> Iterator[tuple[str, str, int, Any]]:
-    """Yield the same of an MCAP file, whose messages are of ROS 2 or JSON."""
+    """Yield the same as ``_bag_messages`` of an MCAP file, whose messages are of ROS 2 or JSON."""
     from mcap.reader import NonSeekingReader
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     types = get_typestore(Stores.EMPTY)
-    known: set[int] = set()
+    known_schemas: set[int] = set()
     with open(path, "rb") as file:
         for schema, channel, message in NonSeekingReader(file).iter_messages():
             if channel.topic not in wanted:
@@ -273,11 +288,15 @@ def _mcap_messages(path: str, wanted: list[str]) -> Iterator[tuple[str, str, int
             if channel.message_encoding == "json":
                 content = json.loads(message.data)
             elif channel.message_encoding == "cdr" and schema and schema.encoding == "ros2msg":
-                if schema.id not in known:
-                    known.add(schema.id)
-                    found = get_types_from_msg(schema.data.decode(), kind)
+                if schema.id not in known_schemas:
+                    known_schemas.add(schema.id)
+                    schemas = get_types_from_msg(schema.data.decode(), kind)
                     types.register(
-                        {name: one for name, one in found.items() if name not in types.fielddefs}
+                        {
+                            name: fielddefs
+                            for name, fielddefs in schemas.items()
+                            if name not in types.fielddefs
+                        }
                     )
                 content = types.deserialize_cdr(message.data, kind)
             else:
@@ -309,7 +328,7 @@ def _is_number(message: Any, field: str) -> bool:
 
 
 def _stamp_ns(message: Any) -> int:
-    """Return when the sender stamped a message, ns, 0 if it did not."""
+    """Return the time at which the sender stamped a message, ns; 0 without a stamp."""
     for name in ("nanosec", "nsec"):
         if _is_number(message, f"header.stamp.{name}"):
             return int(_part(message, "header.stamp.sec")) * 10**9 + int(

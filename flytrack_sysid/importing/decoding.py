@@ -1,4 +1,4 @@
-"""Decoding logs with packages of others, in a process with limits on time and memory."""
+"""Decoding of logs by third-party packages, in a process with limits on time and memory."""
 
 import io
 import json
@@ -14,35 +14,44 @@ from flytrack_env.npz_file import NpzError, load_npz
 from flytrack_sysid.log import LogError
 
 DECODERS = Path(__file__).with_name("decoders.py")
-# Of each format: the extra, what it reads, and its packages.
+# By format: the extra, the kind of logs in words, and the packages.
 PACKAGES = {
     "ulog": ("logs", "ulog logs", "pyulog"),
     "betaflight": ("logs", "betaflight logs", "orangebox"),
     "dataflash": ("logs", "dataflash logs", "pymavlink"),
     "bag": ("bags", "bags", "mcap", "rosbags"),
 }
-# Kinds of errors that say nothing of the file: its decoder cannot, or its process may not.
+# Kinds of errors that do not show a damaged file: the decoder does not support it, or its process
+# has no access.
 NO_DAMAGE = ("UnsupportedError", "FileNotFoundError", "PermissionError", "OSError")
-# For every MiB of the file, beyond the usual limits. Orangebox, the slowest decoder, takes 3 s of
-# processor time for one on a free machine, 5 s on a busy one.
+# Per MiB and per byte of the file, beyond the default limits. Orangebox, the slowest decoder, takes
+# 3 s of processor time for a MiB on a free machine, 5 s on a busy one.
 CPU_S_PER_MIB, BYTES_PER_BYTE = 15, 32
 
 
 def limits_of(num_bytes: int) -> sandbox.ResourceLimits:
-    """Return the limits for decoding a file of that size."""
-    usual, more_s = sandbox.ResourceLimits(), CPU_S_PER_MIB * (num_bytes // 2**20)
+    """Return the limits for decoding a file of a size."""
+    default, more_s = sandbox.ResourceLimits(), CPU_S_PER_MIB * (num_bytes // 2**20)
     return sandbox.ResourceLimits(
-        usual.cpu_s + more_s,
-        usual.memory_bytes + BYTES_PER_BYTE * num_bytes,
-        usual.wall_s + 4.0 * more_s,
+        default.cpu_s + more_s,
+        default.memory_bytes + BYTES_PER_BYTE * num_bytes,
+        default.wall_s + 4.0 * more_s,
     )
 
 
-def decode(source: str, format_name: str, path: Path, *rest: Any) -> tuple[Any, list[np.ndarray]]:
-    """Return the notes and arrays that a format's decoder (``decoders.py``) finds in a file.
+def decode(
+    source: str, format_name: str, path: Path, *arguments: Any
+) -> tuple[Any, list[np.ndarray]]:
+    """Return the notes and arrays that a format's decoder (``decoders.py``) reads from a file.
 
-    source: the file, for messages. rest: the decoder's arguments after the path. Raises LogError if
-    the package is not installed, or cannot decode the file.
+    Args:
+        source: the file, for messages.
+        format_name: key of ``PACKAGES``.
+        path: of the file or folder.
+        arguments: arguments of the decoder after the path.
+
+    Raises:
+        LogError: the package is not installed, or cannot decode the file.
     """
     try:
         check_installed(*PACKAGES[format_name])
@@ -52,13 +61,13 @@ def decode(source: str, format_name: str, path: Path, *rest: Any) -> tuple[Any, 
         files = [path, *path.glob("*")] if path.is_dir() else [path]
         limits = limits_of(sum(file.stat().st_size for file in files))
         packed = sandbox.run(
-            DECODERS, f"decode_{format_name}", [str(path.absolute()), *rest], limits=limits
+            DECODERS, f"decode_{format_name}", [str(path.absolute()), *arguments], limits=limits
         )
         notes, *arrays = load_npz(io.BytesIO(packed), limits.memory_bytes).values()
         return json.loads(notes.tobytes()), arrays
     except (OSError, sandbox.SandboxError, NpzError) as error:
         kind = error.kind if isinstance(error, sandbox.SandboxError) else ""
         damaged = "damaged, " if kind and kind not in NO_DAMAGE else ""
-        named = f"{kind}: " if kind and kind != NO_DAMAGE[0] else ""
-        text = "" if kind == NO_DAMAGE[0] else f"{damaged}cannot be decoded: {named}"
+        error_kind = f"{kind}: " if kind and kind != NO_DAMAGE[0] else ""
+        text = "" if kind == NO_DAMAGE[0] else f"{damaged}cannot be decoded: {error_kind}"
         raise LogError(f"{source}: {text}{error_text(error)}") from error

@@ -6,13 +6,13 @@ from typing import NamedTuple
 from flytrack_env.files import open_file
 from flytrack_sysid.log import LogError
 
-NUM_BYTES = 512  # of a file that are looked at: a TAR archive names itself last, at 257
+NUM_BYTES = 512  # read from the beginning of a file; the last mark is that of a TAR archive, at 257
 TAR, TAR_START = b"ustar", 257
 TELEMETRY, TELEMETRY_START = (0xFD, 0xFE), 8  # MAVLink's packets, after a time stamp of 8 bytes
 
 
 class FileKind(NamedTuple):
-    """A kind of file in words, and the format of ``import`` that reads it, "" if none does."""
+    """A kind of file in words, and the format of ``import`` that reads it ("" if none does)."""
 
     name: str
     format: str = ""
@@ -57,7 +57,7 @@ def identify(content: bytes) -> FileKind:
     """Return what a file probably is.
 
     Args:
-        content: its first bytes, ``NUM_BYTES`` if it has as many.
+        content: its first ``NUM_BYTES`` bytes, or all if it has fewer.
     """
     if not content:
         return EMPTY
@@ -81,13 +81,13 @@ def identify(content: bytes) -> FileKind:
 def check_kind(
     path: Path, format: str, expected: str, allowed: tuple[FileKind, ...] = (UNKNOWN,)
 ) -> None:
-    """Raise LogError for a file that is of another kind than a format reads.
+    """Raise LogError for a file of another kind than a format reads.
 
     Args:
-        path: of the file; what cannot be opened is left to the reader.
+        path: of the file; one that cannot be opened is accepted here, and its reader reports it.
         format: of ``import``.
         expected: kinds of files in words.
-        allowed: kinds that the format reads, too, or refuses with a better reason.
+        allowed: other kinds that the format reads, or refuses with a better reason.
     """
     try:
         with open_file(path, path.stat().st_size) as file:

@@ -1,4 +1,4 @@
-"""One imported flight, and the craft that it is of."""
+"""One imported flight, and its craft."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,10 +17,12 @@ VOLTAGE_TERMS = 4  # of the thrust map: from this coefficient on they multiply t
 
 
 class Craft(NamedTuple):
-    """What a log or its mapping states of a craft; None where it states nothing.
+    """The properties of a craft that a log or its mapping states; None where it states none.
 
-    max_rate_deg_s: (roll, pitch, yaw), body rate at a command of 1. mass_kg. voltage_v: (lowest,
-    highest) in flight.
+    Attributes:
+        max_rate_deg_s: body rates of roll, pitch and yaw at a command of 1.
+        mass_kg: mass.
+        voltage_v: lowest and highest voltage in flight.
     """
 
     max_rate_deg_s: tuple[float, float, float] | None = None
@@ -39,12 +41,17 @@ class Craft(NamedTuple):
         return f"craft: {rates}; {mass}; {volts}"
 
     def nominal_model(self, source: str) -> ModelParameters:
-        """Return the generic racing quadcopter scaled to this craft: where a fit may start.
+        """Return the generic racing quadcopter scaled to this craft, as a start for fits.
 
-        Assumption: the nominal craft's lags, and its thrust-to-weight ratios at the same fractions
-        of the highest voltage: thrust scales with the mass, and a volt counts for more where there
-        are fewer. Raises LogError, with ``source``, where full-stick rates, mass or voltage are
-        unknown.
+        Assumption: the craft has the nominal craft's lags, and its thrust-to-weight ratios at the
+        same fractions of the highest voltage. So thrust scales with the mass, and its dependence on
+        the voltage with the inverse of the highest voltage.
+
+        Args:
+            source: the log, for messages.
+
+        Raises:
+            LogError: full-stick rates, mass or voltage are unknown.
         """
         if self.max_rate_deg_s is None or self.mass_kg is None or self.voltage_v is None:
             name = next(name for name, value in self._asdict().items() if value is None)
@@ -54,7 +61,7 @@ class Craft(NamedTuple):
         per_volt = float(nominal.battery.full_v) / full_v
         coeffs = np.asarray(nominal.thrust_coeffs, float) * self.mass_kg / float(nominal.m)
         coeffs[VOLTAGE_TERMS:] *= per_volt
-        leaves: dict[str, Any] = {  # of NumPy
+        leaves: dict[str, Any] = {  # NumPy arrays
             "thrust_coeffs": coeffs.astype(np.float32),
             "max_rate": np.asarray(self.max_rate_deg_s, np.float32),
         }
@@ -68,12 +75,14 @@ class Craft(NamedTuple):
 
 
 class ImportedFlight(NamedTuple):
-    """A flight as a reader returns it: its log, its craft, and notes for the user.
+    """A flight as a reader returns it.
 
-    craft: as the file and the mapping say.
-
-    is_landed: rows at which the autopilot itself says that it is on the ground, (num_rows,) bool;
-    None if it says nothing.
+    Attributes:
+        log: of the flight.
+        craft: as file and mapping state it.
+        notes: for the user.
+        is_landed: rows at which the autopilot reports that it is on the ground, (num_rows,) bool;
+            None if it does not report it.
     """
 
     log: FlightLog
@@ -83,23 +92,23 @@ class ImportedFlight(NamedTuple):
 
 
 def read_log_file(
-    path: Path, most_bytes: int, first: bytes, expected: str, part: int | None = None
+    path: Path, max_bytes: int, first: bytes, expected: str, num_bytes: int | None = None
 ) -> bytes:
     """Return the content of a log file.
 
     Args:
         path: of the file.
-        most_bytes: that it may have.
-        first: the bytes that it begins with.
+        max_bytes: maximum size of the file.
+        first: the bytes with which it begins.
         expected: the kind of file in words.
-        part: how many bytes of it are needed; all if None.
+        num_bytes: number of bytes that are needed; all if None.
 
     Raises:
-        LogError: it cannot be read, or is of another kind, which the message names.
+        LogError: the file cannot be read, or is of another kind, which the message names.
     """
     try:
-        with open_file(path, most_bytes) as file:
-            content = file.read(max(part, NUM_BYTES) if part else most_bytes)
+        with open_file(path, max_bytes) as file:
+            content = file.read(max(num_bytes, NUM_BYTES) if num_bytes else max_bytes)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error_text(error)}") from error
     if not content.startswith(first):
@@ -107,17 +116,18 @@ def read_log_file(
     return content
 
 
-def not_a_quadcopter(found: str) -> str:
-    """Return the note on a craft that is none."""
+def not_a_quadcopter(craft: str) -> str:
+    """Return the note on a craft that is no quadcopter."""
     return (
-        f"found {found}, not a quadcopter: thrust and rates stand for all rotors together, and for "
+        f"found {craft}, not a quadcopter: thrust and rates stand for all rotors together, and for "
         "no wings"
     )
 
 
 def saturation(is_at_end: np.ndarray) -> str:
-    """Return the note on how often a motor is at its upper end, (num_rows,) bool.
+    """Return the note on how often a motor is at its upper end and cannot give more thrust.
 
-    There, more cannot be commanded.
+    Args:
+        is_at_end: rows where a motor is at its upper end, (num_rows,) bool.
     """
     return f"a motor at its upper end in {np.mean(is_at_end):.2%} of the rows"

@@ -38,15 +38,19 @@ READERS = {
 FORMATS = tuple(READERS)
 FORMATS_OF_SEVERAL_LOGS = ("betaflight",)
 MAX_MANIFEST_BYTES = 2**24
-MIN_THRUST = -0.9  # command: what flies uses more than a twentieth of its thrust at some time
+MIN_THRUST = -0.9  # command: in flight it exceeds a twentieth of the thrust range at some time
 
 
 class Imported(NamedTuple):
     """The result of an import.
 
-    log: a segment per flight, numbered from 0. sources: the file of each segment. craft: by files
-    and mapping. offsets: between the sensors' clocks. notes: what was left out. problems: what in
-    the log cannot be true of a flight; ``fit`` would refuse it.
+    Attributes:
+        log: a segment per flight, numbered from 0.
+        sources: the file of each segment.
+        craft: what files and mapping state.
+        offsets: between the sensors' clocks.
+        notes: what was left out.
+        problems: reasons why no flight can have this log; ``fit`` would refuse it.
     """
 
     log: FlightLog
@@ -106,14 +110,20 @@ def import_log(
 ) -> Imported:
     """Return measured flights as one flight log in SI units and our frames, a segment each.
 
-    paths: one file or several. format: of ``FORMATS``. mapping: a mapping file, or the name of a
-    shipped one; CSV, uSD logs and bags need it, other formats use its ``rows`` and ``craft``.
-    align: correct significant offsets between the sensors' clocks (``flytrack_sysid.clocks``)
-    instead of only reporting them. Voltages that neither files nor mapping state are those of the
-    log, where all are above 0.
+    Where neither files nor mapping state the craft's voltages, they are taken from the log if all
+    of its voltages are above 0.
 
-    Raises: LogError: a file that cannot be read or used; the message names file and field, found
-        and expected.
+    Args:
+        paths: one file or several.
+        format: one of ``FORMATS``.
+        mapping: a mapping file, or the name of a shipped one; CSV, uSD logs and bags need it, other
+            formats use its ``rows`` and ``craft``.
+        align: correct significant offsets between the sensors' clocks (``flytrack_sysid.clocks``)
+            instead of only reporting them.
+
+    Raises:
+        LogError: a file cannot be read or used; the message names file and field, what was found
+            and what was expected.
     """
     files = [Path(path) for path in ([paths] if isinstance(paths, (str, Path)) else paths)]
     if format not in READERS:
@@ -123,10 +133,10 @@ def import_log(
     loaded = Mapping() if mapping is None else load_mapping(mapping)
     if loaded.rows.logs and format not in FORMATS_OF_SEVERAL_LOGS:
         raise LogError(f"{loaded.source}: rows.logs: a file of format {format} holds one log")
-    read = [(path, flight) for path in files for flight in READERS[format](path, loaded)]
-    notes = tuple(note for _, flight in read for note in flight.notes)
-    flights, said = _flights_in_the_air(read, loaded)
-    notes += said
+    flights_read = [(path, flight) for path in files for flight in READERS[format](path, loaded)]
+    notes = tuple(note for _, flight in flights_read for note in flight.notes)
+    flights, ground_notes = _flights_in_the_air(flights_read, loaded)
+    notes += ground_notes
     sources = [flight.log.source for flight in flights]
     log = _concatenate([flight.log for flight in flights], sources)
     log, offsets = align_clocks(log, align)
@@ -138,37 +148,38 @@ def import_log(
         craft = craft._replace(voltage_v=(float(log["v_bat"].min()), float(log["v_bat"].max())))
     step_s = float(np.median(usual_step(log)))
     if "w" in log and step_s > SLOW_STEP_S:
-        slow = f"body rates at {1.0 / step_s:.3g} Hz: too slow for a rate loop's lag or delay"
-        notes += (f"{log.source}: {slow}",)
+        remark = f"body rates at {1.0 / step_s:.3g} Hz: too slow for a rate loop's lag or delay"
+        notes += (f"{log.source}: {remark}",)
     return Imported(log, tuple(sources), craft, offsets, notes, tuple(find_problems(log)))
 
 
 def _parts(flight: ImportedFlight) -> list[ImportedFlight]:
-    """Return the segments of a flight as flights of their own; the notes are those of the first."""
+    """Return the segments of a flight as separate flights; the first one has the notes."""
     log = flight.log
     numbers = np.unique(log.segment)
     if len(numbers) == 1:
         return [flight]
-    parts = []
+    flights = []
     for count, number in enumerate(numbers, start=1):
-        part = replace(
+        segment_log = replace(
             log.select(log.segment == number),
             source=f"{log.source}, part {count} of {len(numbers)}",
         )
-        parts.append(flight._replace(log=part, notes=flight.notes if count == 1 else ()))
-    return parts
+        flights.append(flight._replace(log=segment_log, notes=flight.notes if count == 1 else ()))
+    return flights
 
 
 def _flights_in_the_air(
-    read: list[tuple[Path, ImportedFlight]], mapping: Mapping
+    flights_read: list[tuple[Path, ImportedFlight]], mapping: Mapping
 ) -> tuple[list[ImportedFlight], tuple[str, ...]]:
     """Return the flights with only the rows that are selected and in the air, and notes.
 
-    Raises LogError if nothing flies in any of them.
+    Raises:
+        LogError: nothing flies in any of them.
     """
-    in_the_air, left_out, notes = list[ImportedFlight](), list[str](), list[str]()
+    airborne, reasons, notes = list[ImportedFlight](), list[str](), list[str]()
     for (path, flight), is_ground in zip(
-        read, find_ground([flight.log for _, flight in read]), strict=True
+        flights_read, find_ground([flight.log for _, flight in flights_read]), strict=True
     ):
         log, source = flight.log, flight.log.source
         is_used = _is_selected(path, log, mapping)
@@ -176,39 +187,39 @@ def _flights_in_the_air(
             is_ground = is_ground | flight.is_landed
         num_used, num_ground = is_used.sum(), np.sum(is_used & is_ground)
         if mapping.rows.on_ground == "keep":
-            kept = is_used
+            is_kept = is_used
         elif num_ground == num_used:
-            left_out.append(f"{source}: nothing flies: on the ground in all {num_used} rows")
+            reasons.append(f"{source}: nothing flies: on the ground in all {num_used} rows")
             continue
         elif log["u"][is_used, 3].max() < MIN_THRUST:
-            left_out.append(
+            reasons.append(
                 f"{source}: nothing flies: the thrust command never exceeds 5 % of its range"
             )
             continue
         else:
-            kept = is_used & ~is_ground
+            is_kept = is_used & ~is_ground
             if num_ground:
                 notes.append(f"{source}: {num_ground} of {num_used} rows left out: on the ground")
-        log, said = _with_measured_voltage(log.select(kept))
-        notes += said
-        in_the_air += _parts(flight._replace(log=log, is_landed=None))
-    if not in_the_air:
-        raise LogError(f'{left_out[0]}; rows.on_ground = "keep" in a mapping uses them')
-    return in_the_air, (*notes, *(f"left out: {reason}" for reason in left_out))
+        log, voltage_notes = _with_measured_voltage(log.select(is_kept))
+        notes += voltage_notes
+        airborne += _parts(flight._replace(log=log, is_landed=None))
+    if not airborne:
+        raise LogError(f'{reasons[0]}; rows.on_ground = "keep" in a mapping uses them')
+    return airborne, (*notes, *(f"left out: {reason}" for reason in reasons))
 
 
 def _with_measured_voltage(log: FlightLog) -> tuple[FlightLog, list[str]]:
-    """Return the log without voltages of 0, which nobody measured, and a note if there are some."""
+    """Return the log without voltages of 0, which are not measured, and a note if some are 0."""
     if "v_bat" not in log or log["v_bat"].min() > 0.0:
         return log, []
     is_measured = log["v_bat"][:, 0] > 0.0
-    found = f"{log.source}: v_bat: not above 0 V in {np.sum(~is_measured)} of {len(log)} rows"
+    problem = f"{log.source}: v_bat: not above 0 V in {np.sum(~is_measured)} of {len(log)} rows"
     if not is_measured.any():
-        return log.without("v_bat"), [f"{found}: left out"]
+        return log.without("v_bat"), [f"{problem}: left out"]
     row = np.arange(len(log))
     volts = np.interp(row, row[is_measured], log["v_bat"][is_measured, 0])
     channels = {**log.channels, "v_bat": volts[:, None]}
-    return replace(log, channels=channels), [f"{found}: interpolated between the others"]
+    return replace(log, channels=channels), [f"{problem}: interpolated between the others"]
 
 
 def _is_selected(path: Path, log: FlightLog, mapping: Mapping) -> np.ndarray:
@@ -234,20 +245,20 @@ def _is_selected(path: Path, log: FlightLog, mapping: Mapping) -> np.ndarray:
 
 
 def _is_airborne(log: FlightLog, above_m: float, source: str) -> np.ndarray:
-    """Return the longest stretch of rows above the first row by ``above_m``, (num_rows,) bool."""
+    """Return the longest stretch of rows higher than the first by ``above_m``, (num_rows,) bool."""
     if "p" not in log:
         raise LogError(
             f"{source}: rows.above_m: found no position in {log.source}, expected one to tell "
             "heights"
         )
     is_high = log["p"][:, 2] - log["p"][0, 2] > above_m
-    number = np.cumsum(np.diff(is_high, prepend=False))  # of the stretch, odd ones are high
-    longest = np.argmax(np.bincount(number[is_high])) if is_high.any() else -1
-    return number == longest
+    stretch = np.cumsum(np.diff(is_high, prepend=False))  # odd stretches are high
+    longest_stretch = np.argmax(np.bincount(stretch[is_high])) if is_high.any() else -1
+    return stretch == longest_stretch
 
 
 def _count_of(path: Path, wanted: Manifest) -> int:
-    """Return how many rows of a file the manifest beside it says to use."""
+    """Return the number of rows of a file to use, as the manifest beside it says."""
     manifest = path.parent / wanted.file
     where = f"{path.parent}/{quote_name(wanted.file)}"
     if manifest.name != wanted.file:
@@ -264,8 +275,8 @@ def _count_of(path: Path, wanted: Manifest) -> int:
     try:
         return int(text)
     except ValueError as error:
-        found = f"found {quote_value(text)}, expected a whole number"
-        raise LogError(f"{where}: {path.name}: {quote_name(wanted.count)}: {found}") from error
+        problem = f"found {quote_value(text)}, expected a whole number"
+        raise LogError(f"{where}: {path.name}: {quote_name(wanted.count)}: {problem}") from error
 
 
 def _concatenate(logs: list[FlightLog], sources: list[str]) -> FlightLog:
@@ -287,10 +298,10 @@ def _concatenate(logs: list[FlightLog], sources: list[str]) -> FlightLog:
 
 
 def _common_craft(flights: list[ImportedFlight], sources: list[str]) -> Craft:
-    """Return the craft that all flights must be of."""
+    """Return the craft of all flights; raises LogError if they differ."""
     first = flights[0].craft
     for flight, source in zip(flights, sources, strict=True):
         if flight.craft != first:
-            found = f"{flight.craft.describe()}; {sources[0]}: {first.describe()}"
-            raise LogError(f"{source}: {found}; expected flights of one craft in one log")
+            crafts = f"{flight.craft.describe()}; {sources[0]}: {first.describe()}"
+            raise LogError(f"{source}: {crafts}; expected flights of one craft in one log")
     return first

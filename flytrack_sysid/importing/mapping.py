@@ -1,8 +1,8 @@
 """Mapping files: what the columns of a log are, which rows to use, and what is known of the craft.
 
-TOML. Every table and field is described in docs/real_logs.md; ``rows``, ``craft`` and
-``motors.as_thrust`` apply to logs of every format. Columns are those of a CSV file, variables of a
-Crazyflie's uSD log, fields of topics.
+Mapping files are TOML. docs/real_logs.md describes every table and field. ``rows``, ``craft`` and
+``motors.as_thrust`` apply to logs of every format. A column is a column of a CSV file, a variable
+of a Crazyflie's uSD log, or a field of a topic.
 """
 
 from collections.abc import Callable
@@ -47,9 +47,13 @@ NineNames = tuple[Text, Text, Text, Text, Text, Text, Text, Text, Text]
 class Channel(NamedTuple):
     """A channel of the log in a table of columns: where it is from and how it is converted.
 
-    table: of the mapping, for messages. name: of ``CHANNELS``, or t, or as in ``commands_of``.
-    columns: of the file. convert: from the file's table to the channel's columns, (num_rows, n), SI
-    units and our frames. is_optional: it is left out where the file has none of the columns.
+    Attributes:
+        table: table of the mapping, for messages.
+        name: one of ``CHANNELS``, ``t``, or a name as in ``commands_of``.
+        columns: columns of the file.
+        convert: returns the channel's columns from the file's table, (num_rows, n), in SI units and
+            our frames.
+        is_optional: the channel is left out where the file has none of the columns.
     """
 
     table: str
@@ -62,7 +66,10 @@ class Channel(NamedTuple):
 class Manifest(Fields):
     """A CSV file beside the logs that says how many rows of each to use.
 
-    key, count: its columns of file names and of numbers of rows.
+    Attributes:
+        file: name of the CSV file.
+        key: its column of file names.
+        count: its column of numbers of rows.
     """
 
     file: Text
@@ -73,12 +80,15 @@ class Manifest(Fields):
 class UsedRows(Fields):
     """Which rows to use.
 
-    Every n-th from ``from_s`` to ``to_s`` after the first; a manifest limits them.
-
-    above_m: only the longest stretch of rows that are that much higher than the first. ranges_s:
-    only what is in one of these, s after the first row; all if none. logs: numbers, from 1, of the
-    logs in a file that holds several; all if none. on_ground: whether rows on the ground are used,
-    too.
+    Attributes:
+        every: only each n-th row is used.
+        above_m: only the longest stretch of rows that are this much higher than the first is used.
+        from_s: first time that is used, after the first row.
+        to_s: last time that is used, after the first row.
+        manifest: file that limits the number of rows.
+        ranges_s: only rows in one of these ranges are used (s after the first row); all if None.
+        logs: numbers, from 1, of the logs to use in a file that holds several; all if None.
+        on_ground: whether rows on the ground are used, too.
     """
 
     every: Count = 1
@@ -113,7 +123,7 @@ class CraftFields(Fields):
 
 
 class ScaledFields(Fields, kw_only=True):
-    """A table of columns with a unit: its name, or its size in SI units."""
+    """A table of columns with a unit: the unit's name, or its size in SI units."""
 
     unit: str | None = None
     scale: Positive | None = None
@@ -143,8 +153,10 @@ class SignedFields(ScaledFields, kw_only=True):
 class CsvFile(ScaledFields):
     """One of several CSV files of a log, with a clock of its own.
 
-    file: pattern of its name, in the folder of the log. time: the column of its times, which begin
-    at ``offset_s`` of the log's clock.
+    Attributes:
+        file: pattern of its name, in the folder of the log.
+        time: column of its times.
+        offset_s: time of the log's clock at which those times begin.
     """
 
     file: Text
@@ -159,7 +171,7 @@ class CsvFile(ScaledFields):
 
 
 class Time(ScaledFields):
-    """Times as they are stamped, or of rows that are ``step_s`` apart."""
+    """Times: a column of stamps, or rows that are ``step_s`` apart."""
 
     column: Text | None = None
     step_s: Positive | None = None
@@ -172,8 +184,8 @@ class Time(ScaledFields):
         if column is not None or step_s is None or self.unit is not None or self.scale is not None:
             raise ValueError("expected either column, with its unit, or step_s, of one row")
 
-        def by_row(found: Table) -> np.ndarray:
-            num_rows = len(next(iter(found.columns.values())))
+        def by_row(rows: Table) -> np.ndarray:
+            num_rows = len(next(iter(rows.columns.values())))
             return np.arange(num_rows)[:, None] * step_s
 
         return [Channel(table, "t", (), by_row)]
@@ -190,7 +202,7 @@ class Battery(ScaledFields):
 
 
 class Command(Fields):
-    """Commands, of which ``low`` and ``high`` are -1 and 1."""
+    """Commands; ``low`` and ``high`` are the values that mean -1 and 1."""
 
     columns: FourNames
     low: FourNumbers = (-1.0, -1.0, -1.0, -1.0)
@@ -203,11 +215,11 @@ class Command(Fields):
         low, high = np.array(self.low), np.array(self.high)
         if np.any(low == high):
             raise ValueError(f"high: found {high.tolist()}, expected other values than low")
-        least, most = np.minimum(low, high), np.maximum(low, high)
+        lowest, highest = np.minimum(low, high), np.maximum(low, high)
 
-        def scale(found: Table) -> np.ndarray:
-            values = found.matrix(self.columns)
-            is_past = ((values < least) | (values > most)) & (
+        def scale(rows: Table) -> np.ndarray:
+            values = rows.matrix(self.columns)
+            is_past = ((values < lowest) | (values > highest)) & (
                 not self.clip
             )  # else ``commands_of`` clips
             for row, stick in np.argwhere(is_past)[:1]:
@@ -215,7 +227,7 @@ class Command(Fields):
                     f"found {values[row, stick]:g}, expected {low[stick]:g} to {high[stick]:g} by "
                 )
                 text += "command.low and command.high; clip = true limits it"
-                raise found.error(row, quote_name(self.columns[stick]), text)
+                raise rows.error(row, quote_name(self.columns[stick]), text)
             return 2.0 * (values - low) / (high - low) - 1.0
 
         return [Channel(table, "u", self.columns, scale)]
@@ -229,14 +241,14 @@ class Vector(SignedFields):
     optional: bool = False
 
     def channels(self, table: str) -> list[Channel]:
-        """Return the channel that the table is for."""
+        """Return the channel that the table describes."""
         name, dimension, frames = VECTORS[table]
         check_different("columns", self.columns)
         scales = self.signed_scales(dimension)
         is_turned = TURNED[frames][choose("frame", self.frame, TURNED[frames])]
 
-        def turn(found: Table) -> np.ndarray:
-            return vector_from(found.matrix(self.columns) * scales, is_turned)
+        def turn(rows: Table) -> np.ndarray:
+            return vector_from(rows.matrix(self.columns) * scales, is_turned)
 
         return [Channel(table, name, self.columns, turn, self.optional)]
 
@@ -252,7 +264,7 @@ VECTORS = {
 
 
 class Attitude(SignedFields):
-    """Measured attitude; Euler angles turn by yaw, then pitch, then roll, about moving axes."""
+    """Measured attitude; Euler angles rotate by yaw, then pitch, then roll, about moving axes."""
 
     body: str
     world: str
@@ -277,27 +289,27 @@ class Attitude(SignedFields):
         is_body_turned = TURNED["body"][choose("body", self.body, TURNED["body"])]
         is_world_turned = TURNED["world"][choose("world", self.world, TURNED["world"])]
 
-        def turn(found: Table) -> np.ndarray:
-            rotation = rotate(found)
+        def turn(rows: Table) -> np.ndarray:
+            rotation = rotate(rows)
             rotation = rotation.inv() if self.direction == "world_to_body" else rotation
             return quaternion_from(rotation, is_body_turned, is_world_turned)
 
         return [Channel(table, "q", given[0], turn)]
 
     def _rotate(self) -> Callable[[Table], Rotation]:
-        """Return what makes rotations of the columns as they are."""
+        """Return a function from the file's table to rotations, in the axes of the file."""
         euler, matrix, quaternion = self.euler, self.matrix, self.quaternion
         if euler is not None:
             if self.order is not None:
                 raise ValueError("order: found together with euler, expected none")
             scales = self.signed_scales("angle")
-            return lambda found: Rotation.from_euler("ZYX", (found.matrix(euler) * scales)[:, ::-1])
+            return lambda rows: Rotation.from_euler("ZYX", (rows.matrix(euler) * scales)[:, ::-1])
         if matrix is not None:
             is_transposed = choose("order", self.order, ("by_rows", "by_columns")) == "by_columns"
 
-            def from_matrix(found: Table) -> Rotation:
-                matrices = found.matrix(matrix).reshape(-1, NUM_AXES, NUM_AXES)
-                _check_one(found, matrix[:1], "matrix of determinant", np.linalg.det(matrices))
+            def from_matrix(rows: Table) -> Rotation:
+                matrices = rows.matrix(matrix).reshape(-1, NUM_AXES, NUM_AXES)
+                _check_one(rows, matrix[:1], "matrix of determinant", np.linalg.det(matrices))
                 rotation = Rotation.from_matrix(matrices)
                 return rotation.inv() if is_transposed else rotation
 
@@ -305,9 +317,9 @@ class Attitude(SignedFields):
         assert quaternion is not None
         is_scalar_first = choose("order", self.order, ("wxyz", "xyzw")) == "wxyz"
 
-        def from_quaternion(found: Table) -> Rotation:
-            values = found.matrix(quaternion)
-            _check_one(found, quaternion, "quaternion of norm", np.linalg.norm(values, axis=1))
+        def from_quaternion(rows: Table) -> Rotation:
+            values = rows.matrix(quaternion)
+            _check_one(rows, quaternion, "quaternion of norm", np.linalg.norm(values, axis=1))
             return Rotation.from_quat(values, scalar_first=is_scalar_first)
 
         return from_quaternion
@@ -320,7 +332,7 @@ def _check_one(table: Table, columns: tuple[str, ...], what: str, sizes: np.ndar
 
 
 class ThrustCommand(Fields):
-    """The thrust command, of which ``low`` and ``high`` are -1 and 1."""
+    """The thrust command; ``low`` and ``high`` are the values that mean -1 and 1."""
 
     column: Text
     low: Finite
@@ -332,8 +344,8 @@ class ThrustCommand(Fields):
         if low == high:
             raise ValueError(f"high: found {high:g}, expected another value than low")
 
-        def scale(found: Table) -> np.ndarray:
-            return 2.0 * (found.matrix([self.column]) - low) / (high - low) - 1.0
+        def scale(rows: Table) -> np.ndarray:
+            return 2.0 * (rows.matrix([self.column]) - low) / (high - low) - 1.0
 
         return [Channel(table, "thrust_command", (self.column,), scale)]
 
@@ -341,7 +353,10 @@ class ThrustCommand(Fields):
 class AttitudeCommand(SignedFields):
     """Setpoints of roll, pitch and yaw, the autopilot's estimate of them, and its gains.
 
-    gain: 0 to identify it.
+    Attributes:
+        columns: setpoints of roll, pitch and yaw.
+        own: the autopilot's estimate of these angles.
+        gain: gains of the attitude loop; 0 to identify one.
     """
 
     columns: ThreeNames
@@ -353,12 +368,12 @@ class AttitudeCommand(SignedFields):
         if min(self.gain) < 0.0:
             raise ValueError(f"gain: found {list(self.gain)}, expected 0, to identify it, or more")
         scales = self.signed_scales("angle")
-        found = [_scaled(table, "attitude_command", self.columns, scales)]
-        return found + ([_scaled(table, "own_attitude", self.own, scales)] if self.own else [])
+        result = [_scaled(table, "attitude_command", self.columns, scales)]
+        return result + ([_scaled(table, "own_attitude", self.own, scales)] if self.own else [])
 
 
 class RateGainFields(Fields, kw_only=True):
-    """The gains of the rate loop: stated, N m per rad/s, or by inertia and lag."""
+    """The gains of the rate loop: stated (N m per rad/s), or inertia over lag."""
 
     rate_gain: ThreePositive | None = None
     inertia_kg_m2: ThreePositive | None = None
@@ -378,16 +393,16 @@ class RateGainFields(Fields, kw_only=True):
 
 
 class TorqueCommand(RateGainFields):
-    """Torque setpoints about the body's axes (FLU), and the rates that they are to reach."""
+    """Torque setpoints about the body's axes (FLU), and the reference rates of the controller."""
 
     columns: ThreeNames
     reference_rates: ThreeNames | None = None
 
     def channels(self, table: str) -> list[Channel]:
         """Return the channels of setpoints and rates."""
-        found = [_scaled(table, "torque_command", self.columns, 1.0)]
+        result = [_scaled(table, "torque_command", self.columns, 1.0)]
         rates = self.reference_rates
-        return found + ([_scaled(table, "reference_rates", rates, 1.0)] if rates else [])
+        return result + ([_scaled(table, "reference_rates", rates, 1.0)] if rates else [])
 
 
 class Motors(RateGainFields):
@@ -416,14 +431,14 @@ class Motors(RateGainFields):
         if low >= high:
             raise ValueError(f"high: found {high:g}, expected more than low")
 
-        def scale(found: Table) -> np.ndarray:
-            return np.clip((found.matrix(self.columns) - low) / (high - low), 0.0, 1.0)
+        def scale(rows: Table) -> np.ndarray:
+            return np.clip((rows.matrix(self.columns) - low) / (high - low), 0.0, 1.0)
 
         return [Channel(table, "motors", self.columns, scale)]
 
 
 class MappingFile(Fields):
-    """A mapping file; the tables from ``time`` to ``motors`` are of columns."""
+    """A mapping file; the tables from ``time`` to ``motors`` describe columns."""
 
     time: Time | None = None
     command: Command | None = None
@@ -459,9 +474,16 @@ TABLES = MappingFile.__struct_fields__[: MappingFile.__struct_fields__.index("mo
 
 
 class Mapping(NamedTuple):
-    """A mapping: ``channels`` are of its tables of columns; none if it has none.
+    """A mapping.
 
-    files: of a log of several CSV files, by the names that columns begin with.
+    Attributes:
+        source: the mapping file, for messages.
+        rows: which rows are used.
+        craft: what the mapping states of the craft.
+        channels: channels of its tables of columns; empty if it has none.
+        rules: how commands follow from setpoints and motors.
+        delimiter: separator of a CSV file's cells.
+        files: the CSV files of a log of several, by the names that columns begin with.
     """
 
     source: str = "no mapping"
@@ -476,7 +498,9 @@ class Mapping(NamedTuple):
 def load_mapping(where: str | Path) -> Mapping:
     """Return the mapping in a TOML file, or the shipped one of that name (without ``.toml``).
 
-    Raises LogError, whose message names file, table and field, found and expected.
+    Raises:
+        LogError: the mapping cannot be used; the message names file, table and field, what was
+            found and what was expected.
     """
     path, shipped = Path(where), sorted(file.stem for file in SHIPPED.glob("*.toml"))
     if not path.exists():
@@ -525,16 +549,18 @@ def _load(path: Path) -> dict[str, Any]:
 
 
 def _merged(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
-    """Return a mapping's tables with the fields of another one in place of its own."""
+    """Return the tables of a base mapping, with the fields that another mapping changes."""
     merged = dict(base)
     for name, value in change.items():
-        old = merged.get(name)
+        base_value = merged.get(name)
         merged[name] = (
-            {**old, **value} if isinstance(old, dict) and isinstance(value, dict) else value
+            {**base_value, **value}
+            if isinstance(base_value, dict) and isinstance(value, dict)
+            else value
         )
     return merged
 
 
 def _scaled(table: str, name: str, columns: tuple[str, ...], scales: np.ndarray | float) -> Channel:
     check_different("columns", columns)
-    return Channel(table, name, columns, lambda found: found.matrix(columns) * scales)
+    return Channel(table, name, columns, lambda rows: rows.matrix(columns) * scales)

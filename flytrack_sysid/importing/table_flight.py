@@ -17,49 +17,61 @@ from flytrack_sysid.log_table import Table, columns_of, log_of_table
 from flytrack_sysid.resample import Samples, on_one_base, slow_channels
 from flytrack_sysid.timestamps import MAX_LATENCY_S, number_segments, put_on_one_line, read_clock
 
-MAX_LIST_LENGTH = 1000  # characters of a header in a message
+MAX_LIST_LENGTH = 1000  # characters of a list of columns in a message
 TIMESTAMP = "timestamp"  # column of a table's own times, s
 RECORDED = "recorded"  # column of the times of recording, s, by one clock for all tables
-BASES = ("w", "q", "p")  # the rows are those of the first that is there
+BASES = ("w", "q", "p")  # the rows are those of the first one that a log has
 
 
 def channels_in(
     source: str, headers: Sequence[Iterable[str]], mapping: Mapping
 ) -> list[tuple[Channel, int]]:
-    """Return the channels that a log has, and the table of each, by the tables' column names.
+    """Return the channels that a log has, each with the number of its table.
 
-    Raises LogError for columns that the mapping wants and no table has, or one has several times.
+    Args:
+        source: the log, for messages.
+        headers: column names of the tables.
+        mapping: states the channels and their columns.
+
+    Raises:
+        LogError: no table has a column of the mapping, or a table has it several times.
     """
     if not mapping.channels:
         raise LogError(f"{source}: {mapping.source} names no columns; such a file needs [command]")
-    names = [list(header) for header in headers]
-    found = []
+    column_names = [list(header) for header in headers]
+    result = []
     for channel in mapping.channels:
-        counts = [[header.count(column) for column in channel.columns] for header in names]
-        fitting = [number for number, count in enumerate(counts) if all(one == 1 for one in count)]
+        counts = [[header.count(column) for column in channel.columns] for header in column_names]
+        fitting = [table for table, count in enumerate(counts) if all(n == 1 for n in count)]
         if fitting:
-            found.append((channel, fitting[0]))
+            result.append((channel, fitting[0]))
         elif not (channel.is_optional and not any(map(any, counts))):
-            nearest = max(
+            nearest_table = max(
                 range(len(counts)), key=lambda number: sum(map(bool, counts[number])), default=None
             )
-            count = counts[nearest] if nearest is not None else [0] * len(channel.columns)
+            count = (
+                counts[nearest_table] if nearest_table is not None else [0] * len(channel.columns)
+            )
             column, times = next(
                 (c, n) for c, n in zip(channel.columns, count, strict=True) if n != 1
             )
-            listed = ", ".join(map(quote_name, dict.fromkeys(itertools.chain(*names))))[
+            listed = ", ".join(map(quote_name, dict.fromkeys(itertools.chain(*column_names))))[
                 :MAX_LIST_LENGTH
             ]
             where = f"{source}: column {quote_name(column)}: found {times} times among {listed}"
             raise LogError(f"{where}; expected once by {mapping.source}: {channel.table}")
-    return found
+    return result
 
 
 def read_csv(path: Path, mapping: Mapping) -> ImportedFlight:
     """Return the flight in a CSV file with a header, by a mapping; SI units and our frames.
 
-    path: of a folder, if the mapping has several files. Raises LogError, whose message names file,
-    row, line and column.
+    Args:
+        path: of the file, or of a folder if the mapping has several files.
+        mapping: states the columns.
+
+    Raises:
+        LogError: the file cannot be used; the message names file, row, line and column.
     """
     if mapping.files:
         return _read_files(path, mapping)
@@ -99,8 +111,8 @@ def _read_files(folder: Path, mapping: Mapping) -> ImportedFlight:
             name, colon, field = column.partition(":")
             if name not in mapping.files or not colon:
                 expected = f"expected file:column, where file is one of {', '.join(mapping.files)}"
-                found = f"{mapping.source}: {channel.table}: found {quote_name(column)}"
-                raise LogError(f"{found}, {expected}")
+                problem = f"{mapping.source}: {channel.table}: found {quote_name(column)}"
+                raise LogError(f"{problem}, {expected}")
             wanted.setdefault(name, {})[field] = None
     tables = []
     for name, fields in wanted.items():
@@ -110,8 +122,8 @@ def _read_files(folder: Path, mapping: Mapping) -> ImportedFlight:
             listed = ", ".join(quote_name(path.name) for path in sorted(folder.iterdir()))[
                 :MAX_LIST_LENGTH
             ]
-            found = f"found {len(paths)} files of the name {quote_name(file.file)} among {listed}"
-            raise LogError(f"{folder}: {found}; expected one by {mapping.source}: files.{name}")
+            problem = f"found {len(paths)} files of the name {quote_name(file.file)} among {listed}"
+            raise LogError(f"{folder}: {problem}; expected one by {mapping.source}: files.{name}")
         tables.append(_read_file(paths[0], name, file, list(fields), mapping))
     return flight_of_topics(str(folder), tables, mapping)
 
@@ -123,11 +135,11 @@ def _read_file(path: Path, name: str, file: CsvFile, fields: list[str], mapping:
         for column in (file.time, *fields):
             if header.count(column) != 1:
                 listed = ", ".join(map(quote_name, header))[:MAX_LIST_LENGTH]
-                found = (
+                problem = (
                     f"{path}: column {quote_name(column)}: found {header.count(column)} times "
                     f"among {listed}"
                 )
-                raise LogError(f"{found}; expected once by {mapping.source}: files.{name}")
+                raise LogError(f"{problem}; expected once by {mapping.source}: files.{name}")
         table = read_columns(path, rows, header, dict.fromkeys((file.time, *fields)))
     columns = {f"{name}:{field}": table.columns[field] for field in fields}
     times = table.columns[file.time] * file.si_per_unit("time") + file.offset_s
@@ -135,13 +147,13 @@ def _read_file(path: Path, name: str, file: CsvFile, fields: list[str], mapping:
 
 
 def flight_of_topics(source: str, topics: Sequence[Table], mapping: Mapping) -> ImportedFlight:
-    """Return the flight in tables with clocks and rates of their own, each with a time column.
+    """Return the flight in tables that each have a clock and a time column.
 
-    Rows are the samples of the body rates, else of the attitude or the position: other sensors are
-    interpolated, commands held. There are no rows where a channel has a gap of more than three of
-    its usual steps.
+    The rows are those of the body rates, else of the attitude or the position. Other sensors are
+    interpolated, and commands are held. There are no rows where a channel has a gap of more than
+    three of its usual steps.
     """
-    samples, clocks, latencies_s, said = {}, {}, {}, list[str]()
+    samples, clocks, latencies_s, remarks = {}, {}, {}, list[str]()
     for channel, number in channels_in(source, [topic.columns for topic in topics], mapping):
         topic = topics[number]
         if channel.name == "t":
@@ -156,7 +168,7 @@ def flight_of_topics(source: str, topics: Sequence[Table], mapping: Mapping) -> 
         clock = read_clock(
             source, channel.table, np.where(is_finite, topic.columns[TIMESTAMP], np.nan)
         )
-        said += [text for text in clock.describe(channel.table) if text not in said]
+        remarks += [text for text in clock.describe(channel.table) if text not in remarks]
         kept = topic.select(clock.is_used)
         clocks[channel.name], samples[channel.name] = (
             clock,
@@ -173,11 +185,11 @@ def flight_of_topics(source: str, topics: Sequence[Table], mapping: Mapping) -> 
         early_s = latency_s - latencies_s.get(base_name, latency_s)
         if abs(early_s) > MAX_LATENCY_S:
             clocks[name] = clocks[name]._replace(times=clocks[name].times + early_s)
-            found = (
+            shift = (
                 f"stamps of {name} are {early_s:+.6g} s before those of {base_name}, by their "
                 "recording"
             )
-            said.append(f"{found}: moved by this, so that {name} is as late as recorded")
+            remarks.append(f"{shift}: moved by this, so that {name} is as late as recorded")
     times = put_on_one_line(source, clocks, base_name)
     samples = {name: Samples(times[name], values) for name, (_, values) in samples.items()}
     base = times[base_name]
@@ -187,11 +199,11 @@ def flight_of_topics(source: str, topics: Sequence[Table], mapping: Mapping) -> 
     values = {name: rows[is_known] for name, rows in values.items()}
     since_start = base[is_known] - base[is_known][0]
     flight = _flight(Table(source, {}), since_start, clocks[base_name].max_gap_s, values, mapping)
-    said += slow_channels(samples)
+    remarks += slow_channels(samples)
     if not is_known.all():
         count = f"{np.sum(~is_known)} of {len(clocks[base_name].is_used)} rows"
-        said.append(f"{count} left out: not all channels are known there")
-    return flight._replace(notes=(*(f"{source}: {text}" for text in said), *flight.notes))
+        remarks.append(f"{count} left out: not all channels are known there")
+    return flight._replace(notes=(*(f"{source}: {text}" for text in remarks), *flight.notes))
 
 
 def _flight(
@@ -201,7 +213,7 @@ def _flight(
     values: dict[str, np.ndarray],
     mapping: Mapping,
 ) -> ImportedFlight:
-    """Return the flight of converted channels; longer steps than the gap begin a new segment."""
+    """Return the flight of converted channels; steps above ``max_gap_s`` begin a new segment."""
     commands, notes = commands_of(
         table.source, time, values, mapping.rules, mapping.craft.max_rate_deg_s
     )

@@ -2,7 +2,7 @@
 
 NED and FRD are converted.
 
-Rows are the samples of the body rates; other sensors are interpolated between their own samples,
+The rows are those of the body rates. Other sensors are interpolated between their samples, and
 setpoints are held. There are no rows where a topic has a gap of more than three of its usual steps.
 """
 
@@ -35,8 +35,8 @@ from flytrack_sysid.timestamps import (
 MAX_BYTES = 2**29  # the decoder may take time and memory in proportion
 FIRST_BYTES = b"ULog\x01\x12\x35"
 MICROSECOND = UNITS["time"]["us"]
-# Full stick in acro mode, and the limit of other modes, deg/s; a setpoint stays below the larger
-# one.
+# Full stick in acro mode, and the limit of other modes, deg/s. Setpoints stay below the larger of
+# both.
 RATE_PARAMETERS = (
     ("MC_ACRO_R_MAX", "MC_ROLLRATE_MAX"),
     ("MC_ACRO_P_MAX", "MC_PITCHRATE_MAX"),
@@ -44,7 +44,7 @@ RATE_PARAMETERS = (
 )
 
 
-# Of MAVLink's MAV_TYPE, and of PX4's airframes by thousands of SYS_AUTOSTART.
+# Values of MAVLink's MAV_TYPE, and PX4's airframes by thousands of SYS_AUTOSTART.
 VTOL, HEXACOPTER, OCTOCOPTER = "a VTOL", "a hexacopter", "an octocopter"
 OTHER_VEHICLES = {
     1: "a plane",
@@ -72,7 +72,7 @@ def _indexed(topic: str, field: str, size: int) -> Source:
 
 
 BATTERY_FIELDS = ("voltage_v",)
-# The first one in the log is used; later ones are of older firmware.
+# The first source that a log has is used; later ones are of older firmware.
 SOURCES: dict[str, tuple[Source, ...]] = {
     "w": (
         _indexed("vehicle_angular_velocity", "xyz", 3),
@@ -100,54 +100,57 @@ EVENTS = ("vehicle_land_detected",)  # topics that are published when something 
 def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
     """Return the flight in a PX4 log: commands, rates, attitude, and its other channels.
 
-    docs/real_logs.md says which topics the channels are of. Raises LogError for what is no ULog, or
-    lacks rates, attitude or rate setpoints at any one time.
+    docs/real_logs.md lists the topics of the channels.
+
+    Raises:
+        LogError: the file is no ULog, or at no time has rates, attitude and rate setpoints.
     """
     if mapping.rules.motors_as_thrust:
         raise LogError(
             f"{mapping.source}: motors.as_thrust: not read of PX4 logs: actuator outputs are too "
             "slow"
         )
-    samples, clocks, parameters, said = _decode(path)
+    samples, clocks, parameters, remarks = _decode(path)
     craft = mapping.craft
     if craft.max_rate_deg_s is None:
         craft = craft._replace(max_rate_deg_s=_full_stick_deg_s(path, parameters))
     base, full_stick = samples["w"].times, np.array(craft.max_rate_deg_s)
     commands = _commands(samples["u"].values, full_stick * PER_DEGREE)
     _check_full_stick(path, commands, full_stick)
-    ours = {"u": Samples(samples["u"].times, commands), "q": _attitude(path, samples["q"])}
+    converted = {"u": Samples(samples["u"].times, commands), "q": _attitude(path, samples["q"])}
     for name in ("w", "f", "p", "v"):
         if name in samples:
-            ours[name] = samples[name]._replace(values=vector_from(samples[name].values, True))
+            converted[name] = samples[name]._replace(values=vector_from(samples[name].values, True))
     if "v_bat" in samples:
-        ours["v_bat"] = samples["v_bat"]
-    channels, is_known = on_one_base(ours, base)
+        converted["v_bat"] = samples["v_bat"]
+    channels, is_known = on_one_base(converted, base)
     if not is_known.any():
         raise LogError(
-            f"{path}: found no time at which all of {', '.join(ours)} are known, expected some"
+            f"{path}: found no time at which all of {', '.join(converted)} are known, expected some"
         )
     is_landed = None
     if "landed" in samples:
         times, landed = samples["landed"]
-        last = np.maximum(np.searchsorted(times, base[is_known], side="right") - 1, 0)
-        is_landed = landed[last, 0] != 0.0
+        last_event = np.maximum(np.searchsorted(times, base[is_known], side="right") - 1, 0)
+        is_landed = landed[last_event, 0] != 0.0
     used_channels = {name: values[is_known] for name, values in channels.items()}
     columns = columns_of(base[is_known] - base[is_known][0], used_channels)
     columns["segment"] = number_segments(base[is_known], clocks["w"].max_gap_s)
     num_rows = len(clocks["w"].is_used)
-    used = f"{is_known.sum()} of {num_rows} samples of the rates have all other topics around them"
+    usage = f"{is_known.sum()} of {num_rows} samples of the rates have all other topics around them"
     notes = tuple(
-        f"{path}: {text}" for text in [used, *said, *_airframe(parameters), *slow_channels(ours)]
+        f"{path}: {text}"
+        for text in [usage, *remarks, *_airframe(parameters), *slow_channels(converted)]
     )
     return ImportedFlight(log_of_table(Table(str(path), columns)), craft, notes, is_landed)
 
 
 def _airframe(parameters: dict[str, float]) -> list[str]:
-    """Return a note if the log's own parameters say that the craft is no quadcopter."""
-    for kinds, name, every in ((AIRFRAMES, "MAV_TYPE", 1), (FRAMES, "SYS_AUTOSTART", 1000)):
-        kind = kinds.get(int(parameters.get(name, 0)) // every)
-        if kind:
-            return [not_a_quadcopter(f"{kind} ({name} {parameters[name]:.0f})")]
+    """Return a note if the log's parameters say that the craft is no quadcopter."""
+    for kinds, name, divisor in ((AIRFRAMES, "MAV_TYPE", 1), (FRAMES, "SYS_AUTOSTART", 1000)):
+        vehicle = kinds.get(int(parameters.get(name, 0)) // divisor)
+        if vehicle:
+            return [not_a_quadcopter(f"{vehicle} ({name} {parameters[name]:.0f})")]
     num_rotors = int(parameters.get("CA_ROTOR_COUNT", 0))
     return (
         [not_a_quadcopter(f"{num_rotors} rotors (CA_ROTOR_COUNT)")]
@@ -159,8 +162,11 @@ def _airframe(parameters: dict[str, float]) -> list[str]:
 def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, Clock], dict[str, float], list[str]]:
     """Read the topics of a log.
 
-    Returns: The samples by channel, on one time line; the clocks by channel; the log's parameters;
-        and what was found wrong.
+    Returns:
+        samples: by channel, on one time line.
+        clocks: by channel.
+        parameters: of the log.
+        remarks: what is wrong with the log.
     """
     read_log_file(path, MAX_BYTES, FIRST_BYTES, "a PX4 log (ULog)", len(FIRST_BYTES))
     fields: dict[str, list[str]] = {}
@@ -176,41 +182,41 @@ def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, Clock], dict[str,
     for (topic, instance, field), values in zip(notes["fields"], arrays, strict=True):
         topics.setdefault(topic, {}).setdefault(instance, {})[field] = values
     samples, clocks = {}, {}
-    said = ["damaged in places; what could be read is used"] if notes["is_damaged"] else []
-    if notes["is_cut_off"] and not said:  # damage, too, may end within a message
-        said.append("cut off: used up to the last whole message")
+    remarks = ["damaged in places; what could be read is used"] if notes["is_damaged"] else []
+    if notes["is_cut_off"] and not remarks:  # a damaged log may end within a message, too
+        remarks.append("cut off: used up to the last whole message")
     for channel, sources in SOURCES.items():
         for topic, names in sources:
-            found = _best_instance(path, topic, topics.get(topic, {}), names)
-            if found is not None:
-                samples[channel], clocks[channel], faults = found
-                said += [text for text in faults if text not in said]  # channels share topics
+            best = _best_instance(path, topic, topics.get(topic, {}), names)
+            if best is not None:
+                samples[channel], clocks[channel], faults = best
+                remarks += [text for text in faults if text not in remarks]  # channels share topics
                 break
         if channel not in samples and channel in REQUIRED:
             wanted = " or ".join(f"{topic} ({', '.join(names)})" for topic, names in sources)
-            there = ", ".join(sorted(topics)) or "none of the topics that are read"
-            raise LogError(f"{path}: topic {wanted}: missing or empty; found {there}")
+            available = ", ".join(sorted(topics)) or "none of the topics that are read"
+            raise LogError(f"{path}: topic {wanted}: missing or empty; found {available}")
     times = put_on_one_line(str(path), clocks, "w")
     samples = {channel: Samples(times[channel], values) for channel, (_, values) in samples.items()}
-    return samples, clocks, notes["parameters"], said
+    return samples, clocks, notes["parameters"], remarks
 
 
 def _best_instance(
     path: Path, name: str, instances: dict[int, dict[str, np.ndarray]], fields: tuple[str, ...]
 ) -> tuple[Samples, Clock, list[str]] | None:
-    """Return ``_samples_of`` the topic instance with most valid samples; the first of equals."""
-    found = {
-        number: whole
+    """Return ``_samples_of`` the topic instance with most valid samples; the first if equal."""
+    candidates = {
+        number: candidate
         for number, topic in instances.items()
-        if (whole := _samples_of(path, name, topic, fields)) is not None
+        if (candidate := _samples_of(path, name, topic, fields)) is not None
     }
-    if not found:
+    if not candidates:
         return None
-    used = max(found, key=lambda number: len(found[number][0].times))
-    samples, clock, faults = found[used]
-    others = ", ".join(str(number) for number in found if number != used)
+    best = max(candidates, key=lambda number: len(candidates[number][0].times))
+    samples, clock, faults = candidates[best]
+    others = ", ".join(str(number) for number in candidates if number != best)
     if others:
-        faults = [*faults, f"instance {used} of {name} is used, not {others}"]
+        faults = [*faults, f"instance {best} of {name} is used, not {others}"]
     return samples, clock, faults
 
 
@@ -219,7 +225,7 @@ def _samples_of(
 ) -> tuple[Samples, Clock, list[str]] | None:
     """Return the samples of a topic's fields, their clock, and its faults; None without samples.
 
-    Times are those at which a sensor was read, if the topic has them, else those of publishing.
+    The times are those at which a sensor was read, if the topic has them, else those of publishing.
     """
     if any(field not in topic for field in ("timestamp", *fields)):
         return None
@@ -237,15 +243,15 @@ def _samples_of(
         if np.median(sampled) > 0.0 and abs(latency_s) <= MAX_LATENCY_S:
             times = sampled
         elif np.any(sampled > 0.0):
-            found = f"timestamp_sample of {name} is {latency_s:.6g} s before timestamp"
-            faults.append(f"{found}, more than {MAX_LATENCY_S:g} s: its rows are at timestamp")
+            problem = f"timestamp_sample of {name} is {latency_s:.6g} s before timestamp"
+            faults.append(f"{problem}, more than {MAX_LATENCY_S:g} s: its rows are at timestamp")
     clock = read_clock(str(path), name, np.where(is_finite, times, np.nan), name in EVENTS)
     faults += clock.describe(name)
     return Samples(clock.times, values[clock.is_used]), clock, faults
 
 
 def _attitude(path: Path, samples: Samples) -> Samples:
-    """Return the attitude in our frames, without samples from before the estimator ran."""
+    """Return the attitude in our frames, without the samples before the estimator ran."""
     times, quat = samples
     is_unit = abs(np.linalg.norm(quat, axis=1) - 1.0) <= MAX_NORM_ERROR
     if not is_unit.any():
@@ -259,38 +265,40 @@ def _attitude(path: Path, samples: Samples) -> Samples:
 
 
 def _commands(setpoints: np.ndarray, full_stick: np.ndarray) -> np.ndarray:
-    """Return commands (num_rows, 4) of setpoints.
+    """Return the commands of setpoints, (num_rows, 4).
 
-    setpoints: rates in FRD, rad/s, and thrust, 0 to 1 with either sign.
+    Args:
+        setpoints: rates in FRD, rad/s, and thrust, 0 to 1 with either sign, (num_rows, 4).
+        full_stick: rates at a command of 1, (3,) rad/s.
     """
     rates = vector_from(setpoints[:, :3], True) / full_stick
     return np.column_stack([rates, 2.0 * np.abs(setpoints[:, 3]) - 1.0])
 
 
 def _check_full_stick(path: Path, commands: np.ndarray, full_stick: np.ndarray) -> None:
-    """Raise LogError for setpoints past full stick; the message says how to raise it."""
+    """Raise LogError for setpoints past full stick; the message says how to raise full stick."""
     largest = np.abs(commands[:, :3]).max(axis=0)
     if largest.max() > 1.0 + COMMAND_MARGIN:
-        asked = ", ".join(f"{value:.4g}" for value in largest * full_stick)
-        known = ", ".join(f"{value:.4g}" for value in full_stick)
-        needed = ", ".join(
+        reached = ", ".join(f"{value:.4g}" for value in largest * full_stick)
+        limits = ", ".join(f"{value:.4g}" for value in full_stick)
+        advised = ", ".join(
             f"{value:.0f}" for value in np.ceil(np.maximum(largest, 1.0) * full_stick)
         )
-        found = f"roll, pitch, yaw: found setpoints of up to {asked} deg/s"
-        expected = f"expected at most full stick, {known} deg/s"
-        advice = f"in a mapping, craft.max_rate_deg_s = [{needed}] raises it"
-        raise LogError(f"{path}: topic vehicle_rates_setpoint: {found}, {expected}; {advice}")
+        problem = f"roll, pitch, yaw: found setpoints of up to {reached} deg/s"
+        expected = f"expected at most full stick, {limits} deg/s"
+        advice = f"in a mapping, craft.max_rate_deg_s = [{advised}] raises it"
+        raise LogError(f"{path}: topic vehicle_rates_setpoint: {problem}, {expected}; {advice}")
 
 
 def _full_stick_deg_s(path: Path, parameters: dict[str, float]) -> tuple[float, float, float]:
     """Return the rates of roll, pitch and yaw at a command of 1, deg/s."""
     rates = []
     for names in RATE_PARAMETERS:
-        known = [parameters[name] for name in names if name in parameters]
-        if not known or max(known) <= 0.0:
+        limits = [parameters[name] for name in names if name in parameters]
+        if not limits or max(limits) <= 0.0:
             missing = f"{path}: parameter {' or '.join(names)}: missing, so full stick is unknown"
             missing = "; ".join([missing, *_airframe(parameters)])
             raise LogError(f"{missing}; a mapping can state craft.max_rate_deg_s")
-        rates.append(float(max(known)))
+        rates.append(float(max(limits)))
     roll, pitch, yaw = rates
     return roll, pitch, yaw

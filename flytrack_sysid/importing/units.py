@@ -1,7 +1,8 @@
 """Conversion of units and frames to ours.
 
-Ours: SI units; world z up, body x forward, y left, z up; quaternions (w, x, y, z), body to world. A
-world with z up is ours whichever way its x points (north, east, or where the drone stood).
+We use SI units, a world with z up, a body with x forward, y left and z up, and quaternions (w, x,
+y, z) from body to world. The direction of the world's x does not matter (north, east, or the
+heading at the start).
 """
 
 import numpy as np
@@ -20,28 +21,36 @@ UNITS: dict[str, dict[str, float]] = {
     "acceleration": {"m/s^2": 1.0, "g": GRAVITY, "mg": 1e-3 * GRAVITY},
     "voltage": {"V": 1.0, "dV": 0.1, "cV": 1e-2, "mV": 1e-3},
 }
-# Half a turn about x converts each to ours, and back.
+# Half a turn about x converts the frames that are True to ours, and back.
 TURNED = {"body": {"flu": False, "frd": True}, "world": {"z_up": False, "ned": True}}
 AXES_TURNED = np.array([1.0, -1.0, -1.0])
 HALF_TURN = Rotation.from_rotvec([np.pi, 0.0, 0.0])
 
 
 def vector_from(vectors: np.ndarray, is_turned: bool) -> np.ndarray:
-    """Return vectors (num_rows, 3) in our frame; is_turned: they were in FRD or NED axes."""
+    """Return vectors in our frame, (num_rows, 3).
+
+    Args:
+        vectors: (num_rows, 3).
+        is_turned: whether they are in FRD or NED axes.
+    """
     return vectors * AXES_TURNED if is_turned else vectors
 
 
 def quaternion_from(attitude: Rotation, is_body_turned: bool, is_world_turned: bool) -> np.ndarray:
-    """Return our quaternions (num_rows, 4) of attitudes, each from body to world frame.
+    """Return our quaternions of attitudes, (num_rows, 4).
 
-    is_body_turned: that body frame is FRD; is_world_turned: that world frame is NED.
+    Args:
+        attitude: from body to world frame.
+        is_body_turned: whether its body frame is FRD.
+        is_world_turned: whether its world frame is NED.
     """
     if is_world_turned:
         attitude = HALF_TURN * attitude
     if is_body_turned:
         attitude = attitude * HALF_TURN
     quat = attitude.as_quat(scalar_first=True)
-    # Signs so that neighbours are close, the first with w >= 0.
+    # Choose signs such that neighbours are close and the first has w >= 0.
     flips = np.sum(quat[1:] * quat[:-1], axis=1) < 0.0
     first = quat[:1, 0] < 0.0
     signs = np.where(np.cumsum(np.concatenate([first, flips])) % 2 == 1, -1.0, 1.0)

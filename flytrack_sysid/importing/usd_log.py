@@ -1,10 +1,14 @@
-"""Crazyflie's logs on a micro SD card, binary, as its firmware writes them.
+"""Crazyflie's binary logs on a micro SD card, as its firmware writes them.
 
-Little-endian: a byte 0xBC, version and number of event types (uint16 each); of each type its number
-(uint16), its name, its number of variables (uint16) and their names with a struct format, as in
-``gyro.x(f)``; names end in a zero byte. Then records: number of the type, time (version 1: uint32,
-ms; version 2: uint64, us), values; a CRC-32 ends the file. Source: bitcraze/crazyflie-firmware,
-docs and tools/usdlog.
+All numbers are little-endian. A file has
+
+- a byte 0xBC, the version and the number of event types (uint16 each);
+- for each type its number (uint16), its name, its number of variables (uint16) and their names with
+  a struct format, as in ``gyro.x(f)``; names end in a zero byte;
+- records: number of the type, time (version 1: uint32, ms; version 2: uint64, us), values;
+- a CRC-32.
+
+Source: bitcraze/crazyflie-firmware, docs and tools/usdlog.
 """
 
 import struct
@@ -24,12 +28,17 @@ from flytrack_sysid.log_table import Table
 MAX_BYTES = 2**27  # 40 min at 1 kHz with 50 bytes a record
 FIRST_BYTE = b"\xbc"
 NUM_HEADER_BYTES, NUM_CRC_BYTES = 5, 4
-STAMPS = {1: ("<u4", 1e-3), 2: ("<u8", 1e-6)}  # of a version: type, s
+STAMPS = {1: ("<u4", 1e-3), 2: ("<u8", 1e-6)}  # by version: type and unit (s) of times
 FORMATS = "bBhHiIqQefd"  # of ``struct``, one value each
 
 
 class _Event(NamedTuple):
-    """A type of event: the layout of its records, and where they are in the file."""
+    """A type of event.
+
+    Attributes:
+        layout: of its records.
+        starts: offsets of its records in the file.
+    """
 
     layout: np.dtype
     starts: list[int]
@@ -38,7 +47,8 @@ class _Event(NamedTuple):
 def read_usd(path: Path, mapping: Mapping) -> ImportedFlight:
     """Return the flight in a uSD log, by a mapping of its variables; SI units and our frames.
 
-    Raises LogError for what is no such log, or lacks a variable that the mapping names.
+    Raises:
+        LogError: the file is no such log, or lacks a variable that the mapping names.
     """
     content = read_log_file(path, MAX_BYTES, FIRST_BYTE, "a Crazyflie uSD log")
     try:
@@ -60,45 +70,45 @@ def read_usd(path: Path, mapping: Mapping) -> ImportedFlight:
 
 
 def _header(content: bytes) -> tuple[float, dict[int, _Event], int]:
-    """Return the unit of times, s, the event types by number, and where the records begin."""
+    """Return the unit of times, s, the event types by number, and the offset of the records."""
     version, num_events = struct.unpack_from("<HH", content, 1)
     if version not in STAMPS:
         raise ValueError(f"found version {version}, expected one of {', '.join(map(str, STAMPS))}")
     stamp, stamp_s = STAMPS[version]
-    place, events = NUM_HEADER_BYTES, {}
+    offset, events = NUM_HEADER_BYTES, {}
     for _ in range(num_events):
-        (number,) = struct.unpack_from("<H", content, place)
-        _, place = _text(content, place + 2)
-        (num_variables,) = struct.unpack_from("<H", content, place)
-        place += 2
+        (number,) = struct.unpack_from("<H", content, offset)
+        _, offset = _text(content, offset + 2)
+        (num_variables,) = struct.unpack_from("<H", content, offset)
+        offset += 2
         fields = [("", "<u2"), (TIMESTAMP, stamp)]
         for _ in range(num_variables):
-            text, place = _text(content, place)
+            text, offset = _text(content, offset)
             name, kind = text[:-3], text[-2:-1]
             if text != f"{name}({kind})" or kind not in FORMATS or not kind:
                 raise ValueError(f"found variable {quote_name(text)}, expected name(format)")
             fields.append((name, "<" + kind))
         events[number] = _Event(np.dtype(fields), [])
-    return stamp_s, events, place
+    return stamp_s, events, offset
 
 
-def _text(content: bytes, place: int) -> tuple[str, int]:
-    """Return the text that begins there, and where the next thing begins."""
-    end = content.index(b"\0", place)
-    return content[place:end].decode(), end + 1
+def _text(content: bytes, offset: int) -> tuple[str, int]:
+    """Return the text that begins at an offset, and the offset after it."""
+    end = content.index(b"\0", offset)
+    return content[offset:end].decode(), end + 1
 
 
-def _find_records(content: bytes, place: int, end: int, events: dict[int, _Event]) -> int:
-    """Append the start of each whole record to its event, and return where they end."""
+def _find_records(content: bytes, offset: int, end: int, events: dict[int, _Event]) -> int:
+    """Append the offset of each whole record to its event, and return the offset after the last."""
     sizes = {number: event.layout.itemsize for number, event in events.items()}
-    while place + 2 <= end:
-        number = content[place] | content[place + 1] << 8
+    while offset + 2 <= end:
+        number = content[offset] | content[offset + 1] << 8
         size = sizes.get(number)
-        if size is None or place + size > end:
+        if size is None or offset + size > end:
             break
-        events[number].starts.append(place)
-        place += size
-    return place
+        events[number].starts.append(offset)
+        offset += size
+    return offset
 
 
 def _table(path: Path, content: bytes, event: _Event, stamp_s: float, wanted: set[str]) -> Table:
@@ -108,7 +118,7 @@ def _table(path: Path, content: bytes, event: _Event, stamp_s: float, wanted: se
         np.add.outer(np.array(event.starts, int), np.arange(size))
     ]
     records = rows.reshape(-1, size).view(event.layout)[:, 0]
-    with np.errstate(invalid="ignore"):  # damaged numbers may be NaN of the signalling kind
+    with np.errstate(invalid="ignore"):  # damaged numbers may be signalling NaNs
         columns = {
             name: records[name].astype(float) for name in event.layout.names or () if name in wanted
         }
