@@ -37,6 +37,7 @@ from flytrack_sysid.diagnosis.onset import (
     first_row_as_at_end,
     notes_of,
     spans_of,
+    windows_of,
     with_changes,
 )
 from flytrack_sysid.diagnosis.outliers import outlier_notes, outliers_of
@@ -252,20 +253,20 @@ def vetoed_in_time(selection: Selection, parts: Split) -> tuple[Selection, dict[
     """Return a selection with its changes within the log, after its vetoes, and these by effect.
 
     A change may hide behind an effect that held-out rows contradict. So changes are searched for
-    again without this effect.
+    again without this effect. Where one is there, it is what the held-out rows contradicted.
     """
     selection = with_changes(selection, parts.test, parts.log)
     selection, rejected = apply_vetoes(selection, held_out_under(selection, parts.test))
-    if contradicted_on_held_out in rejected.values():
+    contradicted = {name for name, veto in rejected.items() if veto is contradicted_on_held_out}
+    if contradicted:
         later = with_changes(selection, parts.test, parts.log)
         if later is not selection:
             selection, further = apply_vetoes(later, held_out_under(later, parts.test))
-            rejected = {
-                name: veto
-                for name, veto in rejected.items()
-                if veto is not contradicted_on_held_out
-            }
             rejected |= further
+            if windows_of(selection):
+                rejected = {
+                    name: veto for name, veto in rejected.items() if name not in contradicted
+                }
     return selection, rejected
 
 
