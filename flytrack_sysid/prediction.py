@@ -29,8 +29,8 @@ class Prediction(NamedTuple):
     Attributes:
         model: the model that predicts.
         log: the log without gaps.
-        before: the measured state. Without a channel in the log, its part is zero; then attitude is
-            upright, and the voltage ``assumed_voltage``.
+        before: the measured state. Channels that the log lacks are zero, the attitude is upright,
+            and the voltage is ``assumed_voltage``.
         memories: memories of the model's effects before the step.
         after: the state at the next row.
         force_b: specific force of the step (m/s^2), (num_rows, 3).

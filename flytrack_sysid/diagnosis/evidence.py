@@ -84,7 +84,7 @@ def without(extended: ModelParameters, nominal: ModelParameters, cause: str) -> 
     if cause == "thrust_scale" and all(
         type(effect) is not ThrustScale for effect in extended.effects
     ):
-        cause = "thrust_curve"  # found as one factor between two curves
+        cause = "thrust_curve"  # the scale is one factor between two curves, not an effect
     if cause not in BASE_CAUSES:
         return extended.with_effects(nominal.effect(cause))
     before = dict(zip(names_of(nominal), to_vector(nominal).tolist(), strict=True))

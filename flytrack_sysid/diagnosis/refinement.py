@@ -1,7 +1,7 @@
 """Refinement: keep the effects that make the free-flight prediction of held-out rows better.
 
-One-step residuals show what a model lacks. Where they leave something unexplained, another law may
-stand in for it: this law fits every step, but its prediction diverges over many steps. Refinement
+One-step residuals show what a model lacks. Where they leave something unexplained, a law that
+stands in for it may fit every step although its prediction diverges over many steps. Refinement
 therefore
 
 1. starts free flights of 0.1 to 2 s from measured states (multiple shooting),
@@ -107,8 +107,8 @@ class FlightErrors(NamedTuple):
         Returns:
             Contributions, (models, blocks, horizons, quantities).
         """
-        number = np.maximum(self.windows.counts.sum(axis=1), 1)
-        relative = self.squares / (np.square(scale) * number)[:, None]
+        counts = np.maximum(self.windows.counts.sum(axis=1), 1)
+        relative = self.squares / (np.square(scale) * counts)[:, None]
         return self.windows.sums_by_block(np.moveaxis(relative, 2, 0)).swapaxes(0, 1)
 
     @property
@@ -405,7 +405,7 @@ class Refined(NamedTuple):
         removed: effects that held-out prediction does not need, or that make it worse.
         without: by kept effect, the model without it, refitted.
         problem: the problem with the ranges that were searched.
-        flight_test: held-out windows and errors; None if the log has too few.
+        flight_test: held-out windows and errors; None if there are no windows.
     """
 
     kept: tuple[Candidate, ...]

@@ -129,7 +129,7 @@ class Errors:
     """Errors of one model on the held-out part.
 
     Attributes:
-        one_step_nrmse: by channel, relative to a prediction of the mean.
+        one_step_nrmse: by channel; 1 is as bad as predicting the mean.
         position_m: RMS error of position (m), by seconds of free flight.
     """
 
@@ -214,8 +214,8 @@ class Diagnosis:
         error: errors by model: nominal, refitted_base, extended, noise_floor, and without_learned
             as in ``Prediction``.
         nominal: the model that is diagnosed, with the motion that the log shows.
-        base: the refitted model without effects, with that motion.
-        extended: the model with all causes, with that motion.
+        base: the refitted base, with that motion.
+        extended: the extended model, with that motion.
         noise: fitted standard deviations of the sensors, by channel and axis.
         source: file of the log.
         sha256: hash of the log's content.

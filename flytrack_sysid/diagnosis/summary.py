@@ -463,13 +463,13 @@ def causes_at_end(
             continue
         marginal = Marginal(selection.state.linearized(model.vector)[1], model, one.fields)
         widths = dict(zip(one.fields, marginal.half_widths(), strict=True))
-        where = [
+        ends = [
             _is_beyond(searched, vector, field)
             for field in fields
             if widths[field] < LOOSE * ranges[field]
         ]
-        if where:
-            stuck[one.effect] = ", ".join(where)
+        if ends:
+            stuck[one.effect] = ", ".join(ends)
     if not stuck:
         return ()
     state, linearization = selection.state.linearized(model.vector)

@@ -17,7 +17,7 @@ from flytrack_sysid.diagnosis.search import FittedModel
 from flytrack_sysid.parameters import TAUS
 
 SIDES = {"rate": AXES[0], "force": AXES[1]}  # axes of a residual
-RIDGE = 1e-6  # of each column's diagonal: features are nearly collinear in a monotonous flight
+RIDGE = 1e-6  # of each column's diagonal: features are nearly collinear if the flight covers little
 FALSE_POSITIVE_RATE = 1e-6  # of a flag for each dependence if the residuals are noise
 MATERIAL = 0.08  # of the sensor's noise, RMS: a smaller dependence is not reported
 OF_NAMED = 0.15  # of the named causes' RMS contribution: laws of the list are not exact
@@ -463,8 +463,8 @@ def find_dependences(
         )
         smooth = [feature(name, candidate) for name, candidate in features[side].items()]
         has_places = side == "force" and flight.pos_w.any()
-        places = feature("position", bumps(flight)) if has_places else None
-        result += _greedy(test, side, smooth, places, flight, min_size, noise)
+        bump_pool = feature("position", bumps(flight)) if has_places else None
+        result += _greedy(test, side, smooth, bump_pool, flight, min_size, noise)
     return sorted(result, key=lambda candidate: -candidate.gain)
 
 
@@ -502,7 +502,7 @@ def _greedy(
     test: SideTest,
     side: str,
     smooth: Sequence[Feature],
-    places: Feature | None,
+    bump_pool: Feature | None,
     flight: FlightVariables,
     min_size: float,
     noise: float,
@@ -511,7 +511,7 @@ def _greedy(
     result: list[Dependence] = []
     while len(result) < MAX_DEPENDENCES:
         best: Dependence | None = None
-        for feature in (*smooth, *([] if places is None else [_best_bump(test, places)])):
+        for feature in (*smooth, *([] if bump_pool is None else [_best_bump(test, bump_pool)])):
             if any(feature.name == earlier.name for earlier in result):
                 continue
             fit = test.fit(feature.columns)
@@ -534,16 +534,18 @@ def _greedy(
     return result
 
 
-def _best_bump(test: SideTest, places: Feature) -> Feature:
+def _best_bump(test: SideTest, bump_pool: Feature) -> Feature:
     """Return the bump about a position with the largest gain by itself."""
-    _, information, score, _ = test.projected(places.columns)
+    _, information, score, _ = test.projected(bump_pool.columns)
     parts = [slice(start, start + BUMP_SIZE) for start in range(0, len(score), BUMP_SIZE)]
     chi2 = [
         score[part] @ solve(information[part, part] + np.eye(BUMP_SIZE), score[part])
         for part in parts
     ]
     part = parts[int(np.argmax(chi2))]
-    return Feature(places.name, places.features_w[part], places.columns[:, part], len(parts))
+    return Feature(
+        bump_pool.name, bump_pool.features_w[part], bump_pool.columns[:, part], len(parts)
+    )
 
 
 class Line(NamedTuple):
