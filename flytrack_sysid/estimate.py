@@ -1,8 +1,8 @@
-"""Least squares over all channels of a log, each weighted by the noise that it turns out to have.
+"""Least squares over all channels of a log, each weighted by the noise estimated from the log.
 
-A fit replays a log and searches as the diagnosis does, but weights each component by one noise, and
-sums steps up in short windows: so positions count without velocities, and what a model lacks has no
-part in the weights.
+A fit replays a log and searches as the diagnosis does. Unlike the diagnosis, it weights each
+component by one noise, so that the errors of a model do not enter the weights, and it sums steps up
+in short windows, so that positions count without velocities.
 
 ========  ==============================================================================  =======
 channel   residual                                                                        unit
@@ -15,7 +15,7 @@ channel   residual                                                              
 ``v_bat`` battery voltage, against its drain, centred                                     V
 ========  ==============================================================================  =======
 
-Centring takes out what a window began with, which is measured with noise like the rest.
+Centring removes the value at the start of a window, which is measured with noise like all others.
 """
 
 from collections.abc import Callable
@@ -44,8 +44,8 @@ LAST_STEPS = (
     0,
     0,
     3,
-)  # full Gauss-Newton steps at the end of each round: only the last is to be exact
-LAST_RISE = 1e-10  # of the cost, which rounding may add to such a step
+)  # full Gauss-Newton steps at the end of each round: only the last round has to be exact
+LAST_RISE = 1e-10  # relative rise of the cost in such a step that may be rounding
 
 
 class FitError(ValueError):
@@ -53,10 +53,14 @@ class FitError(ValueError):
 
 
 class Estimate(NamedTuple):
-    """What a fit found, in float64.
+    """The result of a fit, in float64.
 
-    model: with the estimate in it. free: names of what was estimated. covariance: of the free
-    parameters. noise: rms left of each channel, per component. count: numbers that were explained.
+    Attributes:
+        model: the model with the estimated parameters.
+        free: names of the estimated parameters.
+        covariance: covariance of the estimated parameters.
+        noise: RMS residuals by channel, per component.
+        count: number of residuals.
     """
 
     model: ModelParameters
@@ -67,22 +71,24 @@ class Estimate(NamedTuple):
 
 
 def _in_line(values: np.ndarray) -> np.ndarray:
-    """Return (rows, chunks, ...) without lead-ins as (all rows, ...), in the order of time."""
-    own = np.swapaxes(values[lead_in_of(len(values)) :], 0, 1)
-    return own.reshape(-1, *own.shape[2:])
+    """Reshape (rows, chunks, ...) without lead-ins to (all rows, ...), in the order of time."""
+    without_lead_in = np.swapaxes(values[lead_in_of(len(values)) :], 0, 1)
+    return without_lead_in.reshape(-1, *without_lead_in.shape[2:])
 
 
 class Windows(NamedTuple):
     """The windows of a level.
 
-    starts: the rows in line where windows begin. counts: what counts, (all rows, axes).
+    Attributes:
+        starts: indices into all rows where windows begin.
+        counts: which values count, (all rows, axes).
     """
 
     starts: np.ndarray
     counts: np.ndarray
 
     def sums(self, values: np.ndarray) -> np.ndarray:
-        """Return, at every row, the sum of (all rows, axes) over its window."""
+        """Return, for every row, the sum of values, (all rows, axes), over its window."""
         lengths = np.diff(np.append(self.starts, len(values)))
         return np.repeat(np.add.reduceat(values, self.starts, axis=0), lengths, axis=0)
 
@@ -108,8 +114,11 @@ class Windows(NamedTuple):
 class Channels(Problem):
     """A log and the residuals of its channels, in the axes and windows of this module's table.
 
-    noise: (NUM_AXES, 2), a standard deviation each. levels: the windows of turns, forces and
-    battery. has_position: of forces, the level is position and not velocity.
+    The noise of this problem is a standard deviation for each component, (NUM_AXES, 2).
+
+    Attributes:
+        levels: the windows of turns, forces and battery.
+        has_position: whether the level of forces is the position instead of the velocity.
     """
 
     levels: tuple[Windows, ...] = ()
@@ -117,7 +126,7 @@ class Channels(Problem):
 
     @classmethod
     def of_log(cls, log: FlightLog, scored_rows: np.ndarray, model: ModelParameters) -> "Channels":
-        """Return the judged rows of a log, (num_rows,) bool, for a model and its effects."""
+        """Build the problem of the scored rows of a log, (num_rows,) bool, for a model."""
         tau, has_position = (
             np.asarray(model.tau, float),
             "p" in log and "q" in log and "v" not in log,
@@ -129,60 +138,60 @@ class Channels(Problem):
 
     def residuals(self, vectors: np.ndarray) -> np.ndarray:
         """Return residuals, (num_models, rows, chunks, NUM_AXES, 2); 0 where nothing counts."""
-        found = super().residuals(vectors)
-        for left in found:
-            in_line = self._of_channels(_in_line(left))
-            left[lead_in_of(len(left)) :] = in_line.reshape(
-                left.shape[1], -1, *left.shape[2:]
+        all_residuals = super().residuals(vectors)
+        for model_residuals in all_residuals:
+            in_line = self._of_channels(_in_line(model_residuals))
+            model_residuals[lead_in_of(len(model_residuals)) :] = in_line.reshape(
+                model_residuals.shape[1], -1, *model_residuals.shape[2:]
             ).swapaxes(0, 1)
-        return found * self.counts
+        return all_residuals * self.counts
 
-    def _of_channels(self, left: np.ndarray) -> np.ndarray:
+    def _of_channels(self, residuals: np.ndarray) -> np.ndarray:
         """Return the channels' residuals from those of single steps, (all rows, NUM_AXES, 2)."""
         before = Rotation.from_quat(
             _in_line(np.roll(self.chunks.record.quat, 1, axis=0)), scalar_first=True
         )
-        found, turn = left.copy(), left[:, TURNS, 1]
+        result, turn = residuals.copy(), residuals[:, TURNS, 1]
         for axes in (TURNS, FORCES):
-            found[:, axes, 0] = before.apply(left[:, axes, 0], inverse=True)
-        # One turn after the other, to second order: to first, attitude noise would not cancel.
+            result[:, axes, 0] = before.apply(residuals[:, axes, 0], inverse=True)
+        # Turns are composed to second order: to first order, attitude noise would not cancel.
         turned = self.levels[0].centred(np.cumsum(turn, axis=0)) - turn
-        found[:, TURNS, 1] += 0.5 * np.cross(turn, turned)
-        level = np.cumsum(found[..., 1], axis=0)
+        result[:, TURNS, 1] += 0.5 * np.cross(turn, turned)
+        level = np.cumsum(result[..., 1], axis=0)
         for axes, windows in zip(AXES, self.levels, strict=True):
-            found[:, axes, 1] = windows.centred(level[:, axes])
+            result[:, axes, 1] = windows.centred(level[:, axes])
         if self.has_position:
-            found[:, FORCES, 1] = self._of_positions(left[:, FORCES, 1])
-        return found
+            result[:, FORCES, 1] = self._of_positions(residuals[:, FORCES, 1])
+        return result
 
-    def _of_positions(self, left: np.ndarray) -> np.ndarray:
+    def _of_positions(self, residuals: np.ndarray) -> np.ndarray:
         """Return residuals of positions from those of changes of velocity, (all rows, 3) m/s."""
         record = self.chunks.record
         step_s = _in_line(np.roll(record.step_s, 1, axis=0))[:, None]  # of the step to the row
-        change = _in_line(np.diff(record.vel_w, axis=0, prepend=record.vel_w[:1])) - left
-        moved = (np.cumsum(change, axis=0) - 0.5 * change) * step_s
-        off = _in_line(record.pos_w) - np.cumsum(moved, axis=0)
-        return self.levels[1].without_slope(off, np.cumsum(step_s, axis=0))
+        change = _in_line(np.diff(record.vel_w, axis=0, prepend=record.vel_w[:1])) - residuals
+        displacement = (np.cumsum(change, axis=0) - 0.5 * change) * step_s
+        offsets = _in_line(record.pos_w) - np.cumsum(displacement, axis=0)
+        return self.levels[1].without_slope(offsets, np.cumsum(step_s, axis=0))
 
-    def whiten(self, left: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
+    def whiten(self, residuals: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
         """Return residuals over their noise."""
-        return left / self.noise[axes]
+        return residuals / self.noise[axes]
 
     def spread(self, vector: np.ndarray) -> np.ndarray:
-        """Return the rms residuals of a model, (NUM_AXES, 2).
+        """Return the RMS residuals of a model, (NUM_AXES, 2).
 
-        The means and slopes taken out of windows count as fitted.
+        The means and slopes that are removed from windows count as fitted parameters.
         """
-        number = self.counts.sum(axis=(0, 1))
+        counts = self.counts.sum(axis=(0, 1))
         for axes, windows in zip(AXES, self.levels, strict=True):
-            number[axes, 1] -= windows.num_used() * (
+            counts[axes, 1] -= windows.num_used() * (
                 2 if self.has_position and axes is FORCES else 1
             )
         squares = np.square(self.residuals(vector[None])[0]).sum(axis=(0, 1))
-        return np.maximum(np.sqrt(squares / np.maximum(number, 1)), MIN_NOISE)
+        return np.maximum(np.sqrt(squares / np.maximum(counts, 1)), MIN_NOISE)
 
     def by_channel(self, values: np.ndarray) -> dict[str, np.ndarray]:
-        """Return (NUM_AXES, 2) by the names of the channels that count."""
+        """Return values, (NUM_AXES, 2), by the names of the channels that count."""
         level = ("q", "p" if self.has_position else "v", "v_bat")
         sides = (
             (name, values[axes], self.counts[..., axes, :], side)
@@ -190,8 +199,8 @@ class Channels(Problem):
             for name, axes in zip(names, AXES, strict=True)
         )
         return {
-            name: own[:, side]
-            for name, own, counts, side in sides
+            name: channel_values[:, side]
+            for name, channel_values, counts, side in sides
             if name and counts[..., side].any()
         }
 
@@ -199,20 +208,24 @@ class Channels(Problem):
 def _counts(
     chunks: Chunks, scored_rows: np.ndarray, certain: np.ndarray, has_position: bool
 ) -> np.ndarray:
-    """Return what counts of judged rows.
+    """Return which residuals of scored rows count, (rows, chunks, NUM_AXES, 2) bool.
 
-    certain: where applied actions are known, (rows, chunks, 4).
+    Args:
+        chunks: the log in chunks.
+        scored_rows: (num_rows,) bool.
+        certain: where applied actions are known, (rows, chunks, 4) bool.
+        has_position: whether the level of forces is the position.
     """
     source = chunks.record.source_row
     is_scored = scored_rows[source] & (source >= 0) & (chunks.row >= 0)
     is_scored[: lead_in_of(len(is_scored))] = False
     behind = scored_rows[
         np.maximum.accumulate(source, axis=0)
-    ]  # of a filled row, the one before the gap
+    ]  # for a filled row, that of the row before the gap
     counts = chunks.counts & is_scored[..., None, None]
     counts[1:, :, FORCES, 0] &= behind[
         :-1, :, None
-    ]  # a force is that of a step from measured values
+    ]  # a force belongs to a step that starts from measured values
     if "w" in chunks.measured:
         counts[..., TURNS, 0] = certain[..., :3] & (is_scored & chunks.is_joined)[..., None]
     if has_position:
@@ -223,74 +236,83 @@ def _counts(
 def _levels(chunks: Chunks) -> tuple[Windows, ...]:
     """Return the windows of levels.
 
-    Those of voltage are flights; others are pieces, cut where doubt of commands ends.
+    Windows of the voltage are flights. Other windows are pieces of a flight, cut where unknown
+    commands become known again.
     """
     joined, counts = _in_line(chunks.is_joined), _in_line(chunks.counts[..., 1]).astype(float)
     is_cut = np.diff(_in_line(chunks.record.piece), prepend=-1) != 0
-    found = []
+    result = []
     for axes in AXES:
         known = _in_line(chunks.is_known[..., axes.start]) | ~joined
         is_back = known & ~np.append(True, known[:-1])
         is_new = ~joined if axes is BATTERY else ~joined | is_cut | is_back
-        found.append(Windows(np.flatnonzero(is_new), counts[:, axes]))
-    return tuple(found)
+        result.append(Windows(np.flatnonzero(is_new), counts[:, axes]))
+    return tuple(result)
 
 
-def _covariance(found: Linearization) -> np.ndarray:
+def _covariance(linearization: Linearization) -> np.ndarray:
     """Return the parameters' covariance, widened where residuals within a flight are correlated.
 
-    That of independent residuals of the noise assumed, in which each standard deviation is raised
-    to that of the cluster-robust (sandwich) estimate over pieces of a flight, if that is larger:
-    what the model lacks shows as residuals that agree within a piece.
+    The covariance is that of independent residuals with the assumed noise. Each standard deviation
+    is raised to that of the cluster-robust (sandwich) estimate over pieces of a flight, if that is
+    larger, since errors of the model make residuals correlated within a piece.
     """
-    problem, white = found.problem, found.white * robust_weight(found.white)
-    bread = solve(found.total, np.eye(len(found.total)))
-    used = problem.counts.any(axis=(2, 3))
-    columns = problem.whiten(found.slopes.columns)
-    pulls = np.einsum("prlak,rlak->rlp", columns, white, optimize=True)[used]
-    pieces, piece = np.unique(problem.chunks.record.piece[used], return_inverse=True)
+    problem, white = linearization.problem, linearization.white * robust_weight(linearization.white)
+    bread = solve(linearization.total, np.eye(len(linearization.total)))
+    is_used = problem.counts.any(axis=(2, 3))
+    columns = problem.whiten(linearization.slopes.columns)
+    scores = np.einsum("prlak,rlak->rlp", columns, white, optimize=True)[is_used]
+    pieces, piece = np.unique(problem.chunks.record.piece[is_used], return_inverse=True)
     by_piece = np.zeros((len(pieces), len(bread)))
-    np.add.at(by_piece, piece, pulls)
+    np.add.at(by_piece, piece, scores)
     robust = bread @ (by_piece.T @ by_piece) @ bread * (len(pieces) / max(len(pieces) - 1, 1))
-    widen = np.sqrt(np.maximum(np.diag(robust) / np.diag(bread), 1.0))
-    return bread * np.outer(widen, widen)
+    inflation = np.sqrt(np.maximum(np.diag(robust) / np.diag(bread), 1.0))
+    return bread * np.outer(inflation, inflation)
 
 
-def _acting(found: Linearization, free: tuple[str, ...], may_be_idle: bool) -> list[int]:
+def _acting(linearization: Linearization, free: tuple[str, ...], may_be_idle: bool) -> list[int]:
     """Return the indices of parameters that residuals depend on; others mislead a search.
 
-    Wind, say, acts only once there is some drag; what is idle after the first round too is refused.
+    Wind, for example, acts only if there is some drag.
+
+    Args:
+        linearization: residuals and slopes at the current vector.
+        free: names of the parameters to estimate.
+        may_be_idle: whether residuals may be independent of a parameter, as in the first round.
+
+    Raises:
+        FitError: residuals are not finite, or are independent of a parameter.
     """
-    if not np.isfinite(found.columns).all() or not np.isfinite(found.cost):
+    if not np.isfinite(linearization.columns).all() or not np.isfinite(linearization.cost):
         raise FitError("the fit diverged: residuals are not finite")
-    acts = np.flatnonzero(np.abs(found.columns).max(axis=(0, 2), initial=0.0))
-    names = [found.problem.names[found.indices[column]] for column in acts]
+    acts = np.flatnonzero(np.abs(linearization.columns).max(axis=(0, 2), initial=0.0))
+    names = [linearization.problem.names[linearization.indices[column]] for column in acts]
     idle = [name for name in free if name not in names]
     if idle and not may_be_idle:
         raise FitError(
             f"{', '.join(idle)}: nothing that the log measured depends on it; expected it fixed"
         )
-    return found.problem.indices_of(names)
+    return linearization.problem.indices_of(names)
 
 
 def _polished(
     problem: Problem, vector: np.ndarray, indices: list[int], steps: int
 ) -> Linearization:
-    """Take up to ``steps`` full steps, so that the cost's slope, not only its change, is rounding.
+    """Take up to ``steps`` full Gauss-Newton steps, so that the slope of the cost is rounding.
 
-    The cost is flat at its least, so that a search which compares costs ends where the order of
-    summation decides: another number of threads, another model.
+    The cost is flat at its minimum. A search that compares costs therefore ends where the order of
+    summation decides, so that another number of threads gives another model.
     """
-    found = Linearization(problem, problem.slopes(vector, indices))
+    current = Linearization(problem, problem.slopes(vector, indices))
     for _ in range(steps):
-        moved = found.vector.copy()
-        moved[indices] += found.step_inside()
-        moved = problem.clipped(moved)
-        later = Linearization(problem, problem.slopes(moved, indices))
-        if not later.cost <= found.cost * (1.0 + LAST_RISE):
+        trial_vector = current.vector.copy()
+        trial_vector[indices] += current.step_inside()
+        trial_vector = problem.clipped(trial_vector)
+        trial = Linearization(problem, problem.slopes(trial_vector, indices))
+        if not trial.cost <= current.cost * (1.0 + LAST_RISE):
             break
-        found = later
-    return found
+        current = trial
+    return current
 
 
 def estimate(
@@ -300,29 +322,30 @@ def estimate(
     free: tuple[str, ...],
     report: Callable[[int, int], None] = lambda done, rounds: None,
 ) -> Estimate:
-    """Return the least squares estimate of a model's free parameters from the judged rows of a log.
+    """Return the least squares estimate of a model's free parameters from the scored rows of a log.
 
-    Weights and the rows that lost commands spoil follow from the estimate of the round before.
+    The weights, and the rows that lost commands spoil, follow from the estimate of the previous
+    round.
 
     Raises:
-        FitError: a search that diverged, or a parameter on which nothing depends.
+        FitError: the search diverged, or no residual depends on a parameter.
     """
     with threadpool_limits(1, "blas"), jax.enable_x64(True):
         model: Any = jax.tree.map(lambda leaf: np.asarray(leaf, float), start)
         noise = FIRST_NOISE
-        for number, steps in enumerate(LAST_STEPS):
+        for round_index, steps in enumerate(LAST_STEPS):
             problem = replace(Channels.of_log(log, scored_rows, model), noise=noise)
             vector = problem.clipped(problem.start)
-            seen = problem.indices_of([name for name in free if name in problem.names])
-            near = Linearization(problem, problem.slopes(vector, seen))
-            indices = _acting(near, free, may_be_idle=number == 0)
-            vector, _ = refine(problem, vector, indices, near)
-            found = _polished(problem, vector, indices, steps)
-            noise = problem.spread(found.vector)
+            free_indices = problem.indices_of([name for name in free if name in problem.names])
+            initial = Linearization(problem, problem.slopes(vector, free_indices))
+            indices = _acting(initial, free, may_be_idle=round_index == 0)
+            vector, _ = refine(problem, vector, indices, initial)
+            polished = _polished(problem, vector, indices, steps)
+            noise = problem.spread(polished.vector)
             names = tuple(problem.names[index] for index in indices)
             model = parameters.with_values(
-                model, dict(zip(names, found.vector[indices], strict=True))
+                model, dict(zip(names, polished.vector[indices], strict=True))
             )
-            report(number + 1, len(LAST_STEPS))
+            report(round_index + 1, len(LAST_STEPS))
     count = int(problem.counts.sum())
-    return Estimate(model, names, _covariance(found), problem.by_channel(noise), count)
+    return Estimate(model, names, _covariance(polished), problem.by_channel(noise), count)

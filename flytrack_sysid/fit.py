@@ -40,12 +40,12 @@ from flytrack_sysid.plausibility import check_plausible
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
 TWO_SIDED_95 = 1.959964  # standard deviations of a normal distribution
-# What makes a warning: half the width of the 95 % interval, relative to a time constant, to full
-# thrust.
+# Half-widths of 95 % intervals above which there is a warning: relative to a time constant, and to
+# full thrust.
 UNCERTAIN_TAU, UNCERTAIN_THRUST = 0.2, 0.02
 BOX_ACTIONS, BOX_VOLTAGES = 41, 9
 NEVER_MOVED = 1e-3  # of a stick's travel from -1 to 1
-# correlation of a rate with its lagged command; chance gives less in a minute of noise
+# correlation of a rate with its lagged command; a minute of noise gives less
 MIN_RESPONSE = 0.1
 AT_BOUND = 1.01
 AT_END = 1e-3  # of the range of an effect's parameter
@@ -60,9 +60,13 @@ class Interval(NamedTuple):
 
 
 class MapUncertainty(NamedTuple):
-    """The largest uncertainty of the thrust map.
+    """The largest uncertainty of the thrust map, and where it is.
 
-    half_width_n: half the 95 % interval, N. share: of full thrust.
+    Attributes:
+        half_width_n: half-width of the 95 % interval (N).
+        share: the same relative to full thrust.
+        action: action with this uncertainty.
+        battery_v: voltage with this uncertainty (V).
     """
 
     half_width_n: float
@@ -75,11 +79,15 @@ class MapUncertainty(NamedTuple):
 class Fit:
     """An identified model.
 
-    model: float32, as the environment takes it. estimate: the same in float64, with covariance and
-    residuals of each channel. intervals: by name. map_uncertainty: None where the thrust map was
-    not fitted. warnings: sentences on what the data do not determine. every: which part was held
-    out (``flytrack_sysid.split``), 0 for none. source, sha256: of the log, and the hash of its
-    content.
+    Attributes:
+        model: the model in float32, as the environment takes it.
+        estimate: the same in float64, with covariance and residuals of each channel.
+        intervals: estimates and intervals by name.
+        map_uncertainty: None if the thrust map was not fitted.
+        warnings: sentences on what the data do not determine.
+        every: which part was held out (``flytrack_sysid.split``), 0 for none.
+        source: file of the log.
+        sha256: hash of the log's content.
     """
 
     model: ModelParameters
@@ -92,7 +100,7 @@ class Fit:
     sha256: str
 
     def provenance(self) -> dict[str, Any]:
-        """Return how the parameters came about, as JSON values for the model file."""
+        """Return the origin of the parameters, as JSON values for the model file."""
         names = list(self.intervals)
         deviation = np.sqrt(np.diag(self.estimate.covariance))
         scale = np.outer(deviation, deviation)
@@ -116,7 +124,7 @@ class Fit:
             "thrust_map_worst": None
             if self.map_uncertainty is None
             else self.map_uncertainty._asdict(),
-            "left_rms": {name: left.tolist() for name, left in self.estimate.noise.items()},
+            "left_rms": {name: rms.tolist() for name, rms in self.estimate.noise.items()},
             "warnings": list(self.warnings),
         }
 
@@ -140,7 +148,7 @@ class Fit:
 def _free_names(
     model: ModelParameters, log: FlightLog, fixed: Mapping[str, float]
 ) -> tuple[str, ...]:
-    """Return what the log's channels can estimate of lags, thrust map, drain and effects."""
+    """Return the names of lags, thrust map, drain and effects that the log's channels determine."""
     names = names_of(model)
     unknown = [name for name in fixed if name not in names]
     if unknown:
@@ -152,32 +160,32 @@ def _free_names(
     of_effects = [
         name for name in names if "." in name and not BY_NAME[name.split(".")[0]].search.is_setting
     ]
-    wanted = [*base_of(model), *of_effects]
+    candidates = [*base_of(model), *of_effects]
     if "v_bat" not in log:
-        wanted = [name for name in wanted if name not in (*THRUST_COEFFS[4:], DRAIN)]
-    return tuple(name for name in wanted if name not in fixed)
+        candidates = [name for name in candidates if name not in (*THRUST_COEFFS[4:], DRAIN)]
+    return tuple(name for name in candidates if name not in fixed)
 
 
 def _intervals(result: Estimate) -> dict[str, Interval]:
     values = dict(zip(names_of(result.model), to_vector(result.model), strict=True))
-    found = {}
+    intervals = {}
     for name, deviation in zip(result.free, np.sqrt(np.diag(result.covariance)), strict=True):
         value, half = float(values[name]), float(TWO_SIDED_95 * deviation)
-        if name in TAUS:  # even in the logarithm, so that no time is negative
+        if name in TAUS:  # symmetric in the logarithm, so that no time is negative
             factor = np.exp(min(half / value, np.log(TAU_RANGE.high / TAU_RANGE.low)))
-            found[name] = Interval(value, float(value / factor), float(value * factor))
+            intervals[name] = Interval(value, float(value / factor), float(value * factor))
         else:
-            found[name] = Interval(value, value - half, value + half)
-    return found
+            intervals[name] = Interval(value, value - half, value + half)
+    return intervals
 
 
 def _map_uncertainty(result: Estimate, log: FlightLog) -> MapUncertainty | None:
     """Return the largest uncertainty over all actions and voltages.
 
-    Voltages are the battery's, or the log's where it was flown at others.
+    Voltages are those of the battery, or those of the log if it was flown outside of them.
     """
-    where = [index for index, name in enumerate(result.free) if name in THRUST_COEFFS]
-    if not where:
+    indices = [index for index, name in enumerate(result.free) if name in THRUST_COEFFS]
+    if not indices:
         return None
     low, high = flown_voltages(log)
     if is_within((low, high), result.model.battery):
@@ -190,8 +198,8 @@ def _map_uncertainty(result: Estimate, log: FlightLog) -> MapUncertainty | None:
     terms = np.stack(
         [np.asarray(collective_thrust(action, battery_v, unit)) for unit in units], axis=-1
     )
-    terms = terms[..., [THRUST_COEFFS.index(result.free[index]) for index in where]]
-    covariance = result.covariance[np.ix_(where, where)]
+    terms = terms[..., [THRUST_COEFFS.index(result.free[index]) for index in indices]]
+    covariance = result.covariance[np.ix_(indices, indices)]
     half = TWO_SIDED_95 * np.sqrt(np.einsum("...i,ij,...j->...", terms, covariance, terms))
     full = np.abs(collective_thrust(action, battery_v, coeffs)).max()
     worst = np.unravel_index(np.argmax(half), half.shape)
@@ -202,13 +210,13 @@ def _map_uncertainty(result: Estimate, log: FlightLog) -> MapUncertainty | None:
 def _warnings(
     intervals: Mapping[str, Interval], uncertainty: MapUncertainty | None, log: FlightLog
 ) -> list[str]:
-    """Return what the data do not determine."""
-    found = []
+    """Return sentences on what the data do not determine."""
+    warnings = []
     for name, (value, low, high) in intervals.items():
         if name in TAUS and 0.5 * (high - low) > UNCERTAIN_TAU * value:
-            found.append(f"{name} is not determined by the data: {low:.3g} to {high:.3g} s")
+            warnings.append(f"{name} is not determined by the data: {low:.3g} to {high:.3g} s")
         elif "." in name and low <= (neutral := neutral_value(name)) <= high:
-            found.append(
+            warnings.append(
                 f"{name} cannot be told from {neutral:g}: {low:.3g} to {high:.3g} "
                 f"{range_of(name).unit}"
             )
@@ -218,17 +226,17 @@ def _warnings(
         volts = (
             f" at {log['v_bat'].min():.4g} to {log['v_bat'].max():.4g} V" if "v_bat" in log else ""
         )
-        found.append(
+        warnings.append(
             f"the thrust map is not determined by the data everywhere: +-{half_width_n:.3g} N "
             f"({share:.0%} of full thrust) at action {action:.2g}, {battery_v:.4g} V; the log "
             f"commands {thrust.min():.2g} to {thrust.max():.2g}{volts}"
         )
     if "v_bat" not in log:
-        found.append(
+        warnings.append(
             "v_bat is absent: how thrust depends on the voltage, and the drain, are taken as they "
             "were"
         )
-    return found
+    return warnings
 
 
 def what_is_fitted(
@@ -241,7 +249,7 @@ def what_is_fitted(
 ) -> tuple[ModelParameters, tuple[str, ...], np.ndarray]:
     """Return the model a fit starts from, the names that it estimates and the rows that it uses.
 
-    Arguments and what is raised are those of ``fit``, which calls this before any work.
+    Arguments and exceptions are those of ``fit``, which calls this first.
     """
     check_plausible(log)
     fixed, effects = dict(fixed or {}), tuple(effects)
@@ -275,15 +283,20 @@ def fit(
 
     Mass, gravity and full-stick rates are given.
 
-    start: initial values, also of what is not estimated; nominal if None. fixed: values of
-    parameters that are not estimated, by name (``tau_yaw``, ``c4``, ``linear_drag.d_x``, ...).
-    effects: names of effects whose parameters are estimated too. every: which rows are held out
-    (``flytrack_sysid.split``), 0 for none. report: called with the rounds done and in all. motion:
-    how the log moves within a step; if None, continuously where the log is measured, else as
-    ``start`` does.
+    Args:
+        log: the flight log.
+        start: initial values, also of parameters that are not estimated; nominal if None.
+        fixed: values of parameters that are not estimated, by name (``tau_yaw``, ``c4``,
+            ``linear_drag.d_x``, ...).
+        effects: names of effects whose parameters are estimated too.
+        every: which rows are held out (``flytrack_sysid.split``), 0 for none.
+        report: called with the number of finished rounds and of all rounds.
+        motion: motion of the drone within a step. If None, it is continuous for a measured log, and
+            that of ``start`` otherwise.
 
     Raises:
-        LogError, FitError: an implausible log; missing channels or motion, or a fit that diverged.
+        LogError: the log is implausible.
+        FitError: channels or motion are missing, or the fit diverged.
     """
     model, free, scored_rows = what_is_fitted(log, start, fixed, effects, every, motion)
     notes = motion_notes(log, start, motion, f"replayed as {model.motion.value}")
@@ -315,7 +328,7 @@ def fit(
 
 
 def _check_data(log: FlightLog, scored_rows: np.ndarray, free: tuple[str, ...]) -> None:
-    """Raise FitError where the log lacks channels or motion to estimate the free parameters."""
+    """Raise FitError if the log lacks channels or motion to estimate the free parameters."""
     if not free:
         raise FitError("fixed: found every parameter, expected one to estimate at least")
     has_turns = "w" in log or "q" in log
@@ -339,26 +352,26 @@ def _check_data(log: FlightLog, scored_rows: np.ndarray, free: tuple[str, ...]) 
 
 
 def _check_response(log: FlightLog, start: ModelParameters) -> None:
-    """Raise FitError where no body rate follows its command.
+    """Raise FitError if no body rate follows its command.
 
     Possible reasons: motors that are off, a drone on the ground, rates of another log.
     """
     if "w" not in log:
         return
-    answers = []
-    for axis, keep in enumerate(np.exp(-usual_step(log)[0] / np.asarray(start.tau, float)[:3])):
-        expected = signal.lfilter([1.0 - keep], [1.0, -keep], log["u"][:, axis])
+    correlations = []
+    for axis, decay in enumerate(np.exp(-usual_step(log)[0] / np.asarray(start.tau, float)[:3])):
+        expected = signal.lfilter([1.0 - decay], [1.0, -decay], log["u"][:, axis])
         if np.ptp(expected) > NEVER_MOVED and np.ptp(log["w"][:, axis]) > 0.0:
-            answers.append(abs(np.corrcoef(expected, log["w"][:, axis])[0, 1]))
-    if answers and max(answers) < MIN_RESPONSE:
+            correlations.append(abs(np.corrcoef(expected, log["w"][:, axis])[0, 1]))
+    if correlations and max(correlations) < MIN_RESPONSE:
         raise FitError(
             f"{log.source}: w: found no body rate that follows its command (correlation at most "
-            f"{max(answers):.2g}), expected a drone in flight; is it motionless?"
+            f"{max(correlations):.2g}), expected a drone in flight; is it motionless?"
         )
 
 
 def _likely_cause(log: FlightLog, tau: str) -> str:
-    """Return what may let the fit of a lag end at an end of its range."""
+    """Return questions on possible reasons why the fit of a lag ends at a bound."""
     column = CHANNELS["u"][TAUS.index(tau)]
     if tau != TAUS[3]:
         return f"do sign and order of {column} and of the rates agree, and is full stick right?"
@@ -368,7 +381,7 @@ def _likely_cause(log: FlightLog, tau: str) -> str:
 
 
 def _check_result(result: Estimate, log: FlightLog, scored_rows: np.ndarray) -> None:
-    """Raise FitError where the best model is no model of a drone."""
+    """Raise FitError if the best model is not plausible for a drone."""
     values = dict(zip(names_of(result.model), to_vector(result.model), strict=True))
     for name in TAUS:
         if (
@@ -390,13 +403,13 @@ def _check_result(result: Estimate, log: FlightLog, scored_rows: np.ndarray) -> 
             )
     if "w" in result.noise:
         for axis, column in enumerate(CHANNELS["w"]):
-            left, measured = (
+            rms, measured = (
                 result.noise["w"][axis],
                 np.sqrt(np.mean(np.square(log["w"][scored_rows, axis]))),
             )
-            if TAUS[axis] in result.free and left > AT_BOUND * measured:
+            if TAUS[axis] in result.free and rms > AT_BOUND * measured:
                 raise FitError(
-                    f"{log.source}: {column}: the model leaves more ({left:.3g} rad/s rms) than "
+                    f"{log.source}: {column}: the model leaves more ({rms:.3g} rad/s rms) than "
                     f"was measured ({measured:.3g}); do sign and order of {CHANNELS['u'][axis]} "
                     f"and {column} agree?"
                 )

@@ -24,16 +24,25 @@ class Bullets(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What matters at a glance; tone: its colour, "good", "found" or "open"."""
+    """The main result of a page.
+
+    Attributes:
+        text: the result in a sentence or two.
+        tone: "good", "found" or "open", which determines its colour.
+    """
 
     text: str
     tone: str
 
 
 class Table(NamedTuple):
-    """A table; every row has as many cells as the header, the first names the row.
+    """A table.
 
-    is_text: cells hold text rather than numbers, which may wrap and have several lines.
+    Attributes:
+        header: a cell per column.
+        rows: cells, as many as the header has; the first is the name of the row.
+        caption: text above the table.
+        is_text: whether cells are text, which may wrap and have several lines, and not numbers.
     """
 
     header: Sequence[str]
@@ -53,7 +62,7 @@ Part = Text | Verdict | Bullets | Table | Picture
 
 
 class Section(NamedTuple):
-    """A heading and what stands under it."""
+    """A heading and the parts under it."""
 
     heading: str
     parts: Sequence[Part]

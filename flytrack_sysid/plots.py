@@ -28,14 +28,14 @@ def _figure(title: str, rows: int, height_in: float) -> tuple[Figure, np.ndarray
 
 
 def _empty(title: str, why: str) -> Figure:
-    """Return a low figure that says why there is nothing to show."""
+    """Return a low figure with the reason why there is nothing to show."""
     figure, panels = _figure(title, 1, EMPTY_HEIGHT_IN)
     say(panels[0, 0], why)
     return figure
 
 
 def say(axes: Axes, why: str) -> None:
-    """Say in a panel why it shows nothing."""
+    """Write the reason why a panel shows nothing into it."""
     axes.set_axis_off()
     axes.text(
         0.5, 0.5, why, ha="center", va="center", color=GREY, transform=axes.transAxes, wrap=True
@@ -55,11 +55,11 @@ def draw_steps(steps: Sequence[StepResponse]) -> Figure:
         return _empty(title, "no clear commanded step of roll, pitch or yaw is judged")
     figure, panels = _figure(title, len(AXES), 8.0)
     for panel, axis in zip(panels[:, 0], AXES, strict=True):
-        own = [step for step in steps if step.axis == axis]
-        if not own:
+        axis_steps = [step for step in steps if step.axis == axis]
+        if not axis_steps:
             say(panel, f"{axis}: no clear commanded step")
             continue
-        for colour, step in zip((BLUE, ORANGE, GREEN), own, strict=False):
+        for colour, step in zip((BLUE, ORANGE, GREEN), axis_steps, strict=False):
             change = f"{step.command_before:+.2f} to {step.command_after:+.2f}"
             label = f"stick {change} at {step.time_s:.2f} s"
             milliseconds = 1e3 * step.since_step

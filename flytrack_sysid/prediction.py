@@ -1,4 +1,4 @@
-"""A model's predictions of a log, in float64: steps from every row, and free flights from some."""
+"""A model's predictions of a log, in float64: steps from every row, and free flights."""
 
 import operator
 from typing import Any, NamedTuple
@@ -15,22 +15,29 @@ from flytrack_sysid.log_voltage import with_voltage
 from flytrack_sysid.record import Filled, Record, is_applied_certain, record_of
 from flytrack_sysid.replay import Step, replay, start_replay
 
-# For effects that remember: what they remembered when a segment began is not known.
+# For effects with memory, whose memory at the start of a segment is not known.
 SETTLING_S = 0.5
-# Free flights at once: bounds the memory that they need, and compiles one size.
+# Number of free flights that are computed at once: bounds their memory, and compiles one size.
 BATCH = 128
-MAX_S = 2.0  # of free flight: shorter ones share its program
+MAX_S = 2.0  # of free flight: shorter ones share the compiled program
 FLOWN = ("p", "v", "q", "w")  # channels of a free flight
 
 
 class Prediction(NamedTuple):
     """A model's step from every row of a log; leaves of the drones are (num_rows,) float64.
 
-    log: without gaps. before: the measured state; zeros (upright, ``assumed_voltage``) where the
-    log has no such channel. memories: what the model's effects remember before the step. after: the
-    state at the next row. force_b: (num_rows, 3) m/s^2, specific force of the step. record: of the
-    rows. step_s: the usual one. is_settled: (num_rows,) bool, applied action and memories no longer
-    depend on how they began.
+    Attributes:
+        model: the model that predicts.
+        log: the log without gaps.
+        before: the measured state. Channels that the log lacks are zero, the attitude is upright,
+            and the voltage is ``assumed_voltage``.
+        memories: memories of the model's effects before the step.
+        after: the state at the next row.
+        force_b: specific force of the step (m/s^2), (num_rows, 3).
+        record: inputs and measurements of the rows.
+        step_s: median time between rows (s).
+        is_settled: whether applied action and memories no longer depend on their initial values,
+            (num_rows,) bool.
     """
 
     model: ModelParameters
@@ -45,19 +52,21 @@ class Prediction(NamedTuple):
 
     @property
     def is_measured(self) -> np.ndarray:
-        """Which rows were logged, (num_rows,) bool; others fill a gap."""
+        """Whether a row was logged, (num_rows,) bool; other rows fill a gap."""
         return self.record.source_row >= 0
 
     @property
     def lacking(self) -> dict[str, tuple[str, ...]]:
-        """What ``inputs_that_lack`` says of model and log."""
+        """The result of ``inputs_that_lack`` for this model and log."""
         return inputs_that_lack(self.model, self.log)
 
 
 def runs_of(rows: np.ndarray, record: Record) -> list[tuple[int, int]]:
-    """Return the runs of judged rows within a flight, as first row and end.
+    """Return the runs of scored rows within a flight, as first row and end.
 
-    rows: (num_rows,) bool, those that are judged.
+    Args:
+        rows: rows that are scored, (num_rows,) bool.
+        record: the record of the rows.
     """
     follows = np.append(False, rows[1:] & rows[:-1] & ~record.begins[1:])[: len(rows)]
     starts = np.flatnonzero(rows & ~follows)
@@ -66,7 +75,12 @@ def runs_of(rows: np.ndarray, record: Record) -> list[tuple[int, int]]:
 
 
 def scored_steps(rows: np.ndarray, prediction: Prediction) -> np.ndarray:
-    """Return the rows whose step to the next is judged, ascending; rows: (num_rows,) bool."""
+    """Return the rows whose step to the next row is scored, ascending.
+
+    Args:
+        rows: rows that are scored, (num_rows,) bool.
+        prediction: steps from every row.
+    """
     exists = rows & prediction.is_measured
     is_followed = np.append(exists[1:] & ~prediction.record.begins[1:], False)[: len(rows)]
     return np.flatnonzero(exists & is_followed & prediction.is_settled)
@@ -75,7 +89,7 @@ def scored_steps(rows: np.ndarray, prediction: Prediction) -> np.ndarray:
 def inputs_that_lack(model: ModelParameters, log: FlightLog) -> dict[str, tuple[str, ...]]:
     """Return, for each channel that a model predicts, the channels it needs but the log lacks.
 
-    One without forces beside thrust needs no velocity to predict the specific force.
+    A model without forces beside thrust needs no velocity to predict the specific force.
     """
     force = ["v", "q"] if acts(model.effects, "force") else []
     needs = {
@@ -106,7 +120,7 @@ def in_float64(model: ModelParameters) -> ModelParameters:
 def _step_from_every_row(
     record: Record, gyro_b: np.ndarray, model: ModelParameters
 ) -> tuple[Drone, tuple[Any, ...], Drone, Vec3]:
-    """Return all rows' steps: drones and memories before, drones after, specific forces."""
+    """Return the steps of all rows: drones and memories before, drones after, specific forces."""
 
     def observe(step: Step, _: None) -> tuple[Any, ...]:
         return step.before, step.memories, step.after, step.moved.context.force_b
@@ -118,20 +132,20 @@ def _step_from_every_row(
 def predict(model: ModelParameters, filled: Filled) -> Prediction:
     """Return a model's step from every row of a log, from the measured state and logged command.
 
-    The applied action is the log's; without it, it follows the commands from the segment's start
-    on.
+    The applied action is that of the log. If the log has none, it follows the commands from the
+    start of the segment on.
     """
     filled = filled._replace(log=with_voltage(filled.log, model))
     log = filled.log
     record = record_of(filled)._replace(is_applied_known=np.full(len(log), "uprev" in log))
     gyro_b = log["w"] if "w" in log else np.zeros((len(log), 3))
     with jax.enable_x64(True):
-        found = _step_from_every_row(record, gyro_b, in_float64(model))
-        before, memories, after, force_b = jax.tree.map(np.asarray, found)
+        steps = _step_from_every_row(record, gyro_b, in_float64(model))
+        before, memories, after, force_b = jax.tree.map(np.asarray, steps)
     is_settled = np.all(is_applied_certain(record, np.asarray(model.tau, float)), axis=1)
     if jax.tree.leaves(memories):
-        since_start = log.time - log.time[record.begins][np.cumsum(record.begins) - 1]
-        is_settled = is_settled & (since_start >= SETTLING_S)
+        time_in_segment = log.time - log.time[record.begins][np.cumsum(record.begins) - 1]
+        is_settled = is_settled & (time_in_segment >= SETTLING_S)
     step_s = float(np.median(usual_step(log)))
     return Prediction(
         model, log, before, memories, after, columns(force_b), record, step_s, is_settled
@@ -145,40 +159,49 @@ def _fly(
     durations: jax.Array,
     model: ModelParameters,
 ) -> dict[str, Any]:
-    """Return free flights: p, v, q, w after every step; leaves (num_steps, BATCH)."""
+    """Return free flights: p, v, q, w after every step; leaves are (num_steps, BATCH)."""
 
-    def one(carry: Any, row: tuple[Any, ...]) -> Any:
+    def step(carry: Any, row: tuple[Any, ...]) -> Any:
         (drone, memories), (command, duration) = carry, row
         step_all = jax.vmap(advance, in_axes=(0, 0, 0, 0, None))
         drone, memories = step_all(drone, memories, command, duration, model)
-        seen = {"p": drone.pos_w, "v": drone.vel_w, "q": drone.quat, "w": drone.rates_b}
-        return (drone, memories), seen
+        state = {"p": drone.pos_w, "v": drone.vel_w, "q": drone.quat, "w": drone.rates_b}
+        return (drone, memories), state
 
-    return jax.lax.scan(one, starts, (commands, durations))[1]
+    return jax.lax.scan(step, starts, (commands, durations))[1]
 
 
 def free_flights(
-    prediction: Prediction, starts: np.ndarray, seen: np.ndarray
+    prediction: Prediction, starts: np.ndarray, end_rows: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return free flights from measured rows under the logged commands: p, v, q, w.
 
-    starts: (num_starts,) rows. seen: (num_starts, num_seen) later rows, at which it returns them,
-    (num_starts, num_seen, size), units of the log; beyond the log's end the last command is held.
+    Beyond the end of the log the last command is held.
+
+    Args:
+        prediction: steps from every row.
+        starts: rows to start from, (num_starts,).
+        end_rows: later rows at which states are returned, (num_starts, num_ends).
+
+    Returns:
+        States by channel, (num_starts, num_ends, size), in the units of the log.
     """
-    after = seen - starts[:, None] - 1
+    after = end_rows - starts[:, None] - 1
     num_steps = max(int(np.ceil(MAX_S / prediction.step_s)), 1 + after.max(initial=0))
-    found = {name: np.empty((*seen.shape, len(CHANNELS[name]))) for name in FLOWN}
+    result = {name: np.empty((*end_rows.shape, len(CHANNELS[name]))) for name in FLOWN}
     for begin in range(0, len(starts), BATCH):
-        filled = np.resize(starts[begin : begin + BATCH], BATCH)
-        rows = np.minimum(filled + np.arange(num_steps)[:, None], len(prediction.log) - 1)
+        padded = np.resize(starts[begin : begin + BATCH], BATCH)
+        rows = np.minimum(padded + np.arange(num_steps)[:, None], len(prediction.log) - 1)
         with jax.enable_x64(True):
-            memories = (prediction.before, prediction.memories)
-            first = jax.tree.map(operator.itemgetter(filled), memories)
+            states = (prediction.before, prediction.memories)
+            first = jax.tree.map(operator.itemgetter(padded), states)
             commands = Action(*(column[rows] for column in prediction.log["u"].T))
-            flown = _fly(
+            flights = _fly(
                 first, commands, prediction.record.step_s[rows], in_float64(prediction.model)
             )
-        at = after[begin : begin + BATCH]
-        for name, leaves in flown.items():
-            found[name][begin : begin + BATCH] = columns(leaves)[at, np.arange(len(at))[:, None]]
-    return found
+        steps = after[begin : begin + BATCH]
+        for name, leaves in flights.items():
+            result[name][begin : begin + BATCH] = columns(leaves)[
+                steps, np.arange(len(steps))[:, None]
+            ]
+    return result

@@ -38,20 +38,23 @@ QUANTITIES = {
     "rates": ("w", "rad/s"),
 }
 HIGH_PERCENTILE = 95.0
-# Of thrust.
+# Thrust error.
 NUM_ACTION_BINS = 10
 NUM_VOLTAGE_BINS = 4
-# V; a pack that never changes its voltage still gets a bin.
+# V; a battery whose voltage never changes still gets a bin.
 MIN_VOLTAGE_RANGE = 0.1
 
 
 class ChannelError(NamedTuple):
     """One-step errors of a channel, measured minus modelled.
 
-    Those of q are with the sign that is nearer to the measured one.
+    Errors of q are those of the quaternion with the sign nearer to the measured one.
 
-    mse: mean over steps and components. nrmse: None where the measured channel never changes.
-    angle_rms_deg: rms of the angle between measured and modelled attitude, deg; None but for q.
+    Attributes:
+        mse: mean over steps and components.
+        mse_by_axis: mean over steps, by component.
+        nrmse: normalised RMS error; None if the measured channel never changes.
+        angle_rms_deg: RMS angle between measured and modelled attitude (deg); None except for q.
     """
 
     mse: float
@@ -60,7 +63,7 @@ class ChannelError(NamedTuple):
     angle_rms_deg: float | None
 
     def as_json(self, name: str) -> dict[str, Any]:
-        """Return the numbers, not the single errors, as JSON values."""
+        """Return the numbers as JSON values."""
         axes = [column.split("_", 1)[1] for column in CHANNELS[name]]
         angle = {} if self.angle_rms_deg is None else {"angle_rms_deg": self.angle_rms_deg}
         return {
@@ -74,7 +77,7 @@ class ChannelError(NamedTuple):
 
 
 class OneStep(NamedTuple):
-    """One-step errors of all channels that the log has and the model can be judged on."""
+    """One-step errors of all channels that the log has and the model can predict."""
 
     num_steps: int
     channels: dict[str, ChannelError]
@@ -86,27 +89,45 @@ class OneStep(NamedTuple):
 
 
 def predicted_channel(name: str, prediction: Prediction) -> np.ndarray:
-    """Return what the model predicts of a channel after every row's step, (num_rows, size)."""
+    """Return the model's prediction of a channel after the step of every row, (num_rows, size)."""
     after = prediction.after
     if name == "f":
         return prediction.force_b
-    of = {"p": after.pos_w, "v": after.vel_w, "q": after.quat, "w": after.rates_b, "a": after.acc_w}
-    return columns(of[name])
+    by_channel = {
+        "p": after.pos_w,
+        "v": after.vel_w,
+        "q": after.quat,
+        "w": after.rates_b,
+        "a": after.acc_w,
+    }
+    return columns(by_channel[name])
 
 
-def turn_between(quats: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors, (num, 3) rad, that turn attitudes (num, 4) into others.
+def turn_between(quats: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Return the rotation vectors that turn attitudes into other attitudes.
 
-    They are in the body frame.
+    Args:
+        quats: attitudes, (num, 4).
+        targets: the other attitudes, (num, 4).
+
+    Returns:
+        Rotation vectors in the body frame (rad), (num, 3).
     """
-    first, second = (Rotation.from_quat(values, scalar_first=True) for values in (quats, others))
+    first, second = (Rotation.from_quat(values, scalar_first=True) for values in (quats, targets))
     return (first.inv() * second).as_rotvec()
 
 
 def error_of(
     name: str, before: np.ndarray, measured: np.ndarray, predicted: np.ndarray
 ) -> ChannelError:
-    """Return a channel's errors; all (num_steps, size)."""
+    """Return the one-step errors of a channel.
+
+    Args:
+        name: name of the channel.
+        before: measured values before the step, (num_steps, size).
+        measured: measured values after the step, (num_steps, size).
+        predicted: predicted values after the step, (num_steps, size).
+    """
     angle_rms_deg = None
     if name == "q":
 
@@ -125,24 +146,31 @@ def error_of(
 
 
 def one_step_errors(prediction: Prediction, rows: np.ndarray) -> OneStep:
-    """Return the errors from each judged row to the next; rows: (num_rows,) bool, those judged.
+    """Return the errors of the steps from each scored row to the next.
 
-    Of acceleration and specific force, the first that the log has.
+    Channels include only one of acceleration and specific force, the first that the log has.
+
+    Args:
+        prediction: steps from every row.
+        rows: rows that are scored, (num_rows,) bool.
     """
     log, lacking = prediction.log, prediction.lacking
     force = next((name for name in ("a", "f") if name in log and not lacking[name]), None)
     names = [name for name in ("p", "v", "q", "w") if name in log and not lacking[name]]
     names += [force] if force else []
-    here = scored_steps(rows, prediction)
-    if not len(here):
+    starts = scored_steps(rows, prediction)
+    if not len(starts):
         return OneStep(0, {})
     channels = {
         name: error_of(
-            name, log[name][here], log[name][here + 1], predicted_channel(name, prediction)[here]
+            name,
+            log[name][starts],
+            log[name][starts + 1],
+            predicted_channel(name, prediction)[starts],
         )
         for name in names
     }
-    return OneStep(len(here), channels)
+    return OneStep(len(starts), channels)
 
 
 class Spread(NamedTuple):
@@ -154,7 +182,7 @@ class Spread(NamedTuple):
 
 
 class Rollout(NamedTuple):
-    """Errors at one horizon; ``errors`` is empty where there is no start."""
+    """Errors at one horizon; ``errors`` is empty if there is no start."""
 
     horizon_s: float
     num_starts: int
@@ -170,11 +198,11 @@ class Rollout(NamedTuple):
 
 
 def _starts_and_ends(prediction: Prediction, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows to start from, and those at the horizons.
+    """Return the rows to start from, and the rows at the horizons.
 
-    Shapes are (num_starts,) and (num_starts, num_horizons).
-
-    An end is the row nearest to its horizon; -1 where the judged run ends before.
+    Returns:
+        Starts, (num_starts,), and ends, (num_starts, num_horizons). An end is the row nearest to
+        its horizon; -1 if the run of scored rows ends before it.
     """
     starts, ends = [], []
     half_step = 0.5 * prediction.step_s
@@ -182,8 +210,8 @@ def _starts_and_ends(prediction: Prediction, rows: np.ndarray) -> tuple[np.ndarr
         time, is_settled = prediction.log.time[first:end], prediction.is_settled[first:end]
         if not is_settled.any():
             continue
-        wanted = np.arange(time[np.argmax(is_settled)], time[-1], START_EVERY_S)
-        begin = np.searchsorted(time, wanted - half_step)
+        start_times = np.arange(time[np.argmax(is_settled)], time[-1], START_EVERY_S)
+        begin = np.searchsorted(time, start_times - half_step)
         begin = begin[prediction.is_measured[first + begin]]
         reached = np.searchsorted(time, time[begin, None] + np.array(HORIZONS_S) - half_step)
         last = np.minimum(first + reached, len(rows) - 1)
@@ -200,41 +228,53 @@ def _spread(distances: np.ndarray) -> Spread:
 
 
 def rollout_errors(prediction: Prediction, rows: np.ndarray) -> tuple[Rollout, ...]:
-    """Return the errors of free flights from measured states, a start every 0.25 s of judged runs.
+    """Return the errors of free flights from measured states, a start every 0.25 s of scored runs.
 
-    rows: (num_rows,) bool, those judged; a flight stays in them, and begins and ends where it was
-    measured.
+    Args:
+        prediction: steps from every row.
+        rows: rows that are scored, (num_rows,) bool. A flight stays within them, and begins and
+            ends in measured rows.
     """
     log, lacking = prediction.log, prediction.lacking
-    judged = [
+    names = [
         name for name, (channel, _) in QUANTITIES.items() if channel in log and not lacking[channel]
     ]
     starts, ends = _starts_and_ends(prediction, rows)
     starts, ends = starts[(ends >= 0).any(axis=1)], ends[(ends >= 0).any(axis=1)]
     is_reached = ends >= 0
-    flown = free_flights(prediction, starts, np.where(is_reached, ends, starts[:, None] + 1))
+    flights = free_flights(prediction, starts, np.where(is_reached, ends, starts[:, None] + 1))
     rollouts = []
     for index, horizon_s in enumerate(HORIZONS_S):
         reaches = is_reached[:, index]
         errors = {}
-        for name in judged if reaches.any() else ():
+        for name in names if reaches.any() else ():
             channel = QUANTITIES[name][0]
-            with np.errstate(over="ignore", invalid="ignore"):  # a model may run away
+            with np.errstate(over="ignore", invalid="ignore"):  # a model may diverge
                 measured, at_end = (
                     log[channel][ends[reaches, index]],
-                    flown[channel][reaches, index],
+                    flights[channel][reaches, index],
                 )
-                apart = turn_between(measured, at_end) if channel == "q" else measured - at_end
-                distances = np.linalg.norm(apart, axis=1)
+                difference = turn_between(measured, at_end) if channel == "q" else measured - at_end
+                distances = np.linalg.norm(difference, axis=1)
                 errors[name] = _spread(np.rad2deg(distances) if channel == "q" else distances)
         rollouts.append(Rollout(horizon_s, int(reaches.sum()), errors))
     return tuple(rollouts)
 
 
 class ThrustError(NamedTuple):
-    """Measured minus modelled thrust, N.
+    """Measured minus modelled thrust (N).
 
-    Maps are (voltage bins, action bins), NaN where nothing flew.
+    Maps are (voltage bins, action bins), NaN in bins without a step.
+
+    Attributes:
+        source: channel that measures the thrust.
+        action_edges: edges of the action bins.
+        voltage_edges: edges of the voltage bins (V).
+        count: map of the number of steps.
+        mean_n: map of the mean error.
+        rms_n: map of the RMS error.
+        total_mean_n: mean error of all steps.
+        total_rms_n: RMS error of all steps.
     """
 
     source: str
@@ -248,7 +288,7 @@ class ThrustError(NamedTuple):
 
 
 def _voltage_range(battery_v: np.ndarray, battery: Battery) -> tuple[float, float]:
-    """Return the battery's range of voltage, or the log's where it exceeds that."""
+    """Return the voltage range of the battery, or that of the log if it exceeds the battery's."""
     low, high = float(battery_v.min()), float(battery_v.max())
     empty_v, full_v = float(battery.empty_v), float(battery.full_v)
     if low >= empty_v and high <= full_v:
@@ -257,31 +297,34 @@ def _voltage_range(battery_v: np.ndarray, battery: Battery) -> tuple[float, floa
 
 
 def thrust_error(prediction: Prediction, rows: np.ndarray) -> ThrustError | None:
-    """Return the thrust error of judged steps by applied action and voltage; None without any.
+    """Return the thrust error of scored steps by applied action and voltage; None without steps.
 
-    Thrust is measured by f, else by a.
+    Thrust is measured by f, else by a. Samples beyond the last edge are in the last bin, and
+    samples below the first edge in the first bin.
 
-    rows: (num_rows,) bool, those judged. Samples beyond an end are in its bin.
+    Args:
+        prediction: steps from every row.
+        rows: rows that are scored, (num_rows,) bool.
     """
-    log, model, here = prediction.log, prediction.model, scored_steps(rows, prediction)
+    log, model, step_rows = prediction.log, prediction.model, scored_steps(rows, prediction)
     source = next(
         (name for name in ("f", "a") if name in log and not prediction.lacking[name]), None
     )
-    if source is None or not len(here):
+    if source is None or not len(step_rows):
         return None
     measured_b = log["f"] if source == "f" else specific_force_b(log, float(model.g))
-    error_n = float(model.m) * (measured_b[here + 1, 2] - prediction.force_b[here, 2])
-    battery_v = np.asarray(prediction.before.battery_v)[here]
+    error_n = float(model.m) * (measured_b[step_rows + 1, 2] - prediction.force_b[step_rows, 2])
+    battery_v = np.asarray(prediction.before.battery_v)[step_rows]
     low, high = _voltage_range(battery_v, model.battery)
     edges = (
         np.linspace(low, high, NUM_VOLTAGE_BINS + 1),
         np.linspace(-1.0, 1.0, NUM_ACTION_BINS + 1),
     )
-    action = np.asarray(prediction.after.applied.thrust)[here]
-    place = np.clip(battery_v, low, high), np.clip(action, -1.0, 1.0)
-    count = binned_statistic_2d(*place, None, "count", edges).statistic
+    action = np.asarray(prediction.after.applied.thrust)[step_rows]
+    coordinates = np.clip(battery_v, low, high), np.clip(action, -1.0, 1.0)
+    count = binned_statistic_2d(*coordinates, None, "count", edges).statistic
     mean_n, mean_square = binned_statistic_2d(
-        *place, [error_n, error_n**2], "mean", edges
+        *coordinates, [error_n, error_n**2], "mean", edges
     ).statistic
     return ThrustError(
         source=source,

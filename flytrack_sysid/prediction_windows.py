@@ -1,8 +1,9 @@
 """Multi-step prediction: free flight from measured states, many windows at once, differentiable.
 
-A window begins with a lead-in, in which the measured states are fed in, body rates too where there
-is a gyro (as it read them, by the model's latency, later), and the commands settle the applied
-action and the memories of effects. Then the model flies by itself under the logged commands.
+A window begins with a lead-in. In the lead-in, the state of each row is the measured one, and the
+commands settle the applied action and the memories of effects. If there is a gyro, the body rates
+are those that it read, later by the model's latency. After the lead-in, the model predicts the
+state under the logged commands alone.
 """
 
 from typing import Any, NamedTuple
@@ -26,7 +27,7 @@ HORIZONS_S = (0.1, 0.25, 0.5, 1.0, 2.0)
 CHANNEL_OF = {"attitude": "q", "rates": "w", "velocity": "v", "position": "p"}
 QUANTITIES = tuple(CHANNEL_OF)
 UNITS = {"attitude": "rad", "rates": "rad/s", "velocity": "m/s", "position": "m"}
-# Windows come in multiples of so many: logs of one rate share one compiled program.
+# Windows are computed in batches of this size, so that logs of one rate share a compiled program.
 WINDOWS_PER_BATCH = 128
 BLOCK_S = 2.0
 
@@ -34,11 +35,16 @@ BLOCK_S = 2.0
 class Windows(NamedTuple):
     """Windows of a log.
 
-    record: (rows, windows, ...), as in ``flytrack_sysid.record``; the lead-in first. is_free:
-    (rows,) bool, the state of this row is the model's. ends: (horizons,) int, rows at the horizons.
-    gyro_b: (rows, windows, 3) rad/s, zeros without a gyro. has_gyro: bool. counts: (horizons,
-    windows, quantities) bool, what is judged. block: (windows,) int, number of the stretch of 2 s
-    that the window starts in. start: (windows,) int, row of the log.
+    Attributes:
+        record: inputs and measurements as in ``flytrack_sysid.record``, the lead-in first,
+            (rows, windows, ...).
+        is_free: whether the state of a row is predicted, (rows,) bool.
+        ends: rows at the horizons, (horizons,) int.
+        gyro_b: body rates (rad/s), (rows, windows, 3); zeros without a gyro.
+        has_gyro: whether the log has a gyro, () bool.
+        counts: which errors are scored, (horizons, windows, quantities) bool.
+        block: index of the block of 2 s in which a window starts, (windows,) int.
+        start: row of the log at which a window starts, (windows,) int.
     """
 
     record: Record
@@ -52,7 +58,7 @@ class Windows(NamedTuple):
 
     @property
     def first_free(self) -> int:
-        """The first row whose state is the model's."""
+        """The first row whose state is predicted."""
         return int(np.argmax(self.is_free))
 
     def sums_by_block(self, values: np.ndarray) -> np.ndarray:
@@ -64,26 +70,36 @@ class Windows(NamedTuple):
 
 
 def batches_of(windows: Windows) -> list[Windows]:
-    """Return the windows in parts of CHUNK, the last filled up with the first one."""
-    number = len(windows.start)
-    index = np.resize(np.arange(number), (-(-number // WINDOWS_PER_BATCH), WINDOWS_PER_BATCH))
-    index[-1, number - WINDOWS_PER_BATCH * (len(index) - 1) :] = 0
+    """Split windows into batches of WINDOWS_PER_BATCH; the first window pads the last batch."""
+    num_windows = len(windows.start)
+    indices_by_batch = np.resize(
+        np.arange(num_windows), (-(-num_windows // WINDOWS_PER_BATCH), WINDOWS_PER_BATCH)
+    )
+    indices_by_batch[-1, num_windows - WINDOWS_PER_BATCH * (len(indices_by_batch) - 1) :] = 0
     return [
         windows._replace(
-            record=Record(*(leaf[:, part] for leaf in windows.record)),
-            gyro_b=windows.gyro_b[:, part],
-            counts=windows.counts[:, part],
-            block=windows.block[part],
-            start=windows.start[part],
+            record=Record(*(leaf[:, indices] for leaf in windows.record)),
+            gyro_b=windows.gyro_b[:, indices],
+            counts=windows.counts[:, indices],
+            block=windows.block[indices],
+            start=windows.start[indices],
         )
-        for part in index
+        for indices in indices_by_batch
     ]
 
 
-def make_windows(log: FlightLog, scored_rows: np.ndarray, every_s: float, most: int) -> Windows:
-    """Return at most ``most`` windows over judged rows, (num_rows,) bool, one every ``every_s``.
+def make_windows(
+    log: FlightLog, scored_rows: np.ndarray, every_s: float, max_windows: int
+) -> Windows:
+    """Return windows over the scored rows of a log.
 
-    A window counts at the horizons that it reaches within rows that are judged and measured.
+    A window counts at the horizons that it reaches within rows that are scored and measured.
+
+    Args:
+        log: the flight log.
+        scored_rows: (num_rows,) bool.
+        every_s: time between the starts of windows (s).
+        max_windows: largest number of windows; if there are more, they are thinned evenly.
     """
     filled = fill_gaps(log)
     step_s = float(np.median(usual_step(filled.log)))
@@ -97,18 +113,18 @@ def make_windows(log: FlightLog, scored_rows: np.ndarray, every_s: float, most: 
     can_start = is_scored & (rows - first >= lead)
     starts = rows[can_start & ((rows - first - lead) % max(round(every_s / step_s), 1) == 0)]
     last = np.minimum(starts + ends[:, None], len(rows) - 1)
-    reached = (starts + ends[:, None] < len(rows)) & (run[last] == run[starts]) & is_scored[last]
-    starts, reached = starts[reached.any(axis=0)], reached[:, reached.any(axis=0)]
-    most = (
+    is_reached = (starts + ends[:, None] < len(rows)) & (run[last] == run[starts]) & is_scored[last]
+    starts, is_reached = starts[is_reached.any(axis=0)], is_reached[:, is_reached.any(axis=0)]
+    max_windows = (
         len(starts) // WINDOWS_PER_BATCH * WINDOWS_PER_BATCH
-        if WINDOWS_PER_BATCH < len(starts) < most
-        else most
+        if WINDOWS_PER_BATCH < len(starts) < max_windows
+        else max_windows
     )
-    if len(starts) > most:
-        kept = np.linspace(0, len(starts) - 1, most).round().astype(int)
-        starts, reached = starts[kept], reached[:, kept]
+    if len(starts) > max_windows:
+        kept = np.linspace(0, len(starts) - 1, max_windows).round().astype(int)
+        starts, is_reached = starts[kept], is_reached[:, kept]
     index = np.minimum(starts + np.arange(-lead, ends[-1] + 1)[:, None], len(rows) - 1)
-    has = np.array([name in log for name in CHANNEL_OF.values()])
+    has_channel = np.array([name in log for name in CHANNEL_OF.values()])
     gyro = filled.log["w"] if "w" in log else np.zeros((len(rows), 3))
     record = record_of(filled)
     return Windows(
@@ -117,14 +133,14 @@ def make_windows(log: FlightLog, scored_rows: np.ndarray, every_s: float, most: 
         ends=lead + ends,
         gyro_b=gyro[index],
         has_gyro=np.array("w" in log),
-        counts=reached[..., None] & has,
+        counts=is_reached[..., None] & has_channel,
         block=run[starts] * len(rows) + ((starts - first[starts]) * step_s / BLOCK_S).astype(int),
         start=filled.behind[starts],
     )
 
 
 def _turn(measured: Quaternion, predicted: Quaternion) -> jax.Array:
-    """Return the rotation vector from a predicted to a measured attitude, body frame, rad."""
+    """Return the rotation vector (rad) from a predicted to a measured attitude, body frame."""
     inverse = Quaternion(predicted.w, -predicted.x, -predicted.y, -predicted.z)
     turn = inverse.multiply(measured)
     return Rotation.from_quat(jnp.stack([turn.x, turn.y, turn.z, turn.w])).as_rotvec()
@@ -133,44 +149,44 @@ def _turn(measured: Quaternion, predicted: Quaternion) -> jax.Array:
 def _gyro_in_time(
     gyro_b: jax.Array, step_s: Any, model: ModelParameters
 ) -> tuple[jax.Array, ModelParameters]:
-    """Return what the gyro read of each row's own time, and the model of a gyro that is not late.
+    """Return gyro readings shifted to the time of each row, and the model without gyro latency.
 
-    Rates that were corrected by late readings would be corrected again until those arrive, and
-    diverge.
+    If late readings corrected the rates, each error would be corrected again until its reading
+    arrives, and the rates would diverge.
     """
-    late = [one for one in model.effects if isinstance(one, ImuLatency)]
-    if not late:
+    latencies = [effect for effect in model.effects if isinstance(effect, ImuLatency)]
+    if not latencies:
         return gyro_b, model
-    latency_s = late[0].latency_s
+    latency_s = latencies[0].latency_s
     row = jnp.arange(len(gyro_b)) + latency_s / step_s
     before = jnp.clip(jnp.floor(row).astype(int), 0, len(gyro_b) - 2)
-    share = jnp.clip(row - before, 0.0, 1.0)[:, None]
-    read = gyro_b[before] + share * (gyro_b[before + 1] - gyro_b[before])
-    return read, model.with_effects(ImuLatency(jnp.zeros_like(latency_s)))
+    fraction = jnp.clip(row - before, 0.0, 1.0)[:, None]
+    reading = gyro_b[before] + fraction * (gyro_b[before + 1] - gyro_b[before])
+    return reading, model.with_effects(ImuLatency(jnp.zeros_like(latency_s)))
 
 
 def _fly(model: ModelParameters, record: Record, gyro_b: jax.Array, windows: Windows) -> jax.Array:
     """Return the errors of one window at its horizons, (horizons, 12)."""
 
-    def one(carry: tuple[Drone, Any], inputs: tuple[Record, Any, Any]) -> tuple[Any, Any]:
-        (flown, memories), (row, is_free, gyro) = carry, inputs
-        applied = where_true(row.is_applied_known, Action(*row.applied), flown.applied)
+    def step(carry: tuple[Drone, Any], inputs: tuple[Record, Any, Any]) -> tuple[Any, Any]:
+        (predicted, memories), (row, is_free, gyro) = carry, inputs
+        applied = where_true(row.is_applied_known, Action(*row.applied), predicted.applied)
         memories = at_row(memories, row.time_s)
-        drone = where_true(is_free, flown, measured_drone(row, applied, flown.rates_b))
-        beside = Vec3(*gyro) - read_gyro(drone, memories, row.step_s, in_time)
-        seen = observe_rates(drone, memories, drone.rates_b + beside, row.step_s, model)
-        drone, memories = where_true(windows.has_gyro & ~is_free, seen, (drone, memories))
-        after, later = advance(drone, memories, Action(*row.command), row.step_s, model)
-        gyro = read_gyro(after, later, row.step_s, model)
-        return (after, later), (after.pos_w, after.vel_w, after.quat, gyro)
+        drone = where_true(is_free, predicted, measured_drone(row, applied, predicted.rates_b))
+        gyro_offset = Vec3(*gyro) - read_gyro(drone, memories, row.step_s, in_time)
+        observed = observe_rates(drone, memories, drone.rates_b + gyro_offset, row.step_s, model)
+        drone, memories = where_true(windows.has_gyro & ~is_free, observed, (drone, memories))
+        after, memories_after = advance(drone, memories, Action(*row.command), row.step_s, model)
+        gyro = read_gyro(after, memories_after, row.step_s, model)
+        return (after, memories_after), (after.pos_w, after.vel_w, after.quat, gyro)
 
     read_b, in_time = _gyro_in_time(gyro_b, record.step_s, model)
     first = jax.tree.map(lambda leaf: leaf[0], record)
     applied = Action(*first.applied)
     start = measured_drone(first, applied, body_rates(applied, model.max_rate))
     memories = start_memories(model.effects, start, MAX_DELAY_STEPS)
-    _, flown = jax.lax.scan(one, (start, memories), (record, windows.is_free, read_b))
-    pos, vel, quat, gyro = jax.tree.map(lambda leaf: leaf[windows.ends - 1], flown)
+    _, predicted = jax.lax.scan(step, (start, memories), (record, windows.is_free, read_b))
+    pos, vel, quat, gyro = jax.tree.map(lambda leaf: leaf[windows.ends - 1], predicted)
     row, gyro_b = jax.tree.map(lambda leaf: leaf[windows.ends], (record, gyro_b))
     turn = jax.vmap(_turn)(Quaternion(*row.quat.T), quat)
     stacked = [jnp.stack(vector, axis=-1) for vector in (gyro, vel, pos)]
@@ -180,10 +196,11 @@ def _fly(model: ModelParameters, record: Record, gyro_b: jax.Array, windows: Win
 
 
 def prediction_errors(model: ModelParameters, windows: Windows) -> jax.Array:
-    """Return measured minus predicted at the horizons: (horizons, windows, 12).
+    """Return measured minus predicted state at the horizons.
 
-    Turn (rad, body frame), rates (rad/s), velocity (m/s) and position (m), three components each; 0
-    where nothing is judged.
+    Returns:
+        Errors, (horizons, windows, 12): turn (rad, body frame), rates (rad/s), velocity (m/s) and
+        position (m), three components each; 0 where nothing is scored.
     """
     fly = jax.vmap(lambda record, gyro: _fly(model, record, gyro, windows), in_axes=1, out_axes=1)
     return jnp.where(

@@ -22,9 +22,17 @@ class StepResponse(NamedTuple):
 
     The free flight starts before the step.
 
-    time_s, segment: where in the log. command_before, command_after: in [-1, 1]. since_step:
-    (num_rows,) s. command: (num_rows,). measured, modelled: (num_rows,) rad/s. rms: of their
-    difference, rad/s.
+    Attributes:
+        axis: roll, pitch or yaw.
+        segment: segment of the log.
+        time_s: time of the step in the log (s).
+        command_before: command before the step, in [-1, 1].
+        command_after: command after the step, in [-1, 1].
+        since_step: time since the step (s), (num_rows,).
+        command: commands, (num_rows,).
+        measured: measured body rate (rad/s), (num_rows,).
+        modelled: modelled body rate (rad/s), (num_rows,).
+        rms: RMS of their difference (rad/s).
     """
 
     axis: str
@@ -54,43 +62,47 @@ def _steps_in(time: np.ndarray, command: np.ndarray) -> np.ndarray:
 def _largest_steps(
     prediction: Prediction, rows: np.ndarray, axis: int
 ) -> list[tuple[int, int, int]]:
-    """Return the largest steps of an axis: first row shown, row of the step, end of shown rows."""
-    found, log = [], prediction.log
+    """Return the largest steps of an axis: first shown row, row of the step, end of shown rows."""
+    largest, log = [], prediction.log
     command = log["u"][:, axis]
     for start, end in runs_of(rows, prediction.record):
         time = log.time[start:end]
         for step in _steps_in(time, command[start:end]).tolist():
-            at = time[step]
-            first = int(np.searchsorted(time, at - SHOWN_BEFORE_S - TIME_ROUNDING_S))
-            last = int(np.searchsorted(time, at + SHOWN_AFTER_S + TIME_ROUNDING_S))
-            is_whole = time[0] <= at - SHOWN_BEFORE_S + TIME_ROUNDING_S
+            step_time = time[step]
+            first = int(np.searchsorted(time, step_time - SHOWN_BEFORE_S - TIME_ROUNDING_S))
+            last = int(np.searchsorted(time, step_time + SHOWN_AFTER_S + TIME_ROUNDING_S))
+            is_whole = time[0] <= step_time - SHOWN_BEFORE_S + TIME_ROUNDING_S
             if is_whole and prediction.is_settled[start + first]:
-                found.append((start + first, start + step, start + last))
-    found.sort(key=lambda rows: -abs(command[rows[1]] - command[rows[1] - 1]))
-    return found[:MAX_PER_AXIS]
+                largest.append((start + first, start + step, start + last))
+    largest.sort(key=lambda rows: -abs(command[rows[1]] - command[rows[1] - 1]))
+    return largest[:MAX_PER_AXIS]
 
 
 def step_responses(prediction: Prediction, rows: np.ndarray) -> tuple[StepResponse, ...]:
     """Return the responses to the largest commanded steps of each rate axis.
 
-    rows: (num_rows,) bool, the judged ones. A step is a jump by at least 0.2 between commands that
-    are constant for 0.08 s before and 0.15 s after it.
+    A step is a jump by at least 0.2 between commands that are constant for 0.08 s before and 0.15 s
+    after it.
+
+    Args:
+        prediction: steps from every row.
+        rows: rows that are scored, (num_rows,) bool.
     """
     log = prediction.log
     if "w" not in log:
         return ()
     shown = [
-        (axis, *place)
+        (axis, *step_rows)
         for axis in range(len(AXES))
-        for place in _largest_steps(prediction, rows, axis)
+        for step_rows in _largest_steps(prediction, rows, axis)
     ]
     firsts, ends = np.array([(first, end) for _, first, _, end in shown], int).reshape(-1, 2).T
     since_first = np.arange(1, np.max(ends - firsts, initial=1))
-    flown = free_flights(prediction, firsts, firsts[:, None] + since_first)
+    flights = free_flights(prediction, firsts, firsts[:, None] + since_first)
     responses = []
-    for (axis, first, step, end), rates in zip(shown, flown["w"], strict=True):
-        since = slice(first + 1, end)
-        measured, modelled = log["w"][since, axis], rates[: end - first - 1, axis]
+    for (axis, first, step, end), rates in zip(shown, flights["w"], strict=True):
+        shown_rows = slice(first + 1, end)
+        measured, modelled = log["w"][shown_rows, axis], rates[: end - first - 1, axis]
         responses.append(
             StepResponse(
                 axis=AXES[axis],
@@ -98,8 +110,8 @@ def step_responses(prediction: Prediction, rows: np.ndarray) -> tuple[StepRespon
                 time_s=float(log.time[step]),
                 command_before=float(log["u"][step - 1, axis]) + 0.0,  # no -0
                 command_after=float(log["u"][step, axis]) + 0.0,
-                since_step=log.time[since] - log.time[step],
-                command=log["u"][since, axis],
+                since_step=log.time[shown_rows] - log.time[step],
+                command=log["u"][shown_rows, axis],
                 measured=measured,
                 modelled=modelled,
                 rms=float(np.sqrt(np.mean((measured - modelled) ** 2))),

@@ -30,12 +30,16 @@ NAMES = {
 
 
 class Validation(NamedTuple):
-    """Errors of a model on the judged rows of a log.
+    """Errors of a model on the scored rows of a log.
 
-    num_rows, num_judged: rows of the log, and those that were judged. one_step: errors of single
-    steps. rollouts: errors of free flight, by its length. steps: responses to commanded steps.
-    notes: sentences on what could not be judged and why, and on what was assumed. thrust: None
-    where the log has no measurement of it.
+    Attributes:
+        num_rows: number of rows of the log.
+        num_judged: number of scored rows.
+        one_step: errors of single steps.
+        rollouts: errors of free flight, by its length.
+        thrust: errors of the thrust; None if the log does not measure it.
+        steps: responses to commanded steps.
+        notes: sentences on what is not scored and why, and on what is assumed.
     """
 
     num_rows: int
@@ -49,7 +53,8 @@ class Validation(NamedTuple):
     def as_json(self) -> dict[str, Any]:
         """Return the numbers as JSON values in SI units, V and, where the names say so, degrees.
 
-        What could not be judged is absent, and in the notes; numbers that are not finite are null.
+        Channels that are not scored are absent, and the notes name them. Numbers that are not
+        finite are null.
         """
         return _json_of(
             {
@@ -78,7 +83,7 @@ def _json_of(value: Any) -> Any:
 
 
 def _notes_of(prediction: Prediction) -> list[str]:
-    """Return what the log lacks, and what is assumed instead."""
+    """Return sentences on what the log lacks, and on what is assumed instead."""
     log, notes = prediction.log, []
     for name, lacking in prediction.lacking.items():
         if name in log and lacking:
@@ -107,9 +112,16 @@ def _notes_of(prediction: Prediction) -> list[str]:
 def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = None) -> Validation:
     """Return the errors of a model on a log, from the measured states under the logged commands.
 
-    rows: (num_rows,) bool, the judged ones (``split.held_out_rows``); all if None. Other rows are
-    used only for the applied action and the memories of effects. A measured log is replayed
-    continuously, whatever the model says, and a note says so.
+    A measured log is replayed continuously, whatever the motion of the model, and a note says so.
+
+    Args:
+        model: the model to validate.
+        log: the flight log.
+        rows: rows that are scored (``split.held_out_rows``), (num_rows,) bool; all if None. Other
+            rows are used only for the applied action and the memories of effects.
+
+    Raises:
+        ValueError: ``rows`` has another shape or type.
     """
     rows = np.ones(len(log), bool) if rows is None else np.asarray(rows)
     if rows.shape != (len(log),) or rows.dtype != bool:

@@ -79,7 +79,7 @@ def _thrust_table(thrust: ThrustError) -> Table:
 
 
 def _tables(validation: Validation) -> dict[str, Table]:
-    """Return the tables that have any row, by the figure that they belong to."""
+    """Return the tables that are not empty, by the figure that they belong to."""
     tables = {"one_step": _one_step_table(validation), "rollouts": _rollout_table(validation)}
     if validation.thrust is not None:
         tables["thrust"] = _thrust_table(validation.thrust)
@@ -97,12 +97,12 @@ def _text_of_table(table: Table) -> str:
 
 
 def _head(validation: Validation, model_name: str, log: FlightLog) -> str:
-    judged = f"{validation.num_judged} of {validation.num_rows} rows are judged"
-    return f"Model {model_name}, on {log.source}: {judged}."
+    scored = f"{validation.num_judged} of {validation.num_rows} rows are judged"
+    return f"Model {model_name}, on {log.source}: {scored}."
 
 
 def _nrmse_meanings(validation: Validation) -> list[str]:
-    """Return the definitions of the NRMSE of the judged channels, a sentence for each kind."""
+    """Return the definitions of the NRMSE of the scored channels, a sentence for each kind."""
     kinds: dict[str, list[str]] = {}
     for name in validation.one_step.channels:
         kinds.setdefault(NORMALISED_BY[name], []).append(name)
@@ -126,7 +126,14 @@ def text_of(validation: Validation, model_name: str, log: FlightLog) -> str:
 def html_of(
     validation: Validation, model_name: str, log: FlightLog, pictures: dict[str, bytes]
 ) -> str:
-    """Return a validation as a self-contained page; pictures: PNG files by figure's name."""
+    """Return a validation as a self-contained page.
+
+    Args:
+        validation: errors of the model.
+        model_name: name of the model, for the heading.
+        log: the log on which the model is validated.
+        pictures: PNG files by name of the figure.
+    """
     tables = _tables(validation)
     sections = []
     for name, heading in HEADINGS.items():

@@ -1,4 +1,4 @@
-"""What each cause is in plain words, and the plot that shows it: a residual against a regressor."""
+"""Causes in plain words, and the plots that show them: residuals against regressors."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,31 +19,37 @@ from flytrack_sysid.plots import BLUE, GREY, ORANGE, say
 
 WIDTH_IN, ROW_IN, LEGEND_IN = 8.0, 2.5, 0.9
 MAX_COLUMNS = 3
-EXTENDED = "extended"  # its name in traces
+EXTENDED = "extended"  # name of the extended model in traces
 MIN_SHOWN = 50  # rows
 NO_DATA = "not in the log, or too little of it"
 NUM_BINS = 15
-SHOWN_PERCENTILES = (0.5, 99.5)  # of the regressor: single rows far out would squeeze all others
-# Of a bin: wanted, and without which there is no scatter.
+SHOWN_PERCENTILES = (0.5, 99.5)  # of the regressor: outliers would compress all other rows
+# Numbers in a bin: rows or pieces that are wanted, and rows without which there is no scatter.
 WANTED_ROWS, WANTED_PIECES, MIN_ROWS = 20, 5, 2
 BLOCK_S = 1.0  # rows further apart than this count as independent
-MIN_BLOCKS = 10  # fewer say too little of their own scatter
+MIN_BLOCKS = 10  # the scatter of fewer blocks is too uncertain
 TWO_SIDED_95 = 1.959964  # standard deviations
-# Attitude and velocity are noisy in each row: their change over a piece is known as well as over a
-# step.
+# Attitude and velocity are noisy in each row: their change over a piece has the same noise as over
+# a step.
 PIECE_S = 0.2
 _TURN_AXES = {"x": "roll", "y": "pitch", "z": "yaw"}
 
 
 class Panel(NamedTuple):
-    """Means of a residual by bins of a regressor, names as in ``traces``."""
+    """A plot of the means of a residual by bins of a regressor, names as in ``traces``."""
 
     residual: str
     regressor: str
 
 
 class Evidence(NamedTuple):
-    """A cause as a noun in plain words, its panels, and how they show it."""
+    """The words and plots of a cause.
+
+    Attributes:
+        words: the cause as a noun in plain words.
+        panels: plots that show the cause.
+        reading: how the plots show it.
+    """
 
     words: str
     panels: tuple[Panel, ...]
@@ -51,32 +57,34 @@ class Evidence(NamedTuple):
 
 
 def _read_evidence() -> dict[str, Evidence]:
-    """Return the evidence of causes by name, as ``evidence.toml`` has it."""
+    """Read the evidence of causes by name from ``evidence.toml``."""
     rows: dict[str, dict[str, Any]] = {}
-    found = {}
-    for name, own in parse_toml(read_text(Path(__file__).with_suffix(".toml"))).items():
-        rows[name] = row = rows.get(own.get("like", ""), {}) | own
+    result = {}
+    for name, entry in parse_toml(read_text(Path(__file__).with_suffix(".toml"))).items():
+        rows[name] = row = rows.get(entry.get("like", ""), {}) | entry
         plots = [
             plot.replace("*", axis)
             for plot in row["plots"]
             for axis in ("xyz" if "*" in plot else "x")
         ]
         panels = tuple(Panel(*plot.split(" over ")) for plot in plots)
-        found[name] = Evidence(row["words"], panels, row["reading"])
-    return found
+        result[name] = Evidence(row["words"], panels, row["reading"])
+    return result
 
 
 EVIDENCE = _read_evidence()
 
 
 def without(extended: ModelParameters, nominal: ModelParameters, cause: str) -> ModelParameters:
-    """Return a model less one cause: effect or base parameters as in the nominal model.
+    """Return a model without one cause: its effect or base parameters are nominal.
 
     Raises:
         KeyError: no cause of that name.
     """
-    if cause == "thrust_scale" and all(type(one) is not ThrustScale for one in extended.effects):
-        cause = "thrust_curve"  # found as one factor between two curves
+    if cause == "thrust_scale" and all(
+        type(effect) is not ThrustScale for effect in extended.effects
+    ):
+        cause = "thrust_curve"  # the scale is one factor between two curves, not an effect
     if cause not in BASE_CAUSES:
         return extended.with_effects(nominal.effect(cause))
     before = dict(zip(names_of(nominal), to_vector(nominal).tolist(), strict=True))
@@ -84,7 +92,7 @@ def without(extended: ModelParameters, nominal: ModelParameters, cause: str) -> 
 
 
 def words_of(cause: str) -> str:
-    """Return a cause in plain words; its own name where there are none."""
+    """Return a cause in plain words; its name if there are none."""
     if cause == DRIFT:
         return (
             "a drift of the thrust, as while motors warm up; fly again with warm motors and a full "
@@ -101,7 +109,10 @@ def list_words(causes: Sequence[str]) -> str:
 class Binned(NamedTuple):
     """Means by bin, (num_bins,) each; only bins with two rows or more.
 
-    ends95: half of the 95 % interval.
+    Attributes:
+        at: means of the regressor.
+        means: means of the values.
+        ends95: half-widths of the 95 % intervals.
     """
 
     at: np.ndarray
@@ -112,7 +123,7 @@ class Binned(NamedTuple):
 def bin_edges(regressor: np.ndarray, fewest: int = WANTED_ROWS) -> np.ndarray:
     """Return the edges of bins over a regressor, (at most NUM_BINS + 1,).
 
-    Evenly wide, but joined with the next ones where they have fewer than ``fewest`` rows.
+    Bins have equal widths. A bin with fewer than ``fewest`` rows is joined with the next ones.
     """
     low, high = np.percentile(regressor, SHOWN_PERCENTILES)
     even = np.linspace(low, max(high, low + np.finfo(np.float32).eps), NUM_BINS + 1)
@@ -122,47 +133,53 @@ def bin_edges(regressor: np.ndarray, fewest: int = WANTED_ROWS) -> np.ndarray:
         if rows >= fewest:
             edges.append(edge)
             rows = 0
-    # What is left over joins the last bin.
+    # Remaining rows join the last bin.
     return even[[0, -1]] if len(edges) == 1 else np.array([*edges[:-1], even[-1]])
 
 
 def binned_means(
     regressor: np.ndarray, values: np.ndarray, block: np.ndarray, edges: np.ndarray
 ) -> Binned:
-    """Return means of values by bins of a regressor; all (num_rows,), edges (num_bins + 1,).
+    """Return means of values by bins of a regressor.
 
-    block: (num_rows,) int, from 0; rows of one block may be correlated. The interval is from the
-    scatter of sums over blocks (K.-Y. Liang, S. Zeger, 1986); where a bin has few blocks, it is at
-    least that of independent rows.
+    The interval is from the scatter of sums over blocks (K.-Y. Liang, S. Zeger, 1986). If a bin has
+    few blocks, it is at least that of independent rows.
+
+    Args:
+        regressor: (num_rows,).
+        values: (num_rows,).
+        block: index of the block of each row, from 0, (num_rows,) int. Rows of one block may be
+            correlated.
+        edges: edges of the bins, (num_bins + 1,).
     """
     num_bins = len(edges) - 1
-    number = np.searchsorted(edges, regressor, side="right") - 1
-    inside = (number >= 0) & (number < num_bins)
-    number, values, block = number[inside], values[inside], block[inside]
-    rows = np.bincount(number, minlength=num_bins)
-    some = np.maximum(rows, 1)
-    means = np.bincount(number, values, minlength=num_bins) / some
-    at = np.bincount(number, regressor[inside], minlength=num_bins) / some
-    off = values - means[number]
-    by_row = np.bincount(number, off**2, minlength=num_bins)
+    bin_index = np.searchsorted(edges, regressor, side="right") - 1
+    inside = (bin_index >= 0) & (bin_index < num_bins)
+    bin_index, values, block = bin_index[inside], values[inside], block[inside]
+    rows = np.bincount(bin_index, minlength=num_bins)
+    divisors = np.maximum(rows, 1)
+    means = np.bincount(bin_index, values, minlength=num_bins) / divisors
+    centres = np.bincount(bin_index, regressor[inside], minlength=num_bins) / divisors
+    deviations = values - means[bin_index]
+    by_row = np.bincount(bin_index, deviations**2, minlength=num_bins)
     num_blocks = int(block.max(initial=-1)) + 1
-    cell, cells = number * num_blocks + block, num_bins * num_blocks
-    sums = np.bincount(cell, off, minlength=cells).reshape(num_bins, -1)
-    used = (np.bincount(cell, minlength=cells).reshape(num_bins, -1) > 0).sum(axis=1)
+    cell, cells = bin_index * num_blocks + block, num_bins * num_blocks
+    sums = np.bincount(cell, deviations, minlength=cells).reshape(num_bins, -1)
+    num_used_blocks = (np.bincount(cell, minlength=cells).reshape(num_bins, -1) > 0).sum(axis=1)
     by_block = (sums**2).sum(axis=1)
-    variance = np.where(used >= MIN_BLOCKS, by_block, np.maximum(by_block, by_row))
+    variance = np.where(num_used_blocks >= MIN_BLOCKS, by_block, np.maximum(by_block, by_row))
     kept = rows >= MIN_ROWS
-    return Binned(at[kept], means[kept], (TWO_SIDED_95 * np.sqrt(variance) / some)[kept])
+    return Binned(centres[kept], means[kept], (TWO_SIDED_95 * np.sqrt(variance) / divisors)[kept])
 
 
 def _blocks(traces: Traces, length_s: float) -> np.ndarray:
-    """Return the number of the block of some length that each row is in, (num_rows,) int."""
+    """Return the index of each row's block of some length, (num_rows,) int."""
     block = traces.slot // max(round(length_s / traces.step_s), 1)
     return np.unique(block, return_inverse=True)[1]
 
 
 def _in_degrees(unit: str) -> tuple[str, float]:
-    """Return the unit in which one is shown, and the factor to it: turns are shown in degrees."""
+    """Return the unit in which a unit is shown, and the factor to it: degrees for radians."""
     return (
         (unit.replace("rad/", "deg/"), float(np.rad2deg(1.0)))
         if unit.startswith("rad/")
@@ -171,7 +188,7 @@ def _in_degrees(unit: str) -> tuple[str, float]:
 
 
 def _label(residual: str) -> str:
-    """Return what a residual is of, with its unit."""
+    """Return the name of a residual's quantity, with its unit."""
     channel, axis = residual.split("_")[0], residual.split("_")[-1]
     unit = _in_degrees(UNITS[channel])[0]
     if channel == "battery":
@@ -187,7 +204,7 @@ def _label(residual: str) -> str:
 
 def _draw_panel(axes: Any, traces: Traces, panel: Panel, without: str) -> None:
     channel = panel.residual.split("_")[0]
-    (left, counts), (rest, _) = (
+    (without_cause, counts), (with_cause, _) = (
         traces.column(name, panel.residual) for name in (without, EXTENDED)
     )
     label, unit = REGRESSORS[panel.regressor]
@@ -195,18 +212,22 @@ def _draw_panel(axes: Any, traces: Traces, panel: Panel, without: str) -> None:
     scale = _in_degrees(UNITS[channel])[1]
     columns = [
         values[counts]
-        for values in (factor * traces.regressors[panel.regressor], scale * left, scale * rest)
+        for values in (
+            factor * traces.regressors[panel.regressor],
+            scale * without_cause,
+            scale * with_cause,
+        )
     ]
     block, fewest = _blocks(traces, BLOCK_S)[counts], WANTED_ROWS
     if channel in ("attitude", "velocity"):
         piece = np.unique(_blocks(traces, PIECE_S)[counts], return_inverse=True)[1]
         rows, fewest = np.bincount(piece), WANTED_PIECES
         *columns, block = [np.bincount(piece, values) / rows for values in (*columns, block)]
-    regressor, left, rest = columns
+    regressor, without_cause, with_cause = columns
     edges = bin_edges(regressor, fewest=fewest)
     before, explained, after = (
         binned_means(regressor, values, block.astype(int), edges)
-        for values in (left, left - rest, rest)
+        for values in (without_cause, without_cause - with_cause, with_cause)
     )
     axes.axhline(0.0, color=GREY, linewidth=0.8)
     style: dict[str, Any] = {
@@ -230,9 +251,12 @@ def draw_cause(
 ) -> Figure:
     """Draw the panels of a cause.
 
-    without: of the models in ``traces``, the extended one without the cause. The curve is the
-    difference between the predictions of it and of the one with the cause. when: for the title,
-    when the cause acts.
+    The curve is the difference between the predictions of the extended models without and with the
+    cause.
+
+    Args:
+        without: name in ``traces`` of the extended model without the cause.
+        when: when the cause acts, for the title.
     """
     # Without a sensor, its panel and that of its replacement are the same.
     panels = list(
@@ -258,7 +282,8 @@ def draw_cause(
     for axes in grid[:, 0]:
         axes.set_ylabel("measured minus modelled", fontsize="small")
     entries = max(
-        (axes.get_legend_handles_labels() for axes in figure.axes), key=lambda own: len(own[1])
+        (axes.get_legend_handles_labels() for axes in figure.axes),
+        key=lambda legend: len(legend[1]),
     )
     figure.legend(*entries, loc="outside lower center", ncols=3, frameon=False, fontsize="small")
     return figure

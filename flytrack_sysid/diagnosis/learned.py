@@ -1,8 +1,8 @@
-"""Beyond the list: where a diagnosis leaves something unexplained, a law for it.
+"""Beyond the list: learn a law where a diagnosis leaves something unexplained.
 
-Of each side (rate, force) that depends on something, a law is searched; it is proposed where it
-explains nearly all that smooth functions of everything would. It has to predict held-out flights
-better in all, and no worse at any horizon where these tell anything.
+For each side (rate, force) whose residuals depend on something, the diagnosis searches a law. It
+proposes the law if it explains nearly all that smooth functions of all variables would. The law has
+to predict held-out flights better overall, and no worse at any horizon with evidence.
 """
 
 import numpy as np
@@ -29,10 +29,10 @@ from flytrack_sysid.diagnosis.unexplained import (
 )
 
 MAX_ROWS = 12_000  # with their lead-ins: two minutes at 100 Hz
-MIN_RMS_RATIO = 0.08  # of the sensor's noise, rms: less is not learnt
-# of squared errors of held-out flights, over all horizons: what takes less off is nothing
+MIN_RMS_RATIO = 0.08  # of the sensor's noise, RMS: no law is learnt for smaller residuals
+# of squared errors of held-out flights, over all horizons: a smaller reduction counts as none
 MIN_ERROR_REDUCTION = 0.02
-LAW_SHARE = 0.75  # of what smooth functions of everything explain: the least that a law explains
+LAW_SHARE = 0.75  # of the gain of smooth functions of all variables: a law has to gain as much
 
 
 def find_learned(
@@ -42,33 +42,39 @@ def find_learned(
     base: np.ndarray,
     flight_test: FlightTest | None,
 ) -> tuple[Learned | None, np.ndarray]:
-    """Return the law of what a model leaves, None without one, and the model's vector beside it.
+    """Return the law of a model's residuals, None without one, and the model's vector beside it.
 
-    problem, test: of rows to learn from and of others. base: vector of the refitted model without
-    effects. flight_test: of free flights on held-out rows; None without any.
+    Args:
+        problem: the training rows.
+        test: the held-out rows.
+        model: the extended model.
+        base: vector of the refitted model without effects, (num_parameters,).
+        flight_test: free flights on held-out rows; None without any.
     """
     problem, test = thinned_problem(problem), thinned_problem(test)
     waves = waves_of(problem, model, find_lines(problem, model))
     dependences = find_dependences(problem, model, base, waves)
     learned: Learned | None = None
-    # What wanders may be a law whose variable smooth functions of everything do not have.
+    # A wandering disturbance may be a law of a variable that is not among the smooth functions.
     wandering = [] if dependences else list(stochastic_shares(problem, model))
-    for name in dict.fromkeys([*(one.side for one in dependences), *wandering]):
-        on_side = [one for one in dependences if one.side == name]
-        if on_side and max(one.share for one in on_side) < MIN_RMS_RATIO:
+    for name in dict.fromkeys([*(dependence.side for dependence in dependences), *wandering]):
+        on_side = [dependence for dependence in dependences if dependence.side == name]
+        if on_side and max(dependence.share for dependence in on_side) < MIN_RMS_RATIO:
             continue
         law = find_law(Side.of(name, problem, model), Side.of(name, test, model))
-        if law is None or law.gain < LAW_SHARE * sum(one.gain for one in on_side):
+        if law is None or law.gain < LAW_SHARE * sum(dependence.gain for dependence in on_side):
             continue
-        more = _with_side(learned, name, law)
+        extended = _with_side(learned, name, law)
         acts_there = law.expected >= MIN_EXPECTED_GAIN
-        if _predicts(problem, flight_test, (learned, model.vector), (more, law.vector), acts_there):
-            learned, model = more, model._replace(vector=law.vector)
+        if _predicts(
+            problem, flight_test, (learned, model.vector), (extended, law.vector), acts_there
+        ):
+            learned, model = extended, model._replace(vector=law.vector)
     return learned, model.vector
 
 
 def _with_side(learned: Learned | None, name: str, law: FittedLaw) -> Learned:
-    """Return what was learnt, with the law of one more side."""
+    """Add the law of a side to what was learnt."""
     learned = learned or Learned(Law(()), {}, {}, {})
     return Learned(
         Law((*learned.law.terms, *law.terms)),
@@ -79,9 +85,9 @@ def _with_side(learned: Learned | None, name: str, law: FittedLaw) -> Learned:
 
 
 def thinned_problem(problem: Problem) -> Problem:
-    """Return a problem of fewer chunks, evenly spread, where a log is long.
+    """Return a problem of fewer chunks, evenly spread, if a log is long.
 
-    Hundreds of terms are tried.
+    The search tries hundreds of terms.
     """
     chunks = thinned(problem.chunks, max(MAX_ROWS // len(problem.chunks.row), 2))
     if chunks is problem.chunks or problem.late is not None:
@@ -98,20 +104,22 @@ def _predicts(
 ) -> bool:
     """Return whether what was learnt predicts held-out flights no worse, and better overall.
 
-    before, after: what was learnt, and the model's vector beside it. acts_there: whether it acts in
-    them enough to be judged.
+    Args:
+        before: what was learnt before, and the model's vector beside it.
+        after: what was learnt now, and the model's vector beside it.
+        acts_there: whether the new law acts enough in held-out rows for a score.
     """
     if flight_test is None:
         return True
-    old, new = (_flight_errors(problem, flight_test, *each) for each in (before, after))
-    ratio, lost = new.against(old)
-    return improves_flights(ratio[flight_test.is_known], lost[flight_test.is_known], acts_there)
+    old, new = (_flight_errors(problem, flight_test, *pair) for pair in (before, after))
+    ratio, z_scores = new.against(old)
+    return improves_flights(ratio[flight_test.is_known], z_scores[flight_test.is_known], acts_there)
 
 
 def _flight_errors(
     problem: Problem, flight_test: FlightTest, learned: Learned | None, vector: np.ndarray
 ) -> FlightErrors:
-    """Return the errors of held-out flights with what was learnt, if anything."""
+    """Return the errors of held-out flights with what was learnt, if anything was."""
     if learned is None:
         return errors_at(problem, vector[None], flight_test.windows)
     return errors_at(
@@ -119,14 +127,16 @@ def _flight_errors(
     )
 
 
-def improves_flights(ratio: np.ndarray, lost: np.ndarray, acts_there: bool) -> bool:
-    """Return whether flights are predicted no worse anywhere and, if it acts there, better overall.
+def improves_flights(ratio: np.ndarray, z_scores: np.ndarray, acts_there: bool) -> bool:
+    """Return whether a law predicts flights nowhere worse and, if it acts there, better overall.
 
-    ratio: of errors with what was learnt over those without, by horizon and quantity. lost: by how
-    many standard errors each is larger.
+    Args:
+        ratio: errors with the law over those without it, by horizon and quantity.
+        z_scores: increase of each error in standard errors.
+        acts_there: whether the law acts in the flights.
     """
     is_better = float(np.mean(ratio**2)) < 1.0 - MIN_ERROR_REDUCTION
-    # What makes flights in all no better has to be as good at every horizon.
+    # A law that predicts flights no better overall has to be as good at every horizon.
     worst = WORSE_ANYWHERE if is_better else LIKELY
-    is_worse = (ratio > LIKELY_WORSE) & (lost > worst)
+    is_worse = (ratio > LIKELY_WORSE) & (z_scores > worst)
     return not is_worse.any() and (is_better or not acts_there)

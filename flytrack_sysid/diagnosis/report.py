@@ -36,19 +36,19 @@ from flytrack_sysid.page import Bullets, Part, Picture, Section, Table, Text, Ve
 from flytrack_sysid.plots import WIDTH_IN, png_of
 
 JSON_NAME, MODEL_NAME, REPORT_NAME = "diagnosis.json", "extended_model.json", "report.html"
-MAX_PICTURED = 6  # causes, those with the largest gain: more pictures nobody reads
+MAX_PICTURED = 6  # causes with the largest gain that have a picture: nobody reads more pictures
 BARS_HEIGHT_IN = 2.6
 MAX_LISTED = 3  # names in one cell
-LIMITED_S = 1e-3  # by which a step to full stick takes longer where a limit acts
+LIMITED_S = 1e-3  # a step to full stick takes longer by more than this if a limit acts
 NO_BREAK = "\u00a0"  # a space at which lines do not break
 AS_CLOSE, MIN_CHANGE_PERCENT = (
     "no closer",
     0.5,
-)  # % of an error: what changes by less has not changed
-HEADLINE_HORIZON = "1"  # s of free flight, whose error the first sentence gives
+)  # % of an error: a smaller change counts as none
+HEADLINE_HORIZON = "1"  # s of free flight, the horizon of the error in the first sentence
 WRONG = "has the wrong value of"
-LOG_BARS = 20.0  # times the smallest error: from there on bars would vanish on an even scale
-MAX_LIMITS = 8  # rows of the text's table of what a log could not show
+LOG_BARS = 20.0  # ratio of largest to smallest error above which bars vanish on a linear scale
+MAX_LIMITS = 8  # rows in the text's table of effects that a log could not show
 CHANNEL_WORDS = {"rates": "body rates", "force": "specific force"}
 DIFFERENCES = (
     "The log lacks a gyro or an accelerometer; attitude or velocity replace them, by their change "
@@ -76,25 +76,25 @@ def _unit(unit: str) -> str:
     return "" if unit == "1" else " " + unit.replace("^2", "²")
 
 
-def _parameter(name: str, found: Estimated) -> str:
-    low, high = found.ci95
-    text = f"{name.split('.')[-1]} = {found.value:.3g} [{low:.3g}, {high:.3g}]{_unit(found.unit)}"
+def _parameter(name: str, value: Estimated) -> str:
+    low, high = value.ci95
+    text = f"{name.split('.')[-1]} = {value.value:.3g} [{low:.3g}, {high:.3g}]{_unit(value.unit)}"
     return text.replace(" ", NO_BREAK)
 
 
 def _plus_minus(cause: Cause) -> str:
     """Return a cause's values with half of their 95 % intervals."""
     return ", ".join(
-        f"{name} {one.value:.3g} ± {one.half_width:.2g}{_unit(one.unit)}"
-        for name, one in cause.parameters.items()
+        f"{name} {estimate.value:.3g} ± {estimate.half_width:.2g}{_unit(estimate.unit)}"
+        for name, estimate in cause.parameters.items()
     )
 
 
 def when_of(cause: Cause) -> str:
-    """Return when a cause acts, " from 31.2 ± 0.4 s on"; nothing where it does throughout."""
+    """Return when a cause acts, " from 31.2 ± 0.4 s on"; empty if it acts throughout."""
 
-    def time(found: Estimated) -> str:
-        return f"{found.value:.1f} ± {max(found.half_width, 0.05):.1f} s"
+    def time(estimate: Estimated) -> str:
+        return f"{estimate.value:.1f} ± {max(estimate.half_width, 0.05):.1f} s"
 
     if cause.onset_s is not None and cause.end_s is not None:
         return f" from {time(cause.onset_s)} to {time(cause.end_s)}"
@@ -113,9 +113,9 @@ def _faults(diagnosis: Diagnosis) -> str:
     """Return a sentence on what the model lacks, has too much or too little of, or has wrong."""
     by_fault: dict[str, list[str]] = {}
     for cause in diagnosis.causes:
-        alike = () if cause.effect == "thrust_scale" else cause.equivalent[:MAX_LISTED]
-        others = f" (or {' or '.join(map(words_of, alike))})" if alike else ""
-        name = words_of(cause.effect) + when_of(cause) + others
+        equivalent = () if cause.effect == "thrust_scale" else cause.equivalent[:MAX_LISTED]
+        alternatives = f" (or {' or '.join(map(words_of, equivalent))})" if equivalent else ""
+        name = words_of(cause.effect) + when_of(cause) + alternatives
         by_fault.setdefault(fault_of(cause.effect, diagnosis), []).append(name)
     clauses = [
         " ".join([fault, "; ".join(f"the {name}" if fault == WRONG else name for name in names)])
@@ -125,30 +125,33 @@ def _faults(diagnosis: Diagnosis) -> str:
 
 
 def fault_of(cause: str, diagnosis: Diagnosis) -> str:
-    """Return the verb that a cause goes with: what the flight shows, against what the model had."""
+    """Return the verb for a cause: compares the value in the flight with that in the model."""
     if cause not in BY_NAME or cause.endswith("_scale"):
         return WRONG
     neutral, notable = BY_NAME[cause].parameters(), BY_NAME[cause].notable
     models = [model.effect(cause) for model in (diagnosis.nominal, diagnosis.extended)]
     if [*map(float, models[0])] == [*map(float, neutral)]:
         return "lacks"
-    had, shown = (
+    nominal, extended = (
         np.array(
-            [float(getattr(one, name) - getattr(neutral, name)) / notable[name] for name in notable]
+            [
+                float(getattr(effect, name) - getattr(neutral, name)) / notable[name]
+                for name in notable
+            ]
         )
-        for one in models
+        for effect in models
     )
-    if had @ shown < 0.0:
+    if nominal @ extended < 0.0:
         return WRONG  # the other sign
-    return "has too much" if shown @ shown < had @ had else "has too little"
+    return "has too much" if extended @ extended < nominal @ nominal else "has too little"
 
 
 def _gain(diagnosis: Diagnosis) -> str:
-    """Return a sentence on how much closer the extended model flies; empty where unknown."""
+    """Return a sentence on how much closer the extended model predicts; empty if unknown."""
 
     def error(model: str) -> float:
-        found = diagnosis.error[model].position_m if model in diagnosis.error else {}
-        return found.get(HEADLINE_HORIZON, np.nan)
+        errors = diagnosis.error[model].position_m if model in diagnosis.error else {}
+        return errors.get(HEADLINE_HORIZON, np.nan)
 
     before, refitted, after = (error(model) for model in ("nominal", "refitted_base", "extended"))
     if not np.isfinite(before + after):
@@ -159,18 +162,18 @@ def _gain(diagnosis: Diagnosis) -> str:
     if np.isfinite(refitted):
         as_good = ": no effect adds to that" if _closer(refitted, after) == AS_CLOSE else ""
         details.append(f"{refitted:.2g} m when only refitted{as_good}")
-    blind = (
+    placebo = (
         diagnosis.prediction.errors.get("placebo", {})
         .get("position_m", {})
         .get(HEADLINE_HORIZON, np.inf)
     )
-    if blind <= after:
-        details.append(f"a guess that ignores the commands, {blind:.2g} m")
+    if placebo <= after:
+        details.append(f"a guess that ignores the commands, {placebo:.2g} m")
     return f"{text} ({'; '.join(details)})."
 
 
 def _closer(before: float, after: float) -> str:
-    """Return by how much an error fell, "13 % closer"."""
+    """Return the decrease of an error as words, such as "13 % closer"."""
     share = 100.0 * (1.0 - after / before)
     if abs(share) < MIN_CHANGE_PERCENT:
         return AS_CLOSE
@@ -184,7 +187,7 @@ def _beyond(diagnosis: Diagnosis) -> str:
 
 
 def _learned(diagnosis: Diagnosis) -> str:
-    """Return what was learnt beyond the list, as a sentence; nothing without any."""
+    """Return a sentence on what was learnt beyond the list; empty without any."""
     if diagnosis.learned is None:
         return ""
     return "The extended model has a law for it, learnt from this log."
@@ -192,8 +195,10 @@ def _learned(diagnosis: Diagnosis) -> str:
 
 def verdict_of(diagnosis: Diagnosis) -> Verdict:
     """Return the verdict in a sentence or two."""
-    left = diagnosis.unexplained
-    depends = f" It depends on {', '.join(left.depends_on)}." if left.depends_on else ""
+    unexplained = diagnosis.unexplained
+    depends = (
+        f" It depends on {', '.join(unexplained.depends_on)}." if unexplained.depends_on else ""
+    )
     if diagnosis.verdict == CONSISTENT:
         return Verdict(
             "The log agrees with the model: the residuals look like sensor noise.", "good"
@@ -203,7 +208,7 @@ def verdict_of(diagnosis: Diagnosis) -> Verdict:
         text = f"The model is wrong, and no known cause explains it.{depends}"
         return Verdict(" ".join(filter(None, [text, beyond, _learned(diagnosis)])), "open")
     parts = [_faults(diagnosis), _gain(diagnosis), beyond]
-    if left.depends_on:
+    if unexplained.depends_on:
         parts.append(f"Something else remains that no known cause explains.{depends}")
     parts.append(_learned(diagnosis))
     return Verdict(
@@ -217,7 +222,7 @@ def _causes_part(diagnosis: Diagnosis) -> Part:
     rows = [
         [
             f"{words_of(cause.effect)}{when_of(cause)}\n({cause.effect}, in {cause.channel})",
-            "\n".join(_parameter(name, found) for name, found in cause.parameters.items()),
+            "\n".join(_parameter(name, estimate) for name, estimate in cause.parameters.items()),
             _number(cause.heldout_gain),
             _confused(cause),
         ]
@@ -234,18 +239,22 @@ def _causes_part(diagnosis: Diagnosis) -> Part:
 
 def _errors_table(diagnosis: Diagnosis) -> Table:
     models = diagnosis.error.values()
-    steps = dict.fromkeys(key for one in models for key in one.one_step_nrmse)
-    flights = dict.fromkeys(key for one in models for key in one.position_m)
+    steps = dict.fromkeys(key for column in models for key in column.one_step_nrmse)
+    flights = dict.fromkeys(key for column in models for key in column.position_m)
     rows = [
         [
             CHANNEL_WORDS.get(key, key),
             "NRMSE",
-            *(_number(one.one_step_nrmse.get(key)) for one in models),
+            *(_number(column.one_step_nrmse.get(key)) for column in models),
         ]
         for key in steps
     ]
     rows += [
-        [f"position after {key} s", "m", *(_number(one.position_m.get(key)) for one in models)]
+        [
+            f"position after {key} s",
+            "m",
+            *(_number(column.position_m.get(key)) for column in models),
+        ]
         for key in flights
     ]
     responses = [diagnosis.half_response_s.get(name, {}) for name in diagnosis.error]
@@ -253,7 +262,7 @@ def _errors_table(diagnosis: Diagnosis) -> Table:
         [
             f"time to half response, {stick}",
             "ms",
-            *(_half_response(one.get(stick)) for one in responses),
+            *(_half_response(column.get(stick)) for column in responses),
         ]
         for stick in diagnosis.half_response_s.get("extended", {})
     ]
@@ -277,7 +286,7 @@ BARS = {
 
 
 def _errors_picture(diagnosis: Diagnosis) -> list[Part]:
-    """Return bars of the errors of free flight by horizon and model; none without such flights."""
+    """Draw bars of the free-flight errors by horizon and model; nothing without such flights."""
     horizons = list(diagnosis.error["extended"].position_m)
     if not horizons:
         return []
@@ -285,16 +294,16 @@ def _errors_picture(diagnosis: Diagnosis) -> list[Part]:
     axes = figure.subplots()
     models = [(name, one.position_m) for name, one in diagnosis.error.items() if one.position_m]
     width = 0.8 / len(models)
-    for place, (name, errors) in enumerate(models):
-        at, heights = (
-            np.arange(len(horizons)) + place * width,
+    for index, (name, errors) in enumerate(models):
+        positions, heights = (
+            np.arange(len(horizons)) + index * width,
             [errors[horizon] for horizon in horizons],
         )
-        axes.bar(at, heights, width, color=BARS[name], label=name.replace("_", " "))
-    every = [error for _, errors in models for error in errors.values()]
-    if max(every) > LOG_BARS * min(every):
+        axes.bar(positions, heights, width, color=BARS[name], label=name.replace("_", " "))
+    all_errors = [error for _, errors in models for error in errors.values()]
+    if max(all_errors) > LOG_BARS * min(all_errors):
         axes.set_yscale("log")
-        axes.set_ylim(bottom=0.5 * min(every))  # the smallest bar shows, too
+        axes.set_ylim(bottom=0.5 * min(all_errors))  # the smallest bar stays visible
     axes.set_xticks(
         np.arange(len(horizons)) + 0.5 * (len(models) - 1) * width, [f"{one} s" for one in horizons]
     )
@@ -305,15 +314,15 @@ def _errors_picture(diagnosis: Diagnosis) -> list[Part]:
     return [Picture(png_of(figure), caption)]
 
 
-def _half_response(found: HalfResponse | None) -> str:
-    """Return a time with its interval, and that to full stick where it differs; ms."""
-    if found is None or not np.isfinite(found.time):
+def _half_response(response: HalfResponse | None) -> str:
+    """Return a time (ms) with its interval, and the time to full stick where it differs."""
+    if response is None or not np.isfinite(response.time):
         return "-"
-    text = f"{1e3 * found.time:.1f}"
-    if found.ci95 is not None:
-        text += f" ± {1e3 * (found.ci95[1] - found.time):.1f}"
-    differs = abs(found.full_stick - found.time) > LIMITED_S
-    return f"{text} ({1e3 * found.full_stick:.0f})" if differs else text
+    text = f"{1e3 * response.time:.1f}"
+    if response.ci95 is not None:
+        text += f" ± {1e3 * (response.ci95[1] - response.time):.1f}"
+    differs = abs(response.full_stick - response.time) > LIMITED_S
+    return f"{text} ({1e3 * response.full_stick:.0f})" if differs else text
 
 
 def _limits_part(diagnosis: Diagnosis) -> Part:
@@ -324,12 +333,12 @@ def _limits_part(diagnosis: Diagnosis) -> Part:
         )
     rows = [
         [
-            f"{words_of(one.effect)}\n({one.effect})",
-            (_number(one.smallest) + _unit(one.unit)).replace(" ", NO_BREAK),
-            list_words(one.confused_with[:MAX_LISTED]) or "noise",
-            one.fly.replace("_", " "),
+            f"{words_of(limit.effect)}\n({limit.effect})",
+            (_number(limit.smallest) + _unit(limit.unit)).replace(" ", NO_BREAK),
+            list_words(limit.confused_with[:MAX_LISTED]) or "noise",
+            limit.fly.replace("_", " "),
         ]
-        for one in diagnosis.not_identifiable
+        for limit in diagnosis.not_identifiable
     ]
     caption = (
         "Smaller than the second column, such an effect may be there without showing in this log."
@@ -339,26 +348,26 @@ def _limits_part(diagnosis: Diagnosis) -> Part:
 
 
 def _unexplained_parts(diagnosis: Diagnosis) -> list[Part]:
-    left = diagnosis.unexplained
-    if not left.depends_on:
+    unexplained = diagnosis.unexplained
+    if not unexplained.depends_on:
         beyond = _beyond(diagnosis)
         return [Text(f"Nothing more. {beyond}" if beyond else "Nothing: the residuals are noise.")]
-    what = ", ".join(left.depends_on)
-    parts: list[Part] = [Text(f"What is left is more than noise. It depends on: {what}.")]
-    if left.shares:
-        shares = [[name, _number(share)] for name, share in left.shares.items()]
+    dependences = ", ".join(unexplained.depends_on)
+    parts: list[Part] = [Text(f"What is left is more than noise. It depends on: {dependences}.")]
+    if unexplained.shares:
+        shares = [[name, _number(share)] for name, share in unexplained.shares.items()]
         caption = "Size of what is left (rms) by what it depends on, in units of the sensor noise"
         parts.append(Table(["channel: dependence", "times the sensor noise"], shares, caption))
     return parts
 
 
-def _learned_parts(diagnosis: Diagnosis, found: Traces) -> list[Part]:
-    """Return the formulas of what was learnt, and what is left without and with it."""
+def _learned_parts(diagnosis: Diagnosis, model_traces: Traces) -> list[Part]:
+    """Return the formulas of what was learnt, and the residuals without and with it."""
     learned = diagnosis.learned
     if learned is None:
         return []
-    panels = [Panel(*one) for one in learned.drawn()][:MAX_PICTURED]
-    figure = draw_cause("what was learnt", panels, found, _LESS + LEARNT)
+    panels = [Panel(*arguments) for arguments in learned.drawn()][:MAX_PICTURED]
+    figure = draw_cause("what was learnt", panels, model_traces, _LESS + LEARNT)
     return [Bullets(learned.text().splitlines()), Picture(png_of(figure), LEARNT_READING)]
 
 
@@ -370,49 +379,59 @@ LEARNT_READING = (
 
 
 def traces_of(diagnosis: Diagnosis, log: FlightLog) -> Traces:
-    """Return the residuals of both models, and of the extended one "without" each cause."""
+    """Return the residuals of both models, and of the extended model "without" each cause."""
     models = {"nominal": diagnosis.nominal, "extended": diagnosis.extended}
     for cause in diagnosis.causes:
         models[_LESS + cause.effect] = without(diagnosis.extended, diagnosis.nominal, cause.effect)
     if diagnosis.learned is not None:
-        kept = tuple(one for one in diagnosis.extended.effects if not isinstance(one, LearnedLaw))
+        kept = tuple(
+            effect for effect in diagnosis.extended.effects if not isinstance(effect, LearnedLaw)
+        )
         models[_LESS + LEARNT] = diagnosis.extended._replace(effects=kept)
     return traces(log, models, like="extended")
 
 
-def while_acting(found: Traces, cause: Cause, start_s: float) -> Traces:
-    """Return traces that count only where a cause acts; start_s: the log's first time."""
-    time = start_s + found.elapsed_s
+def while_acting(model_traces: Traces, cause: Cause, start_s: float) -> Traces:
+    """Return traces whose scored rows are only those where a cause acts.
+
+    Args:
+        start_s: time of the log's first row (s).
+    """
+    time = start_s + model_traces.elapsed_s
     since = -np.inf if cause.onset_s is None else cause.onset_s.value
     until = np.inf if cause.end_s is None else cause.end_s.value
     acts = (time >= since) & (time < until)
-    return found._replace(counts={name: counts & acts for name, counts in found.counts.items()})
+    return model_traces._replace(
+        counts={name: counts & acts for name, counts in model_traces.counts.items()}
+    )
 
 
-def _evidence_parts(diagnosis: Diagnosis, found: Traces, start_s: float) -> list[Part]:
-    """Return the pictures of the causes that gain most.
+def _evidence_parts(diagnosis: Diagnosis, model_traces: Traces, start_s: float) -> list[Part]:
+    """Return the pictures of the causes with the largest gain.
 
-    found: of ``traces_of``. start_s: the log's first time.
+    Args:
+        model_traces: the result of ``traces_of``.
+        start_s: time of the log's first row (s).
     """
     parts: list[Part] = []
     for cause in sorted(diagnosis.causes, key=lambda cause: -cause.chi2_gain)[:MAX_PICTURED]:
         evidence = EVIDENCE[cause.effect]
-        acting = while_acting(found, cause, start_s)
+        acting = while_acting(model_traces, cause, start_s)
         figure = draw_cause(
             cause.effect, evidence.panels, acting, _LESS + cause.effect, when_of(cause)
         )
         parts.append(
             Picture(png_of(figure), f"{evidence.reading} ({cause.effect}{when_of(cause)})")
         )
-    if parts and any(found.used(name) != name for name in ("rates_x", "force_x")):
+    if parts and any(model_traces.used(name) != name for name in ("rates_x", "force_x")):
         parts.append(Text(DIFFERENCES))
     return parts
 
 
 def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
     """Return the report of a diagnosis of a log as a self-contained page."""
-    found = traces_of(diagnosis, log)
-    minutes = found.elapsed_s[-1] / SECONDS_PER_MINUTE
+    model_traces = traces_of(diagnosis, log)
+    minutes = model_traces.elapsed_s[-1] / SECONDS_PER_MINUTE
     introduction: list[Part] = [
         verdict_of(diagnosis),
         Text(
@@ -423,19 +442,19 @@ def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
     ]
     if diagnosis.negligible:
         listed = "; ".join(
-            f"{words_of(one.effect)} ({_plus_minus(one)})" for one in diagnosis.negligible
+            f"{words_of(cause.effect)} ({_plus_minus(cause)})" for cause in diagnosis.negligible
         )
         introduction.append(Text(f"Seen, but negligible: {listed}."))
     if diagnosis.warnings:
         introduction.append(Bullets(diagnosis.warnings))
-    evidence = _evidence_parts(diagnosis, found, float(log.time[0]))
+    evidence = _evidence_parts(diagnosis, model_traces, float(log.time[0]))
     sections = [
         Section("Errors before and after", [*_errors_picture(diagnosis), _errors_table(diagnosis)]),
         *([Section("The evidence, cause by cause", evidence)] if evidence else []),
         Section("What this log could not show, and what to fly", [_limits_part(diagnosis)]),
         Section(
             "What remains unexplained",
-            _unexplained_parts(diagnosis) + _learned_parts(diagnosis, found),
+            _unexplained_parts(diagnosis) + _learned_parts(diagnosis, model_traces),
         ),
         Section("How this was done", [Bullets(HOW)]),
     ]
@@ -443,9 +462,10 @@ def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
 
 
 def write_diagnosis(folder: str | Path, diagnosis: Diagnosis, log: FlightLog) -> list[Path]:
-    """Write a diagnosis into a folder, which is made if need be, and return the files.
+    """Write a diagnosis into a folder, which is created if needed, and return the files.
 
-    log: what was diagnosed (``diagnose.joined`` of several).
+    Args:
+        log: the log that was diagnosed; for several logs, the result of ``diagnose.joined``.
 
     Raises:
         OSError: a file cannot be written.
@@ -499,20 +519,21 @@ def text_of(diagnosis: Diagnosis) -> str:
 
 
 def _limits_text(diagnosis: Diagnosis) -> list[str]:
-    """Return what a log could not show as a small table, and the flight that settles most of it."""
+    """Return a small table of what a log could not show, and the flight that settles most of it."""
     limits = diagnosis.not_identifiable
     if not limits:
         return []
     rows = [("not shown by this log", "visible from", "looks like")]
-    for one in limits[:MAX_LIMITS]:
-        size = f"{one.smallest:.3g} {one.unit}" if np.isfinite(one.smallest) else "-"
-        rows.append((one.effect, size, ", ".join(one.confused_with[:MAX_LISTED]) or "noise"))
+    for limit in limits[:MAX_LIMITS]:
+        size = f"{limit.smallest:.3g} {limit.unit}" if np.isfinite(limit.smallest) else "-"
+        rows.append((limit.effect, size, ", ".join(limit.confused_with[:MAX_LISTED]) or "noise"))
     widths = [max(len(row[column]) for row in rows) for column in range(2)]
     lines = [
-        f"{name:<{widths[0]}}  {size:<{widths[1]}}  {alike}".rstrip() for name, size, alike in rows
+        f"{name:<{widths[0]}}  {size:<{widths[1]}}  {confused}".rstrip()
+        for name, size, confused in rows
     ]
     if len(limits) > MAX_LIMITS:
         lines.append(f"and {len(limits) - MAX_LIMITS} more, in {REPORT_NAME}")
-    flight, number = Counter(one.fly for one in limits).most_common(1)[0]
+    flight, count = Counter(limit.fly for limit in limits).most_common(1)[0]
     to_do = flight if flight.startswith(TO_LOG) else f"fly {flight}"
-    return [*lines, f"recommended: {to_do}, which settles {number} of {len(limits)}"]
+    return [*lines, f"recommended: {to_do}, which settles {count} of {len(limits)}"]

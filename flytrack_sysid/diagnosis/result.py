@@ -11,9 +11,10 @@ from flytrack_sysid.diagnosis.beyond import Learned
 from flytrack_sysid.diagnosis.chunks import AXES
 
 SCHEMA = 1
-TO_LOG = "log "  # what comes instead of a manoeuvre where a channel is missing
+TO_LOG = "log "  # begins the recommendation where a channel is missing, in place of a manoeuvre
 CONSISTENT, CAUSES_FOUND, UNEXPLAINED = "consistent", "causes_found", "unexplained"
-# no effect: what a curve that depends on the voltage may be, which falls with the time
+# Not an effect: an equivalent of a thrust curve that depends on the voltage, which falls with the
+# time.
 DRIFT = "thrust_drift"
 # Direct and level channel of each side: rotation, force, battery.
 CHANNELS: tuple[tuple[str | None, str], ...] = (
@@ -21,7 +22,8 @@ CHANNELS: tuple[tuple[str | None, str], ...] = (
     ("force", "velocity"),
     (None, "battery"),
 )
-# By channel, of ``Problem.residuals``: the axes, and 0 for the direct channel, 1 for the level.
+# Indices into ``Problem.residuals`` by channel: the axes, and 0 for the direct channel, 1 for the
+# level channel.
 PLACES = {
     name: (axes, number)
     for axes, names in zip(AXES, CHANNELS, strict=True)
@@ -42,7 +44,7 @@ class Estimated:
     def around(
         cls, value: float, half: float, unit: str, low: float = -np.inf, high: float = np.inf
     ) -> "Estimated":
-        """Return a value with a symmetric interval, cut at the ends of the value's range."""
+        """Return a value with a symmetric interval, clipped to the value's range."""
         return cls(value, (max(value - half, low), min(value + half, high)), unit)
 
     @property
@@ -53,17 +55,24 @@ class Estimated:
 
 @dataclass(frozen=True)
 class Cause:
-    """Something that the model has wrong, by name.
+    """A named error of the model.
 
-    effect: of ``flytrack_env.effects``, or a base parameter (tau_roll ... tau_thrust, thrust_curve,
-    thrust_scale, battery_drain). equivalent: names that this log cannot tell from it, or DRIFT.
-    channel: rates, attitude, force, velocity or battery: where it shows most. parameters: by name.
-    chi2_gain: what it gains on the part that was fitted, heldout_gain: on the part held out, of
-    minus twice the log likelihood. lambda_: squared size of its signature over the noise, all else
-    that is free taken out. lambda_sep: the same with the closest rival taken out too, and closest
-    which that is; base parameters have none. beyond: where a value lies at the end of what is
-    searched, "delay_s at least 0.04 s": the true cause may be beyond the list. onset_s, end_s: when
-    it began and ended, in the log's time; None where the log begins and ends with it.
+    Attributes:
+        effect: name in ``flytrack_env.effects``, or a base parameter (tau_roll ... tau_thrust,
+            thrust_curve, thrust_scale, battery_drain).
+        equivalent: names that this log cannot distinguish from it, or DRIFT.
+        channel: channel with the largest difference: rates, attitude, force, velocity or battery.
+        parameters: values by name.
+        chi2_gain: decrease of minus twice the log likelihood on the fitted part.
+        heldout_gain: the same on the held-out part.
+        lambda_: squared size of its signature over the noise, with all other free parameters
+            projected out.
+        lambda_sep: the same with the closest rival projected out, too.
+        closest: the closest rival; base parameters have none.
+        beyond: describes a value at the end of its searched range, such as "delay_s at least
+            0.04 s": the true cause may be beyond the list.
+        onset_s: when it began, in the log's time (s); None if it acts from the log's first row.
+        end_s: when it ended, in the log's time (s); None if it acts until the log's last row.
     """
 
     effect: str
@@ -84,9 +93,11 @@ class Cause:
 class Unexplained:
     """What no known cause explains.
 
-    flagged: something is left, or has a value beyond the list. depends_on: what is left varies with
-    position, time, heading, airspeed, attitude, command, "periodic at F Hz" or is stochastic.
-    shares: of each, how many times the sensor noise it is (rms), by "channel: dependence".
+    Attributes:
+        flagged: whether residuals exceed noise, or a value is beyond the list.
+        depends_on: what the residuals vary with: position, time, heading, airspeed, attitude,
+            command, "periodic at F Hz", or stochastic.
+        shares: RMS of each in units of the sensor noise, by "channel: dependence".
     """
 
     flagged: bool = False
@@ -96,11 +107,14 @@ class Unexplained:
 
 @dataclass(frozen=True)
 class NotIdentifiable:
-    """An effect that this log could not have shown, or not apart from others.
+    """An effect that this log could not have shown, or could not distinguish from others.
 
-    smallest: of its parameter that is seen worst, what the log would show for sure. confused_with:
-    what looks alike in this log. fly: what to fly to settle it, one of
-    ``flytrack_sysid.manoeuvres``.
+    Attributes:
+        effect: name of the effect.
+        smallest: smallest detectable size of its least visible parameter.
+        unit: unit of ``smallest``.
+        confused_with: effects with the same signature in this log.
+        fly: the manoeuvre of ``flytrack_sysid.manoeuvres`` that settles it.
     """
 
     effect: str
@@ -114,8 +128,9 @@ class NotIdentifiable:
 class Errors:
     """Errors of one model on the held-out part.
 
-    one_step_nrmse: by channel, 1 is as bad as saying the mean. position_m: by seconds of free
-    flight, rms.
+    Attributes:
+        one_step_nrmse: by channel; 1 is as bad as predicting the mean.
+        position_m: RMS error of position (m), by seconds of free flight.
     """
 
     one_step_nrmse: Mapping[str, float]
@@ -126,8 +141,13 @@ class Errors:
 class Changed:
     """A parameter whose value in the extended model is not the nominal one.
 
-    name: as in ``flytrack_sysid.parameters``. ci95: not finite where the log does not determine it.
-    is_at_bound: it lies at the end of what is searched.
+    Attributes:
+        name: name in ``flytrack_sysid.parameters``.
+        nominal: value in the nominal model.
+        value: value in the extended model.
+        ci95: 95 % interval; not finite if the log does not determine the parameter.
+        unit: unit of the values.
+        is_at_bound: whether the value is at the end of its searched range.
     """
 
     name: str
@@ -140,14 +160,16 @@ class Changed:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Held-out errors of free flights from measured states, rms, and where they tell anything.
+    """Held-out RMS errors of free flights from measured states, and where they are evidence.
 
-    errors: by model (nominal, refitted_base, extended, placebo; refitted_to_flights, the base alone
-    fitted as the extended model was, where that was done; without_learned, the extended model
-    without what was learnt beyond the list), by quantity with its unit, and by seconds. evidence:
-    by quantity, the horizons, s, at which a model predicts better than the placebo, which knows the
-    state at the start and no commands. removal_costs: by effect, by which share these errors grow
-    without it.
+    Attributes:
+        errors: by model, by quantity with its unit, and by seconds of free flight. Models are
+            nominal, refitted_base, extended and placebo. If it was fitted, refitted_to_flights is
+            the base alone, fitted as the extended model. If a law was learnt, without_learned is
+            the extended model without it.
+        evidence: by quantity, the horizons (s) at which a model predicts better than the placebo,
+            which knows the state at the start and no commands.
+        removal_costs: relative increase of these errors without an effect, by effect.
     """
 
     errors: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
@@ -157,12 +179,14 @@ class Prediction:
 
 @dataclass(frozen=True)
 class HalfResponse:
-    """Time from a step of a stick to half of the response, s.
+    """Time from a step of a stick to half of the response (s), as in ``flytrack_sysid.response``.
 
-    time: of a small step. full_stick: of a step to full stick.
+    Times are NaN where there is no response.
 
-    ci95: 95 % interval of the small step's; None where the model was not fitted. As in
-    ``flytrack_sysid.response``; not a number where there is no response.
+    Attributes:
+        time: time for a small step.
+        full_stick: time for a step to full stick.
+        ci95: 95 % interval of ``time``; None if the model was not fitted.
     """
 
     time: float
@@ -172,7 +196,7 @@ class HalfResponse:
 
 @dataclass(frozen=True)
 class Outliers:
-    """How many rows of a channel are outliers, and of how many."""
+    """The number of outliers in a channel, and the number of rows."""
 
     rows: int
     of: int
@@ -180,18 +204,31 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is wrong with a model, according to a log.
+    """The errors of a model, according to a log.
 
-    verdict: consistent, causes_found, unexplained, or "causes_found+unexplained". error: by model:
-    nominal, refitted_base, extended, noise_floor, and without_learned as in ``Prediction``.
-    nominal, base, extended: the models, with the motion that the log shows. negligible: what is
-    significant and too small to matter. beyond: what has a value at the end of what is searched, so
-    that it is not named. source, sha256: of the log. noise: by channel and axis, fitted standard
-    deviations of the sensors. voltages: the lowest and the highest of the battery that were learnt
-    from, V; None where it was not measured. prediction: how far ahead the models predict. changed:
-    every parameter of the extended model that is not as in the nominal one. learned: a law for what
-    is unexplained, part of the extended model. half_response_s: by model (nominal, refitted_base,
-    extended) and by stick. outliers: by channel, if any.
+    Attributes:
+        verdict: consistent, causes_found, unexplained, or "causes_found+unexplained".
+        causes: the errors that the log shows, by name.
+        unexplained: what no known cause explains.
+        not_identifiable: effects that the log could not have shown.
+        error: errors by model: nominal, refitted_base, extended, noise_floor, and without_learned
+            as in ``Prediction``.
+        nominal: the model that is diagnosed, with the motion that the log shows.
+        base: the refitted base, with that motion.
+        extended: the extended model, with that motion.
+        noise: fitted standard deviations of the sensors, by channel and axis.
+        source: file of the log.
+        sha256: hash of the log's content.
+        voltages: lowest and highest battery voltage (V) of the training rows; None if it was not
+            measured.
+        warnings: what a reader must know before trusting the causes.
+        negligible: causes that are significant, but too small to matter.
+        beyond: causes that are not named since a value is at the end of its searched range.
+        prediction: errors of free flight.
+        changed: parameters whose value in the extended model differs from the nominal one.
+        half_response_s: by model (nominal, refitted_base, extended) and by stick.
+        outliers: by channel, if any.
+        learned: a law for what is unexplained, part of the extended model.
     """
 
     verdict: str
@@ -216,7 +253,7 @@ class Diagnosis:
     learned: Learned | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """Return the content of diagnosis.json: fields by the names of its schema, six digits."""
+        """Return the content of diagnosis.json, with the names of its schema and six digits."""
         causes, negligible, beyond = _plain((self.causes, self.negligible, self.beyond))
         limits, unexplained = _plain((self.not_identifiable, self.unexplained))
         unexplained["times_sensor_noise"] = unexplained.pop("shares")
@@ -251,11 +288,11 @@ class Diagnosis:
 def _plain(value: Any) -> Any:
     """Return dataclasses as JSON values: numbers with six digits, None for non-finite ones."""
     if is_dataclass(value):
-        value = {one.name: getattr(value, one.name) for one in fields(value)}
+        value = {item.name: getattr(value, item.name) for item in fields(value)}
     if isinstance(value, Mapping):
-        return {key: _plain(one) for key, one in value.items()}
+        return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
+        return [_plain(item) for item in value]
     if isinstance(value, float):
         return float(f"{value:.6g}") if np.isfinite(value) else None
     return value

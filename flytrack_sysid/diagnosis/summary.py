@@ -52,7 +52,7 @@ from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES
 from flytrack_sysid.response import FULL_STEP, SMALL_STEP, half_responses
 
 TWO_SIDED_95 = 1.959964
-LOOSE = 0.5  # of the prior's width: a parameter that the log knows no better is not determined
+LOOSE = 0.5  # of the prior's width: a parameter with a wider interval is not determined
 SCALE_TWINS = (
     "thrust_curve",
 )  # mass, payload, battery and motors all scale the thrust over the mass
@@ -66,11 +66,13 @@ def estimates(
     """Return values and 95 % intervals of determined parameters, by name without the effect."""
     problem = linearization.problem
     halves = Marginal(linearization, model, fields).half_widths()
-    result, least = {}, halves.min()  # at least one parameter of each effect is listed
+    result, smallest = {}, halves.min()  # at least one parameter of each effect is listed
     for field, half in zip(fields, halves, strict=True):
-        place = problem.names.index(field)
-        value, low, high = (float(one[place]) for one in (model.vector, problem.low, problem.high))
-        if "." in field and half > LOOSE * (high - low) and half > least:
+        index = problem.names.index(field)
+        value, low, high = (
+            float(values[index]) for values in (model.vector, problem.low, problem.high)
+        )
+        if "." in field and half > LOOSE * (high - low) and half > smallest:
             continue
         name, unit = field.split(".")[-1], range_of(field).unit
         result[name] = Estimated.around(value, float(half), unit, low, high)
@@ -81,13 +83,13 @@ def estimates(
 
 
 def mean_thrust(problem: Problem) -> np.ndarray:
-    """Return the mean thrust of judged rows, N, per unit of each thrust coefficient, (6,)."""
-    record, flown = problem.chunks.record, problem.counts.any(axis=(2, 3))
+    """Return the mean thrust of scored rows (N) per unit of each thrust coefficient, (6,)."""
+    record, is_scored = problem.chunks.record, problem.counts.any(axis=(2, 3))
     return np.array(
         [
             np.mean(
                 np.asarray(collective_thrust(record.command[..., 3], record.battery_v, coeffs))[
-                    flown
+                    is_scored
                 ]
             )
             for coeffs in np.eye(len(THRUST_COEFFS))
@@ -100,10 +102,14 @@ def mean_factor(problem: Problem, vector: np.ndarray, half_n: float) -> dict[str
 
     Individual coefficients are not interpretable.
 
-    half_n: half of the 95 % interval of the mean thrust, N. Empty where the nominal one has none.
+    Args:
+        half_n: half of the 95 % interval of the mean thrust (N).
+
+    Returns:
+        The ratio as ``mean_factor``; empty if the nominal model has no thrust.
     """
     indices, slopes = problem.indices_of(THRUST_COEFFS), mean_thrust(problem)
-    before, after = (float(slopes @ own[indices]) for own in (problem.start, vector))
+    before, after = (float(slopes @ parameters[indices]) for parameters in (problem.start, vector))
     if before <= 0.0:
         return {}
     return {"mean_factor": Estimated.around(after / before, half_n / before, "1")}
@@ -115,61 +121,65 @@ def half_responses_of(
     refined: Refined,
     vectors: Mapping[str, np.ndarray],
 ) -> dict[str, dict[str, HalfResponse]]:
-    """Return the times to half response of models by name, by stick.
+    """Return the times to half response by model and stick.
 
-    The intervals of the extended model are to first order those of all its parameters together.
+    The extended model also gets intervals: first-order propagation of the covariance of all its
+    parameters.
     """
     problem, fit = refined.problem, refined.fit
     indices = list(model.indices if fit is None else fit.indices)
-    moved, step = problem.nudged(vectors["extended"], indices, SLOPE_STEP)
-    found = half_responses(np.stack([*vectors.values(), *moved]), problem.like, SMALL_STEP)
+    nudged, step = problem.nudged(vectors["extended"], indices, SLOPE_STEP)
+    small = half_responses(np.stack([*vectors.values(), *nudged]), problem.like, SMALL_STEP)
     full = half_responses(np.stack(list(vectors.values())), problem.like, FULL_STEP)
-    own = found[list(vectors).index("extended")]
-    slopes = np.nan_to_num((found[len(vectors) :] - own) / step[:, None]).T
+    extended = small[list(vectors).index("extended")]
+    slopes = np.nan_to_num((small[len(vectors) :] - extended) / step[:, None]).T
     if fit is None:
-        names = [problem.names[place] for place in indices]
+        names = [problem.names[index] for index in indices]
         halves = Marginal(linearization, model, names).half_widths(slopes)
     else:
         halves = np.sqrt(np.diag(slopes @ fit.covariance @ slopes.T))
     result = {
         name: dict(zip(STICKS, map(HalfResponse, small_s.tolist(), full_s.tolist()), strict=True))
-        for name, small_s, full_s in zip(vectors, found, full, strict=False)
+        for name, small_s, full_s in zip(vectors, small, full, strict=False)
     }
-    for (stick, one), half in zip(result["extended"].items(), halves.tolist(), strict=True):
-        result["extended"][stick] = replace(one, ci95=(max(one.time - half, 0.0), one.time + half))
+    for (stick, response), half in zip(result["extended"].items(), halves.tolist(), strict=True):
+        result["extended"][stick] = replace(
+            response, ci95=(max(response.time - half, 0.0), response.time + half)
+        )
     return result
 
 
-def channel_of(problem: Problem, less: np.ndarray, full: np.ndarray) -> str:
+def channel_of(problem: Problem, reduced: np.ndarray, full: np.ndarray) -> str:
     """Return the channel in which two models differ most, in multiples of the noise."""
-    white = problem.whitened_residuals(less, full)
+    white = problem.whitened_residuals(reduced, full)
     by_axis = np.square(white[1] - white[0]).sum(axis=(0, 1))
-    power = {name: float(by_axis[place].sum()) for name, place in PLACES.items()}
+    power = {name: float(by_axis[index].sum()) for name, index in PLACES.items()}
     return max(power, key=lambda name: power[name])
 
 
 def effect_causes(
     selection: vetoes.Selection, test: Problem, linearization: Linearization
 ) -> list[Cause]:
-    """Return the effects of a model as causes, those that explain most first.
+    """Return the effects of a model as causes, sorted by what they explain, largest first.
 
-    A force may as well be one of the laws of velocity or attitude where the log lacks these.
+    If the log lacks velocity or attitude, the laws that need these are equivalents of every force.
     """
     problem, model = selection.state.problem, selection.model
     causes = []
-    for one in model.candidates:
-        ablation = selection.ablations[one.effect]
-        less = ablation.without.vector
-        own = separation(linearization, model, one.effect)
-        # Refitted where that was worth it, else to first order.
+    for candidate in model.candidates:
+        ablation = selection.ablations[candidate.effect]
+        reduced = ablation.without.vector
+        separated = separation(linearization, model, candidate.effect)
+        # Rivals are refitted where that was worth it, and compared to first order elsewhere.
         rivals = {
-            name: min(ablation.rivals.get(name, size), size) for name, size in own.beside.items()
+            name: min(ablation.rivals.get(name, size), size)
+            for name, size in separated.beside.items()
         }
         closest = min(rivals, key=lambda name: rivals[name], default="")
-        alike = equivalents(ablation, own)
-        channel = channel_of(problem, less, model.vector)
+        equivalent = equivalents(ablation, separated)
+        channel = channel_of(problem, reduced, model.vector)
         if channel in CHANNELS[1]:
-            alike += tuple(
+            equivalent += tuple(
                 name
                 for name in selection.state.unobservable
                 if vetoes.is_force_law(name)
@@ -177,18 +187,18 @@ def effect_causes(
             )
         causes.append(
             Cause(
-                effect=one.effect,
-                equivalent=alike,
+                effect=candidate.effect,
+                equivalent=equivalent,
                 channel=channel,
-                parameters=estimates(linearization, model, one.fields),
+                parameters=estimates(linearization, model, candidate.fields),
                 chi2_gain=ablation.gain,
-                heldout_gain=vetoes.held_out_gain(test, less, model.vector)[0],
-                lambda_=own.noncentrality,
-                lambda_sep=max(rivals.get(closest, own.noncentrality), 0.0),
+                heldout_gain=vetoes.held_out_gain(test, reduced, model.vector)[0],
+                lambda_=separated.noncentrality,
+                lambda_sep=max(rivals.get(closest, separated.noncentrality), 0.0),
                 closest=closest,
             )
         )
-    # A scale of thrust that was found in place of a thrust curve may be a remainder, too.
+    # A thrust scale that was selected in place of a thrust curve may be a remainder, too.
     kept = [
         cause
         for cause in causes
@@ -197,11 +207,11 @@ def effect_causes(
     return sorted(kept, key=lambda cause: -cause.chi2_gain)
 
 
-def _is_remainder(cause: Cause, others: Sequence[Cause]) -> bool:
-    """Return whether a cause gains next to nothing beside another one in the same channels."""
+def _is_remainder(cause: Cause, causes: Sequence[Cause]) -> bool:
+    """Return whether a cause gains next to nothing compared with one in the same channels."""
     side = next(names for names in CHANNELS if cause.channel in names)
-    most = max((one.chi2_gain for one in others if one.channel in side), default=0.0)
-    return cause.chi2_gain < vetoes.BASE_REMAINDER * most
+    largest = max((peer.chi2_gain for peer in causes if peer.channel in side), default=0.0)
+    return cause.chi2_gain < vetoes.BASE_REMAINDER * largest
 
 
 def base_causes(
@@ -212,7 +222,8 @@ def base_causes(
 ) -> tuple[list[Cause], list[str]]:
     """Return base changes that the log shows, as causes, and names that held-out rows contradict.
 
-    effects: the other causes.
+    Args:
+        effects: the causes that are effects. Base changes that are remainders of them are omitted.
     """
     problem, model = selection.state.problem, selection.model
     causes: list[Cause] = []
@@ -240,7 +251,7 @@ def base_causes(
 def vector_without(
     cause: Cause, selection: vetoes.Selection, linearization: Linearization
 ) -> np.ndarray:
-    """Return the extended model without one of its causes, the rest fitted again."""
+    """Return the extended model without one of its causes, all other parameters refitted."""
     if cause.effect in selection.ablations:
         return selection.ablations[cause.effect].without.vector
     name = "thrust_curve" if cause.effect == "thrust_scale" else cause.effect
@@ -250,34 +261,37 @@ def vector_without(
 def _refitted_to_first_order(
     linearization: Linearization, model: FittedModel, fields: Sequence[str]
 ) -> np.ndarray:
-    """Return the vector with some parameters at nominal, the rest refitted to first order."""
+    """Return the vector with some parameters at nominal, the others refitted to first order."""
     problem = linearization.problem
-    indices, less = problem.indices_of(fields), problem.at_start(model.vector, fields)
-    others = [place for place in model.indices if place not in set(indices)]
-    columns, own = linearization.columns_at(others), linearization.columns_at(indices)
-    change = less[indices] - model.vector[indices]
-    score = linearization.score[columns] - linearization.total[np.ix_(columns, own)] @ change
-    less[others] += solve(linearization.total[np.ix_(columns, columns)], score)
-    return problem.clipped(less)
+    indices, vector = problem.indices_of(fields), problem.at_start(model.vector, fields)
+    free = [index for index in model.indices if index not in set(indices)]
+    free_columns, held_columns = linearization.columns_at(free), linearization.columns_at(indices)
+    change = vector[indices] - model.vector[indices]
+    score = (
+        linearization.score[free_columns]
+        - linearization.total[np.ix_(free_columns, held_columns)] @ change
+    )
+    vector[free] += solve(linearization.total[np.ix_(free_columns, free_columns)], score)
+    return problem.clipped(vector)
 
 
 def _as_thrust_scale(
     cause: Cause, change: BaseChange, problem: Problem, model: FittedModel
 ) -> Cause:
-    """Return a thrust curve as a scale of thrust if one factor explains all of its change."""
+    """Convert a thrust curve to a scale of thrust if one factor explains all of its change."""
     if cause.effect != "thrust_curve":
         return cause
     indices, information = problem.indices_of(change.fields), change.marginal.information
     nominal, values = problem.start[indices], model.vector[indices]
-    along = nominal @ information
-    known = float(along @ nominal)
-    if known <= 0.0:
+    projection = nominal @ information
+    norm = float(projection @ nominal)
+    if norm <= 0.0:
         return cause  # a curve of zeros
-    factor = float(along @ values) / known
-    rest = values - factor * nominal
-    if rest @ information @ rest / change.marginal.inflation > threshold(len(values) - 1):
+    factor = float(projection @ values) / norm
+    residual = values - factor * nominal
+    if residual @ information @ residual / change.marginal.inflation > threshold(len(values) - 1):
         return cause
-    half = TWO_SIDED_95 * float(np.sqrt(change.marginal.inflation / known))
+    half = TWO_SIDED_95 * float(np.sqrt(change.marginal.inflation / norm))
     scale = {"factor": Estimated.around(factor, half, "1")}
     return replace(cause, effect="thrust_scale", equivalent=SCALE_TWINS, parameters=scale)
 
@@ -285,86 +299,90 @@ def _as_thrust_scale(
 def not_identifiable(
     state: SearchState, linearization: Linearization, model: FittedModel, causes: Sequence[Cause]
 ) -> tuple[NotIdentifiable, ...]:
-    """Return effects that the log could not show or tell from others, with what to fly."""
+    """Return effects that the log cannot show or distinguish from others, with what to fly."""
     limits = unseen_effects(state, linearization, model)
     twins: dict[str, tuple[str, ...]] = {}
     for cause in causes:
         if cause.effect in BY_NAME and cause.equivalent and cause.effect != "thrust_scale":
             twins[cause.effect] = (*twins.get(cause.effect, ()), *cause.equivalent)
             twins |= {name: (*twins.get(name, ()), cause.effect) for name in cause.equivalent}
-    wanted = {name: limit.confused_with for name, limit in limits.items()} | twins
+    confusions = {name: limit.confused_with for name, limit in limits.items()} | twins
     flights = {
         name: TO_LOG + " and ".join(BY_NAME[name].search.needs) for name in state.unobservable
     }
-    asked = {name: alike for name, alike in wanted.items() if name not in state.unobservable}
-    flights |= advise(state.problem, model, linearization, asked)
+    observable = {
+        name: equivalent
+        for name, equivalent in confusions.items()
+        if name not in state.unobservable
+    }
+    flights |= advise(state.problem, model, linearization, observable)
     result = []
-    for name, alike in wanted.items():
-        # A twin of what was found has no size of its own.
+    for name, equivalent in confusions.items():
+        # An equivalent of a named cause has no detectable size of its own.
         twin = NotIdentifiable(name, float("inf"), unit_of(name), (), "")
         result.append(
-            replace(limits.get(name, twin), confused_with=tuple(alike), fly=flights[name])
+            replace(limits.get(name, twin), confused_with=tuple(equivalent), fly=flights[name])
         )
     return tuple(result)
 
 
-def verdict_of(causes: Sequence[Cause], rest: Unexplained) -> str:
+def verdict_of(causes: Sequence[Cause], unexplained: Unexplained) -> str:
     """Return the verdict, as in ``Diagnosis``."""
-    if causes and rest.flagged:
+    if causes and unexplained.flagged:
         return f"{CAUSES_FOUND}+{UNEXPLAINED}"
     if causes:
         return CAUSES_FOUND
-    return UNEXPLAINED if rest.flagged else CONSISTENT
+    return UNEXPLAINED if unexplained.flagged else CONSISTENT
 
 
 def model_of(problem: Problem, model: FittedModel) -> ModelParameters:
     """Return a fitted model in float32, with its effects and those of the nominal model."""
-    found = as_float32(from_vector(model.vector, problem.like))
+    parameters = as_float32(from_vector(model.vector, problem.like))
     kept = model.effects | set(problem.given_effects)
-    return found._replace(
-        effects=tuple(one for one in found.effects if effect_of(one).name in kept)
+    return parameters._replace(
+        effects=tuple(effect for effect in parameters.effects if effect_of(effect).name in kept)
     )
 
 
 def _by_channel(values: np.ndarray, problem: Problem) -> dict[str, np.ndarray]:
-    """Return values (NUM_AXES, 2) by channel that is judged; (axes of it,) each."""
+    """Return values, (NUM_AXES, 2), by scored channel, each (num_axes of the channel,)."""
     return {
-        name: values[place] for name, place in PLACES.items() if problem.counts[..., *place].any()
+        name: values[index] for name, index in PLACES.items() if problem.counts[..., *index].any()
     }
 
 
 def sensor_noise(problem: Problem) -> dict[str, list[float]]:
     """Return the fitted standard deviations of the sensors, by channel and axis (world frame)."""
     noise = problem.fitted_noise
-    found = np.stack([np.asarray(noise.direct), np.asarray(noise.level)], axis=-1)
+    deviations = np.stack([np.asarray(noise.direct), np.asarray(noise.level)], axis=-1)
     return {
-        name: [float(f"{value:.4g}") for value in own]
-        for name, own in _by_channel(found, problem).items()
+        name: [float(f"{value:.4g}") for value in by_axis]
+        for name, by_axis in _by_channel(deviations, problem).items()
     }
 
 
-def _with_voltage_summed(left: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return residuals with those of the battery summed up, less their mean in each chunk.
+def _with_voltage_summed(residuals: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return residuals with those of the voltage summed up, less their mean in each chunk.
 
-    A voltage changes by less in a step than its last digit, so that a single step tells nothing of
-    it.
+    In one step a voltage changes by less than its last digit, so that the residual of one step
+    contains no information about it.
     """
-    found = left.copy()
+    result = residuals.copy()
     is_counted = counts[..., -1, 1]
-    level = np.cumsum(left[..., -1, 1], axis=0)
+    level = np.cumsum(residuals[..., -1, 1], axis=0)
     mean = np.where(is_counted, level, 0.0).sum(axis=0) / np.maximum(is_counted.sum(axis=0), 1)
-    found[..., -1, 1] = level - mean
-    return found
+    result[..., -1, 1] = level - mean
+    return result
 
 
-def _rms(left: np.ndarray, counts: np.ndarray, is_centred: bool = False) -> np.ndarray:
-    number = np.maximum(counts.sum(axis=(0, 1)), 1)
-    mean = np.where(counts, left, 0.0).sum(axis=(0, 1)) / number if is_centred else 0.0
-    return np.sqrt(np.where(counts, (left - mean) ** 2, 0.0).sum(axis=(0, 1)) / number)
+def _rms(residuals: np.ndarray, counts: np.ndarray, is_centred: bool = False) -> np.ndarray:
+    num_rows = np.maximum(counts.sum(axis=(0, 1)), 1)
+    mean = np.where(counts, residuals, 0.0).sum(axis=(0, 1)) / num_rows if is_centred else 0.0
+    return np.sqrt(np.where(counts, (residuals - mean) ** 2, 0.0).sum(axis=(0, 1)) / num_rows)
 
 
 def _free_flight_floor(problem: Problem) -> dict[str, float]:
-    """Return the free-flight position errors due to noise at the start alone, m, by horizon."""
+    """Return the free-flight position errors (m) due to noise at the start alone, by horizon."""
     level = np.asarray(problem.fitted_noise.level)
     speed, tilt = np.sqrt(np.sum(level[3:6] ** 2)), np.sqrt(np.sum(level[:2] ** 2))
     gravity = float(problem.like.g)
@@ -379,43 +397,48 @@ def errors_of(
 ) -> dict[str, Errors]:
     """Return errors of models on held-out rows, by name, and those of sensor noise alone.
 
-    One-step errors are relative to those of a model that does not move, whose residuals are the
+    One-step errors are relative to those of a model that does not move. Its residuals are the
     measured changes themselves, less their mean.
+
+    Args:
+        test: the problem of the held-out rows.
+        vectors: parameters of each model, by name.
+        prediction: errors of free flight, of which the position errors are used.
     """
-    still = test.start.copy()
-    still[test.indices_of(STILL)] = 0.0
-    left = [
-        _with_voltage_summed(one, test.counts)
-        for one in test.residuals(np.stack([still, *vectors.values()]))
+    motionless = test.start.copy()
+    motionless[test.indices_of(STILL)] = 0.0
+    residuals = [
+        _with_voltage_summed(model_residuals, test.counts)
+        for model_residuals in test.residuals(np.stack([motionless, *vectors.values()]))
     ]
-    scales = _by_channel(_rms(left[0], test.counts, is_centred=True), test)
+    scales = _by_channel(_rms(residuals[0], test.counts, is_centred=True), test)
 
     def relative(errors: np.ndarray) -> dict[str, float]:
         return {
-            name: float(np.linalg.norm(own)) / max(float(np.linalg.norm(scales[name])), 1e-12)
-            for name, own in _by_channel(errors, test).items()
+            name: float(np.linalg.norm(values)) / max(float(np.linalg.norm(scales[name])), 1e-12)
+            for name, values in _by_channel(errors, test).items()
         }
 
     result, flights = {}, prediction.errors
-    for name, one in zip(vectors, left[1:], strict=True):
-        flown = flights.get(name, {}).get("position_m", {})
-        result[name] = Errors(relative(_rms(one, test.counts)), flown)
+    for name, model_residuals in zip(vectors, residuals[1:], strict=True):
+        position_errors = flights.get(name, {}).get("position_m", {})
+        result[name] = Errors(relative(_rms(model_residuals, test.counts)), position_errors)
     noise = test.fitted_noise
     floor = np.stack([np.asarray(noise.direct), np.sqrt(2.0) * np.asarray(noise.level)], axis=-1)
     floor[-1, 1] = noise.level[-1]  # summed up, not a difference of two
-    flown = _free_flight_floor(test) if result["extended"].position_m else {}
-    result["noise_floor"] = Errors(relative(floor), flown)
+    position_errors = _free_flight_floor(test) if result["extended"].position_m else {}
+    result["noise_floor"] = Errors(relative(floor), position_errors)
     return result
 
 
 def _is_beyond(problem: Problem, vector: np.ndarray, field: str) -> str:
-    """Return which way a parameter would go beyond its range; empty within the range."""
+    """Describe the end of the range at which a parameter is; empty within the range."""
     if not at_bounds(problem, vector, [field]):
         return ""
-    place = problem.names.index(field)
-    is_low = vector[place] - problem.low[place] < problem.high[place] - vector[place]
+    index = problem.names.index(field)
+    is_low = vector[index] - problem.low[index] < problem.high[index] - vector[index]
     unit = range_of(field).unit
-    size = f"{vector[place]:.3g}" + ("" if unit == "1" else f" {unit}")
+    size = f"{vector[index]:.3g}" + ("" if unit == "1" else f" {unit}")
     return f"{field.split('.')[-1]} at {'most' if is_low else 'least'} {size}"
 
 
@@ -424,8 +447,8 @@ def causes_at_end(
 ) -> tuple[Cause, ...]:
     """Return effects with a value at the end of its range, as causes that say which end.
 
-    Left out are values that the log does not determine, which end anywhere, and delays that end at
-    how many rows are remembered: their law holds.
+    Two kinds of values are omitted: those that the log does not determine, which a fit leaves
+    anywhere, and delays that are as long as the rows that are remembered, whose law holds.
     """
     problem, model = selection.state.problem, selection.model
     searched, vector = problem, model.vector
@@ -440,13 +463,13 @@ def causes_at_end(
             continue
         marginal = Marginal(selection.state.linearized(model.vector)[1], model, one.fields)
         widths = dict(zip(one.fields, marginal.half_widths(), strict=True))
-        where = [
+        ends = [
             _is_beyond(searched, vector, field)
             for field in fields
             if widths[field] < LOOSE * ranges[field]
         ]
-        if where:
-            stuck[one.effect] = ", ".join(where)
+        if ends:
+            stuck[one.effect] = ", ".join(ends)
     if not stuck:
         return ()
     state, linearization = selection.state.linearized(model.vector)
@@ -458,7 +481,7 @@ def causes_at_end(
 def with_refined_values(
     causes: Sequence[Cause], refined: Refined, vector: np.ndarray
 ) -> tuple[Cause, ...]:
-    """Return causes with refined values and intervals, and which of the values are at a bound."""
+    """Return causes with refined values and intervals, and with the values that are at a bound."""
     problem, fit = refined.problem, refined.fit
     half = {} if fit is None else dict(zip(fit.indices, fit.half_widths, strict=True))
     result = []
@@ -467,19 +490,23 @@ def with_refined_values(
         fields = [prefix + name for name in cause.parameters if prefix + name in problem.names]
         values = dict(cause.parameters)
         for field in fields:
-            place, name = problem.names.index(field), field.split(".")[-1]
-            if half.get(place) == 0.0 and len(values) > 1:
+            index, name = problem.names.index(field), field.split(".")[-1]
+            if half.get(index) == 0.0 and len(values) > 1:
                 del values[name]  # no flight depends on it
-            elif place in half:
+            elif index in half:
                 value, low, high = (
-                    float(one[place]) for one in (vector, problem.low, problem.high)
+                    float(array[index]) for array in (vector, problem.low, problem.high)
                 )
-                values[name] = Estimated.around(value, half[place], range_of(field).unit, low, high)
+                values[name] = Estimated.around(value, half[index], range_of(field).unit, low, high)
         fields = [field for field in fields if field.split(".")[-1] in values]
         if "mean_factor" in values and fit is not None:
-            own = [fit.indices.index(place) for place in problem.indices_of(THRUST_COEFFS)]
+            thrust_columns = [
+                fit.indices.index(index) for index in problem.indices_of(THRUST_COEFFS)
+            ]
             slopes = mean_thrust(problem)
-            half_n = float(np.sqrt(slopes @ fit.covariance[np.ix_(own, own)] @ slopes))
+            half_n = float(
+                np.sqrt(slopes @ fit.covariance[np.ix_(thrust_columns, thrust_columns)] @ slopes)
+            )
             values |= mean_factor(problem, vector, half_n)
         if len(fields) == 1 and fit is not None and "." not in fields[0]:
             low, high = values[fields[0]].ci95
@@ -491,18 +518,20 @@ def with_refined_values(
 
 
 def prediction_of(refined: Refined, vectors: Mapping[str, np.ndarray]) -> Prediction:
-    """Return how far ahead models predict held-out flights; empty if too few could be judged."""
+    """Return the errors of models on held-out flights, by horizon; empty without a flight test."""
     flight_test = refined.flight_test
     if flight_test is None:
         return Prediction()
     models = dict(vectors)
     if refined.base is not None:
         models["refitted_to_flights"] = refined.base
-    found = errors_at(refined.problem, np.stack(list(models.values())), flight_test.windows).rms()
-    errors = {name: table_of(one) for name, one in zip(models, found, strict=True)}
+    rms = errors_at(refined.problem, np.stack(list(models.values())), flight_test.windows).rms()
+    errors = {name: table_of(value) for name, value in zip(models, rms, strict=True)}
     errors["placebo"] = table_of(flight_test.placebo.rms()[0])
     evidence = {
-        quantity: tuple(float(one) for one in np.array(HORIZONS_S)[flight_test.matters[:, index]])
+        quantity: tuple(
+            float(value) for value in np.array(HORIZONS_S)[flight_test.matters[:, index]]
+        )
         for index, quantity in enumerate(QUANTITIES)
         if flight_test.is_known[:, index].any()
     }
@@ -515,40 +544,44 @@ def changed_parameters(
     """Return every parameter of the extended model whose value differs from the nominal one."""
     problem, fit, vector = refined.problem, refined.fit, extended.vector
     indices = [
-        place for place in extended.indices if abs(vector[place] - problem.start[place]) > 0.0
+        index for index in extended.indices if abs(vector[index] - problem.start[index]) > 0.0
     ]
     if fit is not None:
         widths = dict(zip(fit.indices, fit.half_widths, strict=True))
     else:
         acting = [
-            place for place in indices if linearization.acting([linearization.indices.index(place)])
+            index for index in indices if linearization.acting([linearization.indices.index(index)])
         ]
         halves = Marginal(
-            linearization, extended, [problem.names[place] for place in acting]
+            linearization, extended, [problem.names[index] for index in acting]
         ).half_widths()
         widths = dict(zip(acting, halves, strict=True))
     result = []
-    for place in indices:
+    for index in indices:
         name, value, half = (
-            problem.names[place],
-            float(vector[place]),
-            float(widths.get(place, np.inf)),
+            problem.names[index],
+            float(vector[index]),
+            float(widths.get(index, np.inf)),
         )
         bound = bool(at_bounds(problem, vector, [name]))
         ends, unit = (value - half, value + half), range_of(name).unit
-        result.append(Changed(name, float(problem.start[place]), value, ends, unit, bound))
+        result.append(Changed(name, float(problem.start[index]), value, ends, unit, bound))
     return tuple(result)
 
 
 def refinement_notes(refined: Refined, model: FittedModel) -> list[str]:
-    """Return what a refinement found out beside values; model: what is left of the selected one."""
+    """Return notes on a refinement: removed effects, and horizons without evidence.
+
+    Args:
+        model: the extended model after the refinement.
+    """
     flight_test = refined.flight_test
     if flight_test is None:
         return []
     notes = []
     removed = [
         *refined.removed,
-        *(one.effect for one in refined.kept if one not in model.candidates),
+        *(candidate.effect for candidate in refined.kept if candidate not in model.candidates),
     ]
     if removed:
         names = ", ".join(removed)
@@ -578,7 +611,8 @@ def warnings_of(
 ) -> list[str]:
     """Return what a reader must know before trusting causes or the extended model.
 
-    contradicted: names that were rejected because held-out rows contradict them.
+    Args:
+        contradicted: names that were rejected because held-out rows contradict them.
     """
     return [
         *_voltage_unknown(problem, causes),
@@ -591,12 +625,15 @@ def warnings_of(
 
 
 def stand_in_notes(selection: vetoes.Selection, vector: np.ndarray) -> list[str]:
-    """Return base changes that are not named since something unknown may be their cause.
+    """Return notes on base changes that are not named since something unknown may be their cause.
 
-    vector: of the extended model. In hover, a constant push passes for thrust.
+    In hover, for example, a constant force is equivalent to a change of thrust.
+
+    Args:
+        vector: parameters of the extended model, (num_parameters,).
     """
     problem, notes = selection.state.problem, []
-    for name in (one for one in selection.stand_ins if one in BASE_CAUSES):
+    for name in (cause for cause in selection.stand_ins if cause in BASE_CAUSES):
         size = ""
         if name == "thrust_curve":
             for factor in mean_factor(problem, vector, 0.0).values():
@@ -608,9 +645,9 @@ def stand_in_notes(selection: vetoes.Selection, vector: np.ndarray) -> list[str]
     return notes
 
 
-def given_law_notes(problem: Problem, rest: Unexplained) -> list[str]:
-    """Return that no law is looked for beside one that the nominal model has from another log."""
-    if not problem.has_given_law or not rest.shares:
+def given_law_notes(problem: Problem, unexplained: Unexplained) -> list[str]:
+    """Return a note that no law is learnt if the nominal model has one from another log."""
+    if not problem.has_given_law or not unexplained.shares:
         return []
     return [
         "the model has learned_law from another log: nothing is learnt beside that; diagnose the "
@@ -619,7 +656,7 @@ def given_law_notes(problem: Problem, rest: Unexplained) -> list[str]:
 
 
 def unseen_at_rest_notes(rejected: Mapping[str, vetoes.Veto]) -> list[str]:
-    """Return laws of the sticks that were rejected for what they do while those rest."""
+    """Return a note on laws of the sticks that were rejected for their action at resting sticks."""
     names = ", ".join(name for name, veto in rejected.items() if veto is vetoes.not_seen_at_rest)
     if not names:
         return []
@@ -630,7 +667,7 @@ def unseen_at_rest_notes(rejected: Mapping[str, vetoes.Veto]) -> list[str]:
 
 
 def _at_bound(cause: Cause) -> str:
-    """Return a warning of a value at the end of its range: the true cause may be another one."""
+    """Return a warning about a value at the end of its range: the true cause may be another."""
     why = "its law may stand in for something else"
     if cause.effect in BY_NAME:
         why += ", and is not in the extended model"
@@ -642,7 +679,7 @@ def _at_bound(cause: Cause) -> str:
 
 
 def _voltage_unknown(problem: Problem, causes: Sequence[Cause]) -> list[str]:
-    """Return a warning where thrust is named and the voltage it depends on was not measured."""
+    """Return a warning if thrust is named and the voltage that it depends on was not measured."""
     thrust = [cause.effect for cause in causes if cause.effect in ("thrust_curve", "thrust_scale")]
     if not thrust or voltages_of(problem.chunks) is not None:
         return []
@@ -652,8 +689,11 @@ def _voltage_unknown(problem: Problem, causes: Sequence[Cause]) -> list[str]:
     return [f"{assumed}: {thrust[0]} may only be the error of that"]
 
 
-def with_lost_causes(rest: Unexplained, contradicted: Sequence[str]) -> Unexplained:
-    """Return what is unexplained; it depends on time where a cause was there for a time only."""
-    if not contradicted or "time" in rest.depends_on:
-        return rest
-    return replace(rest, flagged=True, depends_on=(*rest.depends_on, "time"))
+def with_lost_causes(unexplained: Unexplained, contradicted: Sequence[str]) -> Unexplained:
+    """Add a dependence on time to what is unexplained if held-out rows contradict a cause.
+
+    Such a cause acted for a part of the flight only.
+    """
+    if not contradicted or "time" in unexplained.depends_on:
+        return unexplained
+    return replace(unexplained, flagged=True, depends_on=(*unexplained.depends_on, "time"))

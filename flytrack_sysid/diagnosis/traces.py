@@ -1,4 +1,4 @@
-"""Residuals of models by row of a log, and regressors to plot them against: speed, sticks, place.
+"""Residuals of models by row of a log, and regressors to plot them against, such as airspeed.
 
 ============  =====================================================================  =======
 channel       residual of a row, measured minus modelled                             unit
@@ -11,7 +11,7 @@ channel       residual of a row, measured minus modelled                        
 ============  =====================================================================  =======
 
 ``attitude`` and ``velocity`` measure the same as ``rates`` and ``force``, without gyro and
-accelerometer: what shows in only one of a pair is wrong with a sensor.
+accelerometer. A residual in only one channel of a pair is the error of a sensor.
 """
 
 from collections.abc import Mapping
@@ -35,20 +35,25 @@ UNITS = {"rates": "rad/s", "attitude": "rad/s", "force": "m/s²", "velocity": "m
 _PER_STEP = ("attitude", "velocity", "battery")  # changes since the row before
 _INSTEAD = {"rates": "attitude", "force": "velocity"}
 _AXES = "xyz"
-BETWEEN_FLIGHTS = 1000  # slots: no lag of a correlation reaches from one flight into the next
+BETWEEN_FLIGHTS = 1000  # slots: more than any lag of a correlation, so that flights are separate
 
 
 class Traces(NamedTuple):
     """Residuals of models and regressors, a value per row of the log.
 
-    residuals: model -> channel -> (num_rows, 3), battery (num_rows, 1); units of the module's
-    table; anything where nothing counts. counts: channel -> (num_rows,) bool, what a fit is made
-    of; all False of a channel that the log lacks. regressors: (num_rows,) each, in the units of
-    ``REGRESSORS``. elapsed_s: (num_rows,) s, flights one after the other. slot: (num_rows,) int,
-    place of a row among evenly spaced ones; a lost row leaves its slot empty, and flights are far
-    apart. step_s: between slots. attitude: body to world, of the row before: the frame of force and
-    velocity. row: (num_rows,) int, of the log that was given; ends of flights whose poses came late
-    are left out.
+    Attributes:
+        residuals: by model and channel, (num_rows, 3), battery (num_rows, 1), in the units of the
+            module's table. Values where ``counts`` is False have no meaning.
+        counts: by channel, rows that a fit uses, (num_rows,) bool; all False if the log lacks the
+            channel.
+        regressors: by name, (num_rows,) each, in the units of ``REGRESSORS``.
+        elapsed_s: time (s), flights one after the other, (num_rows,).
+        slot: index of each row among evenly spaced ones, (num_rows,) int. A lost row leaves its
+            slot empty, and flights are far apart.
+        step_s: time between slots (s).
+        attitude: body to world in the row before, (num_rows,): the frame of force and velocity.
+        row: index of each row in the log that was given, (num_rows,) int. Ends of flights with late
+            poses are omitted.
     """
 
     residuals: Mapping[str, Mapping[str, np.ndarray]]
@@ -62,26 +67,28 @@ class Traces(NamedTuple):
 
     def used(self, name: str) -> str:
         """Return the column to use: without a sensor, attitude for rates, velocity for force."""
-        channel, _, rest = name.partition("_")
+        channel, _, component = name.partition("_")
         if not self.counts[channel].any():
             channel = _INSTEAD.get(channel, channel)
-        return f"{channel}_{rest}" if rest else channel
+        return f"{channel}_{component}" if component else channel
 
     def column(self, model: str, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return one component of a residual and where it counts, both (num_rows,).
 
-        name: ``rates_x``, ``force_world_z``, ``force_along`` (the direction of flight through the
-        air), ``battery``, ...; what is ``used`` for it.
+        Args:
+            model: name of the model.
+            name: ``rates_x``, ``force_world_z``, ``force_along`` (the direction of flight through
+                the air), ``battery``, ...; the result is the column that is ``used`` for it.
         """
-        channel, *rest = self.used(name).split("_")
+        channel, *suffixes = self.used(name).split("_")
         values = self.residuals[model][channel]
-        if "along" in rest:
+        if "along" in suffixes:
             airspeed = np.stack([self.regressors[f"airspeed_{axis}"] for axis in _AXES], axis=-1)
             speed = np.maximum(np.linalg.norm(airspeed, axis=-1, keepdims=True), 1e-6)
             return (values * airspeed / speed).sum(axis=-1), self.counts[channel]
-        if "world" in rest:
+        if "world" in suffixes:
             values = self.attitude.apply(values)
-        return values[:, _AXES.index(rest[-1]) if rest else 0], self.counts[channel]
+        return values[:, _AXES.index(suffixes[-1]) if suffixes else 0], self.counts[channel]
 
 
 # Label and unit of each regressor.
@@ -128,10 +135,13 @@ def _lagged(record: Record, tau: np.ndarray) -> Action:
 
 
 class _Rows(NamedTuple):
-    """Where the log's rows are in chunks, and what was fed in there.
+    """The indices of the log's rows in chunks, and their record.
 
-    place: of the record's rows; kept: of these, the log's rows. record: in that order. before:
-    attitude in the row before each of the log's.
+    Attributes:
+        place: indices (row in chunk, chunk) of the record's rows.
+        kept: indices of those record rows that are rows of the log.
+        record: inputs and measurements, chunk after chunk.
+        before: attitude in the row before each row of the log.
     """
 
     place: tuple[np.ndarray, np.ndarray]
@@ -140,7 +150,7 @@ class _Rows(NamedTuple):
     before: Rotation
 
     def along(self, values: np.ndarray) -> np.ndarray:
-        """Return values (rows, chunks, ...) in the record's order, filled rows included."""
+        """Return values (rows, chunks, ...) in the order of the record, filled rows included."""
         return np.asarray(values)[self.place]
 
 
@@ -148,24 +158,26 @@ def _rows_of(chunks: Chunks) -> _Rows:
     row = np.where(
         (np.arange(len(chunks.row)) >= lead_in_of(len(chunks.row)))[:, None], chunks.row, -1
     )
-    chunk, place = np.nonzero(row.T >= 0)  # chunk after chunk is the record's order
-    record = Record(*(leaf[place, chunk] for leaf in chunks.record))
-    record = record._replace(begins=~chunks.is_joined[place, chunk])
+    chunk, row_in_chunk = np.nonzero(row.T >= 0)  # chunk after chunk is the record's order
+    record = Record(*(leaf[row_in_chunk, chunk] for leaf in chunks.record))
+    record = record._replace(begins=~chunks.is_joined[row_in_chunk, chunk])
     kept = np.flatnonzero(record.source_row >= 0)
     before = Rotation.from_quat(np.roll(record.quat, 1, axis=0)[kept], scalar_first=True)
-    return _Rows((place, chunk), kept, record, before)
+    return _Rows((row_in_chunk, chunk), kept, record, before)
 
 
-def _residuals(left: np.ndarray, rows: _Rows) -> dict[str, np.ndarray]:
-    """Return the channels of one model on the log's rows.
+def _residuals(residuals: np.ndarray, rows: _Rows) -> dict[str, np.ndarray]:
+    """Return the residuals of one model on the log's rows, by channel.
 
-    left: (rows, chunks, NUM_AXES, 2), world frame.
+    Args:
+        residuals: residuals in the world frame, (rows, chunks, NUM_AXES, 2).
+        rows: indices of the log's rows in chunks.
     """
-    along, record = rows.along(left), rows.record
+    by_row, record = rows.along(residuals), rows.record
     step_s = np.roll(record.step_s, 1)[:, None]
-    found = {}
-    for name, (axes, number) in PLACES.items():
-        values = along[:, axes, number]
+    result = {}
+    for name, (axes, level) in PLACES.items():
+        values = by_row[:, axes, level]
         if name == "battery":
             summed = np.cumsum(values, axis=0)
             is_first = np.flatnonzero(record.begins)
@@ -173,35 +185,41 @@ def _residuals(left: np.ndarray, rows: _Rows) -> dict[str, np.ndarray]:
             values = summed - summed[started]
         elif name in _PER_STEP:
             values = values / step_s
-        found[name] = (
+        result[name] = (
             values[rows.kept] if name == "battery" else rows.before.inv().apply(values[rows.kept])
         )
-    return found
+    return result
 
 
 def _counts(chunks: Chunks, rows: _Rows) -> dict[str, np.ndarray]:
-    """Return where channels count; changes since a row that was lost do not."""
-    along, record = rows.along(chunks.counts), rows.record
+    """Return the rows that count by channel; changes since a row that was lost do not count."""
+    by_row, record = rows.along(chunks.counts), rows.record
     after_measured = np.append(False, record.source_row[:-1] >= 0) & ~record.begins
-    found = {name: along[:, axes, number].all(axis=1) for name, (axes, number) in PLACES.items()}
+    by_channel = {
+        name: by_row[:, axes, level].all(axis=1) for name, (axes, level) in PLACES.items()
+    }
     return {
         name: np.logical_and(counts, after_measured | (name not in _PER_STEP))[rows.kept]
-        for name, counts in found.items()
+        for name, counts in by_channel.items()
     }
 
 
 def _regressors(
     model: ModelParameters, record: Record, applied: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return the regressors in the record's order; applied: (num_rows, 4)."""
+    """Return the regressors in the order of the record.
+
+    Args:
+        applied: action after the lags, (num_rows, 4).
+    """
     attitude = Rotation.from_quat(record.quat, scalar_first=True)
     wind = model.effect("wind")
     airspeed = attitude.inv().apply(record.vel_w - np.array([wind.v_x, wind.v_y, wind.v_z], float))
     change = np.diff(applied, axis=0, append=applied[-1:]) / record.step_s[:, None]
     change = np.where(np.append(record.begins[1:], True)[:, None], 0.0, change)
     body_x = attitude.apply((1.0, 0.0, 0.0))
-    full_rates = np.deg2rad(np.asarray(model.max_rate, float))
-    found = {
+    max_rates = np.deg2rad(np.asarray(model.max_rate, float))
+    result = {
         "airspeed": np.linalg.norm(airspeed, axis=1),
         "airspeed_xy": np.hypot(airspeed[:, 0], airspeed[:, 1]),
         "thrust_change": change[:, 3],
@@ -211,12 +229,12 @@ def _regressors(
         "voltage": record.battery_v,
     }
     for index, axis in enumerate(_AXES):
-        found[f"airspeed_{axis}"] = airspeed[:, index]
-        found[f"spin_up_{axis}"] = change[:, index] * full_rates[index]
-    # Values of a row are those of the step to it, from the row before; the lag acts first in a
-    # step.
-    found = {name: np.roll(values, 1) for name, values in found.items()}
-    return found | {f"applied_{stick}": applied[:, index] for index, stick in enumerate(STICKS)}
+        result[f"airspeed_{axis}"] = airspeed[:, index]
+        result[f"spin_up_{axis}"] = change[:, index] * max_rates[index]
+    # Values of a row are those of the step to it, from the row before. The lag acts first in a
+    # step, so that the applied action is that of the row itself.
+    result = {name: np.roll(values, 1) for name, values in result.items()}
+    return result | {f"applied_{stick}": applied[:, index] for index, stick in enumerate(STICKS)}
 
 
 def _predicted(
@@ -230,8 +248,8 @@ def _predicted(
     else:
         after = Rotation.from_quat(record.quat[rows.kept], scalar_first=True)
         rates = (before.inv() * after).as_rotvec() / step_s - residuals["attitude"]
-    moved = (record.vel_w - np.roll(record.vel_w, 1, axis=0))[rows.kept] / step_s
-    force = before.inv().apply(moved + np.array([0.0, 0.0, gravity])) - residuals["velocity"]
+    acceleration = (record.vel_w - np.roll(record.vel_w, 1, axis=0))[rows.kept] / step_s
+    force = before.inv().apply(acceleration + np.array([0.0, 0.0, gravity])) - residuals["velocity"]
     squares = rates**2
     turning = squares.sum(axis=1, keepdims=True) - squares
     parts = {"model_rates": rates, "model_force": force, "turning": turning}
@@ -245,38 +263,44 @@ def _predicted(
 def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> Traces:
     """Return the residuals of models on the rows of a log at which all of them know the pose.
 
-    Each model reads poses with its own latency.
+    Each model reads poses with its own latency. Regressors of a row are those of the step to it:
+    state and commands of the row before, and the action after its lag.
 
-    like: name of the model whose lags, rates and wind make the regressors; a delay of commands does
-    not enter. Regressors of a row are those of the step to it: what was flown and commanded in the
-    row before, the action after its lag.
+    Args:
+        like: name of the model whose lags, rates and wind determine the regressors. A delay of
+            commands is ignored.
 
     Raises:
         KeyError: ``like`` is not one of the models.
     """
     base = models[like]
     logs = {late_s: read_poses(log, late_s) for late_s in map(latency_of, models.values())}
-    is_known = np.logical_and.reduce([known for _, known in logs.values()])
-    in_time = {late_s: moved.select(is_known) for late_s, (moved, _) in logs.items()}
+    is_known = np.logical_and.reduce([is_row_known for _, is_row_known in logs.values()])
+    in_time = {late_s: shifted.select(is_known) for late_s, (shifted, _) in logs.items()}
     log = in_time[latency_of(base)]
     with jax.enable_x64(True):
         by_lateness = {
             late_s: cut_chunks(one, np.ones(len(one), bool), base)
             for late_s, one in in_time.items()
         }
-        left = []
+        chunk_residuals = []
         for model in models.values():
             problem = Problem.of(by_lateness[latency_of(model)], model._replace(motion=base.motion))
-            left.append(problem.residuals(problem.start[None])[0])
+            chunk_residuals.append(problem.residuals(problem.start[None])[0])
         chunks = by_lateness[latency_of(base)]
         lagged = _lagged(chunks.record, np.asarray(base.tau, float))
         applied = np.stack([np.asarray(stick) for stick in lagged], axis=-1)
     rows = _rows_of(chunks)
-    residuals = {name: _residuals(one, rows) for name, one in zip(models, left, strict=True)}
-    found = _regressors(base, rows.record, rows.along(applied))
-    since = log.time - log.time[log.is_start()][np.cumsum(log.is_start()) - 1]
+    residuals = {
+        name: _residuals(one, rows) for name, one in zip(models, chunk_residuals, strict=True)
+    }
+    in_record_order = _regressors(base, rows.record, rows.along(applied))
+    time_in_flight = log.time - log.time[log.is_start()][np.cumsum(log.is_start()) - 1]
     step_s = float(np.median(rows.record.step_s))
-    regressors = {"time": since, **{name: values[rows.kept] for name, values in found.items()}}
+    regressors = {
+        "time": time_in_flight,
+        **{name: values[rows.kept] for name, values in in_record_order.items()},
+    }
     regressors |= _predicted(residuals[like], chunks, rows, float(base.g))
     slot = np.arange(len(rows.record.begins)) + BETWEEN_FLIGHTS * np.cumsum(rows.record.begins)
     elapsed_s, counts = step_s * rows.kept, _counts(chunks, rows)
