@@ -184,7 +184,9 @@ def factors_of(side: Side) -> Iterator[tuple[str, tuple[Factor, ...]]]:
     airspeeds = ("airspeed_x", "airspeed_y", "airspeed_z", "edgewise", "airspeed")
     for quantity in airspeeds:
         yield from (("body", (power(quantity, exponent),)) for exponent in (1.0, 2.0, 3.0))
-        yield from (("body", (power("thrust", one), power(quantity))) for one in (0.5, 1.0))
+        yield from (
+            ("body", (power("thrust", exponent), power(quantity))) for exponent in (0.5, 1.0)
+        )
         yield "body", (power("thrust"), power(quantity, 2.0))
     for quantity in ("rate_x", "rate_y", "rate_z"):
         yield from (("body", (power(quantity, exponent),)) for exponent in (1.0, 2.0))
@@ -194,18 +196,18 @@ def factors_of(side: Side) -> Iterator[tuple[str, tuple[Factor, ...]]]:
     yield "body", (power("rate_y"), power("rate_z"))
     for quantity in ("roll", "pitch", "yaw", "throttle"):
         yield from (("body", (power(quantity, exponent),)) for exponent in (2.0, 3.0))
-        yield from (("body", (one,)) for one in _local(side, quantity, ("bump", "step"), 5))
+        yield from (("body", (factor,)) for factor in _local(side, quantity, ("bump", "step"), 5))
     # The voltage alone is not tried: within one flight it falls with the time.
     yield "body", (power("thrust"), power("voltage"))
     for quantity in ("tilt", "height"):
         yield from (("body", (power(quantity, exponent),)) for exponent in (1.0, 2.0))
-        yield from (("body", (one,)) for one in _local(side, quantity, ("bump",), 6))
+        yield from (("body", (factor,)) for factor in _local(side, quantity, ("bump",), 6))
         yield "body", (power("thrust"), power(quantity))
     span = float(np.ptp(side.spread("time")))
     saturations = [Factor("time", "saturation", (share * span,)) for share in (0.1, 0.3, 1.0)]
-    for one in (power("time"), *saturations, *_local(side, "time", ("bump", "step"), 8)):
-        yield "body", (one,)
-        yield "body", (power("thrust"), one)
+    for factor in (power("time"), *saturations, *_local(side, "time", ("bump", "step"), 8)):
+        yield "body", (factor,)
+        yield "body", (power("thrust"), factor)
     frames = ("body", "world") if side.name == "force" else ("body",)
     for order in (1.0, 2.0, 3.0, 4.0):
         for phase in np.linspace(0.0, math.pi, 4, endpoint=False):
@@ -213,12 +215,12 @@ def factors_of(side: Side) -> Iterator[tuple[str, tuple[Factor, ...]]]:
                 (frame, (Factor("heading", "wave", (order, float(phase))),)) for frame in frames
             )
     if side.name == "force":
-        for one in (
+        for factor in (
             power("airspeed", 2.0),
             power("airspeed", 3.0),
             *_local(side, "airspeed", ("bump",), 8),
         ):
-            yield "air", (one,)
+            yield "air", (factor,)
         positions = side.flight.pos_w[side.flight.is_counted]
         for centre in positions[
             np.linspace(0, len(positions) - 1, 2 * BUMP_PLACES + 1).astype(int)[1::2]
@@ -274,13 +276,13 @@ def refine_shapes(side: Side, test: SideTest, start: Trial) -> Trial:
     """Optimise the shape parameters of a term for the largest gain."""
     if not num_shaped(start.term):
         return start
-    numbers = np.concatenate([one.numbers for one in start.term.factors])
+    numbers = np.concatenate([factor.numbers for factor in start.term.factors])
     is_free = np.array(
         [
-            one.shape != "power"
-            and (one.shape, index) != ("wave", 0)  # a wave's order, which is an integer
-            for one in start.term.factors
-            for index in range(len(one.numbers))
+            factor.shape != "power"
+            and (factor.shape, index) != ("wave", 0)  # a wave's order, which is an integer
+            for factor in start.term.factors
+            for index in range(len(factor.numbers))
         ]
     )
     steps = np.maximum(0.2 * np.abs(numbers), 0.1)[is_free]
@@ -294,7 +296,7 @@ def refine_shapes(side: Side, test: SideTest, start: Trial) -> Trial:
         if term is None:
             return 0.0
         trial = score_term(side, test, term)
-        best = max(best, trial, key=lambda one: one.merit)
+        best = max(best, trial, key=lambda candidate: candidate.merit)
         return -trial.merit
 
     simplex = np.concatenate([np.zeros((1, len(steps))), np.eye(len(steps))])
@@ -482,23 +484,25 @@ def find_law(side: Side, held: Side) -> FittedLaw | None:
     The search starts from the best terms of several quantities, since each wave of a sum may gain
     less than a bump.
     """
-    pool = [bare_term(side, *one) for one in factors_of(side)]
+    pool = [bare_term(side, *frame_and_factors) for frame_and_factors in factors_of(side)]
     firsts, ranked = best_of(side, side.test, pool)
     limits = stats.chi2.isf(
-        FALSE_POSITIVE_RATE / len(pool), [num_numbers(one.term) for one in firsts]
+        FALSE_POSITIVE_RATE / len(pool), [num_numbers(trial.term) for trial in firsts]
     )
-    clear = [one for one, limit in zip(firsts, limits, strict=True) if one.gain >= limit]
-    rivals = tuple(_kind(one.term) for one in firsts[1:] if one.merit > firsts[0].merit - 10.0)
+    clear = [trial for trial, limit in zip(firsts, limits, strict=True) if trial.gain >= limit]
+    rivals = tuple(
+        _kind(trial.term) for trial in firsts[1:] if trial.merit > firsts[0].merit - 10.0
+    )
     by_quantity: dict[str, Trial] = {}
-    for one in clear:
-        by_quantity.setdefault(one.term.factors[-1].quantity, one)
+    for trial in clear:
+        by_quantity.setdefault(trial.term.factors[-1].quantity, trial)
     starts = list(by_quantity.values())[:MAX_STARTS]
-    grown = [grow_law(side, held, one, ranked, len(pool)) for one in starts]
-    laws = [drop_weak_terms(side, held, one, len(pool)) for one in grown if one is not None]
-    confirmed = [one._replace(rivals=rivals) for one in laws if one is not None]
+    grown = [grow_law(side, held, trial, ranked, len(pool)) for trial in starts]
+    laws = [drop_weak_terms(side, held, law, len(pool)) for law in grown if law is not None]
+    confirmed = [law._replace(rivals=rivals) for law in laws if law is not None]
     return max(
         confirmed,
-        key=lambda one: one.gain - sum(price_of(term) for term in one.terms),
+        key=lambda law: law.gain - sum(price_of(term) for term in law.terms),
         default=None,
     )
 
@@ -526,7 +530,7 @@ def grow_law(
     best: FittedLaw | None = None
 
     def uses_time(term: Term) -> bool:
-        return any(one.quantity == "time" for one in term.factors)
+        return any(factor.quantity == "time" for factor in term.factors)
 
     # A single event would pass for the remainder of another law, so either all terms depend on the
     # time, or none.
@@ -537,12 +541,12 @@ def grow_law(
             best is not None and fit.chi2 < (1.0 + MIN_GAIN_FRACTION) * best.gain
         ):
             break
-        one = judge_law(side, held, fitted, fit)
-        if best is not None and one.held_out_gain < best.held_out_gain:
+        law = judge_law(side, held, fitted, fit)
+        if best is not None and law.held_out_gain < best.held_out_gain:
             break
         # One wave of a sum of two may fail on held-out rows although the sum does not.
-        if is_confirmed(side, one):
-            best = one
+        if is_confirmed(side, law):
+            best = law
         terms = list(fitted)
         if len(terms) == MAX_TERMS:
             break

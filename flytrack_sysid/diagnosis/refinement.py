@@ -609,21 +609,24 @@ class _Refinement(NamedTuple):
         assert refined.fit is not None and refined.flight_test is not None
         flight_test, fit, without = refined.flight_test, refined.fit, {}
         kept = [
-            one for one in refined.kept if not _is_neutral(refined.problem, fit.vector, one.fields)
+            candidate
+            for candidate in refined.kept
+            if not _is_neutral(refined.problem, fit.vector, candidate.fields)
         ]
-        removed = [one.effect for one in refined.kept if one not in kept]
-        while any(one.effect in self.acting for one in kept):
-            tried = [one for one in kept if one.effect in self.acting]
-            fits = [self._without(target, fit, kept, one) for one in tried]
-            losses = flight_test.losses(fit.vector, *(one.vector for one in fits))
-            sure = np.array([sureness(one - losses[0]) for one in losses[1:]])
+        removed = [candidate.effect for candidate in refined.kept if candidate not in kept]
+        while any(candidate.effect in self.acting for candidate in kept):
+            tried = [candidate for candidate in kept if candidate.effect in self.acting]
+            fits = [self._without(target, fit, kept, candidate) for candidate in tried]
+            losses = flight_test.losses(fit.vector, *(reduced_fit.vector for reduced_fit in fits))
+            sure = np.array([sureness(reduced_losses - losses[0]) for reduced_losses in losses[1:]])
             worth = np.sqrt(losses[1:].sum(axis=1) / losses[0].sum()) - 1.0
             needed = np.where(
                 (worth >= WORTHWHILE) & (sure >= LIKELY), np.maximum(sure, SURE), sure
             )
             needed[:] = needed if flight_test.matters.any() else np.inf  # no cell is evidence
             without = {
-                one.effect: reduced_fit.vector for one, reduced_fit in zip(tried, fits, strict=True)
+                candidate.effect: reduced_fit.vector
+                for candidate, reduced_fit in zip(tried, fits, strict=True)
             }
             if self.is_explained and not flight_test.is_surely_worse(fit.vector):
                 break
@@ -631,12 +634,16 @@ class _Refinement(NamedTuple):
             if needed[weakest] >= SURE:
                 if flight_test.worst_ratio(fit.vector) < 1.0:
                     break
-                weakest = int(np.argmin([flight_test.worst_ratio(one.vector) for one in fits]))
+                weakest = int(
+                    np.argmin([flight_test.worst_ratio(reduced_fit.vector) for reduced_fit in fits])
+                )
             kept.remove(tried[weakest])
             removed.append(tried[weakest].effect)
             indices = self.indices(target.problem, kept)
             fit = target.fitted(fits[weakest].vector, indices, MAX_ROUNDS)
-        if not any(one.effect in self.acting for one in kept):  # the base from single steps stands
+        if not any(
+            candidate.effect in self.acting for candidate in kept
+        ):  # the base from single steps stands
             return refined._replace(kept=tuple(kept), fit=None, removed=tuple(removed), without={})
         return refined._replace(kept=tuple(kept), fit=fit, removed=tuple(removed), without=without)
 
@@ -725,8 +732,10 @@ def reduced(selection: Selection, refined: Refined) -> Selection:
 def _narrowed(selection: Selection, kept: Sequence[Candidate]) -> Selection:
     """Return the selection with some of its effects only, fitted to single steps again."""
     state, model = selection.state, selection.model
-    removed = [one.effect for one in model.candidates if one not in kept]
-    state = replace(state, held=tuple(one for one in state.held if one.effect not in removed))
+    removed = [candidate.effect for candidate in model.candidates if candidate not in kept]
+    state = replace(
+        state, held=tuple(parameter for parameter in state.held if parameter.effect not in removed)
+    )
     model = state.fitted(kept, state.problem.without(model.vector, removed))
     state, linearization = state.linearized(model.vector)
     ablations = ablate_all(state, model, linearization)

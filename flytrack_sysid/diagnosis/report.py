@@ -292,7 +292,11 @@ def _errors_picture(diagnosis: Diagnosis) -> list[Part]:
         return []
     figure = new_figure(WIDTH_IN, BARS_HEIGHT_IN)
     axes = figure.subplots()
-    models = [(name, one.position_m) for name, one in diagnosis.error.items() if one.position_m]
+    models = [
+        (name, model_errors.position_m)
+        for name, model_errors in diagnosis.error.items()
+        if model_errors.position_m
+    ]
     width = 0.8 / len(models)
     for index, (name, errors) in enumerate(models):
         positions, heights = (
@@ -305,7 +309,8 @@ def _errors_picture(diagnosis: Diagnosis) -> list[Part]:
         axes.set_yscale("log")
         axes.set_ylim(bottom=0.5 * min(all_errors))  # the smallest bar stays visible
     axes.set_xticks(
-        np.arange(len(horizons)) + 0.5 * (len(models) - 1) * width, [f"{one} s" for one in horizons]
+        np.arange(len(horizons)) + 0.5 * (len(models) - 1) * width,
+        [f"{horizon} s" for horizon in horizons],
     )
     axes.set_ylabel("position error (m, rms)")
     plain(axes)
@@ -491,10 +496,13 @@ def text_of(diagnosis: Diagnosis) -> str:
     lines = [f"verdict: {diagnosis.verdict}", f"motion: {diagnosis.extended.motion.value}"]
     for cause in diagnosis.causes:
         values = ", ".join(
-            f"{name} {one.value:.4g} ({one.ci95[0]:.4g} to {one.ci95[1]:.4g}) {one.unit}"
-            for name, one in cause.parameters.items()
+            f"{name} {value.value:.4g} ({value.ci95[0]:.4g} to {value.ci95[1]:.4g}) {value.unit}"
+            for name, value in cause.parameters.items()
         )
-        names = [words_of(one) if one == DRIFT else one for one in cause.equivalent]
+        names = [
+            words_of(equivalent) if equivalent == DRIFT else equivalent
+            for equivalent in cause.equivalent
+        ]
         twins = f"; not told apart from {', '.join(names)}" if names else ""
         lines.append(
             f"  {cause.effect}{when_of(cause)}: {values}; held-out gain "
@@ -506,7 +514,7 @@ def text_of(diagnosis: Diagnosis) -> str:
         lines.append(f"negligible: {cause.effect}: {_plus_minus(cause)}")
     answers = diagnosis.half_response_s.get("extended", {}).items()
     if answers:
-        times = ", ".join(f"{stick} {_half_response(one)} ms" for stick, one in answers)
+        times = ", ".join(f"{stick} {_half_response(response)} ms" for stick, response in answers)
         lines.append(f"time from a stick to half of the response: {times}")
     if diagnosis.unexplained.depends_on:
         lines.append(f"unexplained, depends on: {', '.join(diagnosis.unexplained.depends_on)}")

@@ -456,26 +456,30 @@ def causes_at_end(
         searched, vector = refined.problem, refined.fit.vector
     ranges = dict(zip(problem.names, problem.high - problem.low, strict=True))
     stuck: dict[str, str] = {}
-    for one in refined.kept:
-        steps = [f"{one.effect}.{field}" for field in BY_NAME[one.effect].max_steps]
-        fields = [field for field in at_bounds(searched, vector, one.fields) if field not in steps]
+    for candidate in refined.kept:
+        steps = [f"{candidate.effect}.{field}" for field in BY_NAME[candidate.effect].max_steps]
+        fields = [
+            field for field in at_bounds(searched, vector, candidate.fields) if field not in steps
+        ]
         if not fields:
             continue
-        marginal = Marginal(selection.state.linearized(model.vector)[1], model, one.fields)
-        widths = dict(zip(one.fields, marginal.half_widths(), strict=True))
+        marginal = Marginal(selection.state.linearized(model.vector)[1], model, candidate.fields)
+        widths = dict(zip(candidate.fields, marginal.half_widths(), strict=True))
         ends = [
             _is_beyond(searched, vector, field)
             for field in fields
             if widths[field] < LOOSE * ranges[field]
         ]
         if ends:
-            stuck[one.effect] = ", ".join(ends)
+            stuck[candidate.effect] = ", ".join(ends)
     if not stuck:
         return ()
     state, linearization = selection.state.linearized(model.vector)
     causes = effect_causes(selection._replace(state=state), test, linearization)
-    refused = with_refined_values([one for one in causes if one.effect in stuck], refined, vector)
-    return tuple(replace(one, beyond=stuck[one.effect]) for one in refused)
+    refused = with_refined_values(
+        [cause for cause in causes if cause.effect in stuck], refined, vector
+    )
+    return tuple(replace(cause, beyond=stuck[cause.effect]) for cause in refused)
 
 
 def with_refined_values(

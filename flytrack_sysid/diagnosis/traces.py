@@ -280,8 +280,8 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
     log = in_time[latency_of(base)]
     with jax.enable_x64(True):
         by_lateness = {
-            late_s: cut_chunks(one, np.ones(len(one), bool), base)
-            for late_s, one in in_time.items()
+            late_s: cut_chunks(late_log, np.ones(len(late_log), bool), base)
+            for late_s, late_log in in_time.items()
         }
         chunk_residuals = []
         for model in models.values():
@@ -292,7 +292,8 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
         applied = np.stack([np.asarray(stick) for stick in lagged], axis=-1)
     rows = _rows_of(chunks)
     residuals = {
-        name: _residuals(one, rows) for name, one in zip(models, chunk_residuals, strict=True)
+        name: _residuals(model_residuals, rows)
+        for name, model_residuals in zip(models, chunk_residuals, strict=True)
     }
     in_record_order = _regressors(base, rows.record, rows.along(applied))
     time_in_flight = log.time - log.time[log.is_start()][np.cumsum(log.is_start()) - 1]
