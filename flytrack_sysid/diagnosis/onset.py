@@ -390,14 +390,13 @@ def notes_of(selection: Selection, linearization: Linearization, log: FlightLog)
     if gone:
         notes.append(f"not in the extended model: {', '.join(gone)}, which ended within the log")
     lacking = (*selection.state.unobservable, *selection.state.refused)
-    further = changes_of(linearization, selection.model, lacking) if is_one_flight(log) else []
-    if further and further[0].margin > 0.0:
-        name, how = (
-            further[0].candidate.effect,
-            "drifts" if further[0].way == "drift" else "changes",
-        )
-        value = ": its value is a mean" if name in selection.model.effects else ""
-        notes.append(f"{name} {how} within the log{value}")
+    changes = changes_of(linearization, selection.model, lacking) if is_one_flight(log) else []
+    for change in changes:
+        effect = change.candidate.effect
+        if change.margin > 0.0 and effect in selection.model.effects:
+            how = "drifts" if change.way == "drift" else "changes"
+            notes.append(f"{effect} {how} within the log: its value is a mean")
+            break
     return notes
 
 
