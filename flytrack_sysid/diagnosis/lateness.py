@@ -113,15 +113,14 @@ def scored_as_logged(
     gap_s = 2.0 * (np.ptp(logged.time) + late_s + 1.0)  # segments one after the other, well apart
     logged_s = filled.log.time + gap_s * logged.segment[filled.behind]
     corrected_s = moved.log.time + gap_s * corrected.segment[moved.behind]
-    nearest = np.searchsorted(logged_s, corrected_s - NEAR * step_s) + int(
-        np.floor(late_s / step_s + SAME)
-    )
-    nearest = np.clip(nearest, 0, len(logged_s) - 1)
+    last = len(logged_s) - 1
+    same = np.minimum(np.searchsorted(logged_s, corrected_s - NEAR * step_s), last)
+    nearest = np.clip(same + int(np.floor(late_s / step_s + SAME)), 0, last)
     run = np.cumsum(filled.log.is_start())
     is_logged = (filled.source_row[nearest] >= 0) & (
         np.abs(logged_s[nearest] - corrected_s - late_s) < 2.0 * step_s
     )
-    is_logged &= run[nearest] == run[np.searchsorted(logged_s, corrected_s - NEAR * step_s)]
+    is_logged &= run[nearest] == run[same]
     weights = _weights((corrected_s + late_s - logged_s[nearest]) / step_s, motion)
     constant = _changes(record_of(filled))[nearest] - _delayed(_changes(record), weights, 0)
     constant = np.pad(np.where(record.begins[:, None], 0.0, constant), ((0, 0), (0, NUM_AXES - 6)))

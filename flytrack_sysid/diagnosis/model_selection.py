@@ -369,6 +369,14 @@ class BaseChange(NamedTuple):
     gain: float
 
 
+def thrust_over_weight(problem: Problem, coefficients: np.ndarray) -> float:
+    """Return the rms over scored rows of a thrust map, as a share of the weight."""
+    record, is_scored = problem.chunks.record, problem.counts.any(axis=(2, 3))
+    thrust = np.asarray(collective_thrust(record.command[..., 3], record.battery_v, coefficients))
+    weight = float(problem.like.m) * float(problem.like.g)
+    return float(np.sqrt(np.mean(thrust[is_scored] ** 2))) / weight
+
+
 def _is_immaterial(problem: Problem, fields: Sequence[str], model: FittedModel) -> bool:
     """Return whether a lag, drain or thrust curve differs by too little to matter.
 
@@ -378,13 +386,7 @@ def _is_immaterial(problem: Problem, fields: Sequence[str], model: FittedModel) 
     change = model.vector[indices] - problem.start[indices]
     if fields != THRUST_COEFFS:
         return bool(np.all(np.abs(change) < IMMATERIAL * np.abs(problem.start[indices])))
-    record = problem.chunks.record
-    thrust = np.asarray(collective_thrust(record.command[..., 3], record.battery_v, change))
-    weight = float(problem.like.m) * float(problem.like.g)
-    return (
-        float(np.sqrt(np.mean(thrust[problem.counts.any(axis=(2, 3))] ** 2)))
-        < IMMATERIAL_THRUST * weight
-    )
+    return thrust_over_weight(problem, change) < IMMATERIAL_THRUST
 
 
 def base_change(

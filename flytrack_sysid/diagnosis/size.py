@@ -9,9 +9,9 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from flytrack_env.dynamics import collective_thrust
 from flytrack_env.effects import BY_NAME
 from flytrack_env.state import BATTERY_FULL_V
+from flytrack_sysid.diagnosis.model_selection import thrust_over_weight
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import Cause
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
@@ -81,10 +81,7 @@ def _change(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> np.n
 
 def _is_base_notable(fields: Sequence[str], problem: Problem, vector: np.ndarray) -> bool:
     if fields == THRUST_COEFFS:
-        stick, volt = problem.chunks.record.command[..., 3], problem.chunks.record.battery_v
-        thrust_change = collective_thrust(stick, volt, _change(problem, vector, fields))
-        weight = float(problem.like.m) * float(problem.like.g)
-        return bool(np.sqrt(np.mean(np.square(thrust_change))) >= NOTABLE_THRUST * weight)
+        return thrust_over_weight(problem, _change(problem, vector, fields)) >= NOTABLE_THRUST
     battery = problem.like.battery
     notable_drain = NOTABLE_DRAIN_PER_MIN * float(battery.full_v - battery.empty_v)
     sizes = {**dict.fromkeys(TAUS, NOTABLE_LAG_S), DRAIN: notable_drain}

@@ -122,8 +122,7 @@ def _read_log(
     if craft.max_rate_deg_s is None:
         craft = craft._replace(max_rate_deg_s=headers.full_stick_deg_s())
     full = np.array([*(craft.max_rate_deg_s or ()), FULL_THROTTLE])
-    channels, about_attitude = _channels(table, headers)
-    remarks += about_attitude
+    channels = _channels(table, headers)
     channels["u"], clipped = _commands(table, headers, full)
     if mapping.rules.motors_as_thrust:
         channels["u"][:, 3] = _thrust_of_motors(table, headers)
@@ -248,8 +247,8 @@ def _commands(table: Table, headers: _Headers, full: np.ndarray) -> tuple[np.nda
     ]
 
 
-def _channels(table: Table, headers: _Headers) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Return the sensors' channels of the log, and notes."""
+def _channels(table: Table, headers: _Headers) -> dict[str, np.ndarray]:
+    """Return the sensors' channels of the log."""
     channels = {"w": table.matrix(GYRO) * headers.rate_unit_deg_s() * PER_DEGREE}
     if all(name in table.columns and np.any(table.columns[name]) for name in ACCELEROMETER):
         g_unit = headers.numbers("acc_1G", 1)[0]
@@ -262,12 +261,12 @@ def _channels(table: Table, headers: _Headers) -> tuple[dict[str, np.ndarray], l
         table.matrix(ATTITUDE) / UNIT_QUATERNION if table.columns.keys() >= set(ATTITUDE) else None
     )
     if vector is None or not np.any(vector):
-        return channels, []
+        return channels
     size = np.linalg.norm(vector, axis=1, keepdims=True)
     channels["q"] = np.column_stack(
         [np.sqrt(np.maximum(1.0 - size**2, 0.0)), vector / np.maximum(size, 1.0)]
     )
-    return channels, []
+    return channels
 
 
 def _motors(table: Table, headers: _Headers) -> list[str]:

@@ -199,7 +199,7 @@ def _identified_attitude_gain(
         rates = channels["w"][is_flying, axis] - channels["w"][is_flying, axis].mean()
         for delay_s in DELAYS_S:
             delay = round(delay_s / step_s)
-            delayed = np.concatenate([np.zeros(delay), errors[: len(errors) - delay, axis]])
+            delayed = np.pad(errors[:, axis], (delay, 0))[: len(errors)]
             for lag_s in LAGS_S:
                 decay = np.exp(-step_s / lag_s) if lag_s else 0.0
                 response = lfilter([1.0 - decay], [1.0, -decay], delayed)[is_flying]

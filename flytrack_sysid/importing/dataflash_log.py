@@ -99,15 +99,11 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
     if notes["is_cut_off"]:
         remarks.append("cut off: used up to the last whole message")
     chosen = {name: _choose(name, instances, remarks) for name, instances in messages.items()}
-    for name in ("RATE",):
-        if name not in chosen or any(field not in chosen[name] for field in (TIME, *FIELDS[name])):
-            listed = (
-                ", ".join(map(quote_name, sorted(chosen))) or "none of the messages that are read"
-            )
-            raise LogError(
-                f"{path}: message {name}: missing or without {', '.join(FIELDS[name])}; found "
-                f"{listed}"
-            )
+    if any(field not in chosen.get("RATE", ()) for field in (TIME, *FIELDS["RATE"])):
+        listed = ", ".join(map(quote_name, sorted(chosen))) or "none of the messages that are read"
+        raise LogError(
+            f"{path}: message RATE: missing or without {', '.join(FIELDS['RATE'])}; found {listed}"
+        )
     craft = mapping.craft
     if craft.max_rate_deg_s is None:
         craft = craft._replace(
@@ -251,9 +247,8 @@ def _channels(
     gyroscope = vector("w", "IMU", GYROSCOPE)
     is_fast = len(messages["RATE"][TIME]) >= len(messages.get("IMU", {}).get(TIME, ()))
     rates = vector("w", "RATE", RATES, PER_DEGREE) if is_fast or not gyroscope else gyroscope
-    remarks.append(
-        f"rates of {rates[0].table}, which has more samples than other messages with rates"
-    )
+    reason = "which has the most samples" if gyroscope else "the only message with rates"
+    remarks.append(f"rates of {rates[0].table}, {reason}")
     channels = [Channel("RATE", "u", columns_of("RATE", (*SETPOINTS, THROTTLE)), commands), *rates]
     channels += vector("f", "IMU", ACCELEROMETER)
     channels += vector("v", "XKF1", VELOCITY) + vector("p", "XKF1", POSITION)

@@ -120,7 +120,7 @@ def decode_betaflight(arguments: Any, _: bytes) -> bytes:
         names = [str(field.name) for field in main]
         values, num_undecoded, end = array("d"), 0, 0
         for frame in _whole_frames(parser, number in cut_off):
-            end = parser.reader.tell() if cut_off else 0
+            end = parser.reader.tell() if number in cut_off else 0
             if not values and frame.type.value != MAIN_FRAME:
                 num_undecoded += 1
                 continue
