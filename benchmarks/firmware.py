@@ -29,7 +29,7 @@ from flytrack_sysid.diagnosis import Cause
 from flytrack_sysid.diagnosis.score_test import Candidate
 from flytrack_sysid.excitation import script as excitation_script
 from flytrack_sysid.manoeuvres import flights_of, hover_action
-from flytrack_sysid.script_file import script_of
+from flytrack_sysid.script_file import build_script
 
 LINES, PAGE = report.RESULTS / "firmware.jsonl", report.RESULTS / "firmware.md"
 MARKS = "<!-- benchmarks.firmware -->", "<!-- end -->"
@@ -153,7 +153,7 @@ def fly(settings: Mapping[str, Any], body: Body, flown: str, seed: int) -> tuple
         model = plant.nominal_model()
         script = None
         if flown == "gentle":
-            script = script_of(flights_of(GENTLE, hover_action(model), seed))
+            script = build_script(flights_of(GENTLE, hover_action(model), seed))
         return collect(plant, 1.0, seed, 1.0, script=script), model
 
 
@@ -168,7 +168,7 @@ def know(setup: str, flown: str, seed: int) -> Known:
 def places(settings: Mapping[str, Any], body: Body, seed: int) -> np.ndarray:
     """Return displacements after a second of ``collect``'s excitation, (flights, 3), m."""
     hover = hover_action(nominal_parameters())
-    flights = script_of(excitation_script(FLIGHTS, hover, np.random.default_rng(seed)))
+    flights = build_script(excitation_script(FLIGHTS, hover, np.random.default_rng(seed)))
     with Betaflight(settings, body) as plant:
         states = plant.fly(flights.starts, flights.commands[:, :SECOND])
     return states[:, -1, POSITION] - flights.starts[:, POSITION]

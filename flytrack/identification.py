@@ -27,7 +27,7 @@ from flytrack_sysid.diagnosis import (
 )
 from flytrack_sysid.diagnosis import text_of as text_of_diagnosis
 from flytrack_sysid.diagnosis.identifiability import next_flight
-from flytrack_sysid.diagnosis.report import traces_of
+from flytrack_sysid.diagnosis.report import collect_traces
 from flytrack_sysid.fit import fit, what_is_fitted
 from flytrack_sysid.flight_recording import write_flight_recording
 from flytrack_sysid.importing import import_log
@@ -169,7 +169,7 @@ def run_diagnose(flags: Diagnose) -> None:
     print(text_of_diagnosis(diagnosis))
     recording = flags.out / RECORDING_NAME
     models = {"nominal": diagnosis.nominal, "extended": diagnosis.extended}
-    reason = write_flight_recording(recording, log, models, traces_of(diagnosis, log))
+    reason = write_flight_recording(recording, log, models, collect_traces(diagnosis, log))
     print_written([*written, *[recording] * (not reason)])
     if reason:
         print(f"{recording}: left out: {reason}")

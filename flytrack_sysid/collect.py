@@ -22,7 +22,7 @@ from flytrack_env.state import ACCELERATION, STATE_SIZE, pack, unpack, unpack_ac
 from flytrack_sysid import excitation
 from flytrack_sysid.excitation import DT_S, MIDDLE_V, MIN_STEPS, VOLTAGES
 from flytrack_sysid.log import FlightLog, log_of_states
-from flytrack_sysid.script_file import Script, check_script, script_of
+from flytrack_sysid.script_file import Script, build_script, check_script
 from flytrack_sysid.sensors import LOST_ROWS, measure
 
 StepFunction = Callable[[np.ndarray, np.ndarray], Any]
@@ -172,7 +172,7 @@ def collect(
         hover = find_hover(_fly_any(plant, lambda done, total: None), 0.5 * sum(voltages))
         num_flights = round(minutes * 60.0 / SECONDS_PER_FLIGHT)
         flights, heights = (
-            script_of(excitation.script(num_flights, hover, rng, voltages)),
+            build_script(excitation.script(num_flights, hover, rng, voltages)),
             excitation.HEIGHTS,
         )
     else:

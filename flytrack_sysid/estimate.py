@@ -29,7 +29,7 @@ from threadpoolctl import threadpool_limits
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid import parameters
-from flytrack_sysid.diagnosis.chunks import AXES, DIRECT, Chunks, lead_in_of, make_chunks
+from flytrack_sysid.diagnosis.chunks import AXES, DIRECT, Chunks, count_lead_in, make_chunks
 from flytrack_sysid.diagnosis.problem import Problem, robust_weight
 from flytrack_sysid.diagnosis.score_test import Linearization, solve
 from flytrack_sysid.diagnosis.search import refine
@@ -72,7 +72,7 @@ class Estimate(NamedTuple):
 
 def _in_line(values: np.ndarray) -> np.ndarray:
     """Reshape (rows, chunks, ...) without lead-ins to (all rows, ...), in the order of time."""
-    without_lead_in = np.swapaxes(values[lead_in_of(len(values)) :], 0, 1)
+    without_lead_in = np.swapaxes(values[count_lead_in(len(values)) :], 0, 1)
     return without_lead_in.reshape(-1, *without_lead_in.shape[2:])
 
 
@@ -141,7 +141,7 @@ class Channels(Problem):
         all_residuals = super().residuals(vectors)
         for model_residuals in all_residuals:
             in_line = self._of_channels(_in_line(model_residuals))
-            model_residuals[lead_in_of(len(model_residuals)) :] = in_line.reshape(
+            model_residuals[count_lead_in(len(model_residuals)) :] = in_line.reshape(
                 model_residuals.shape[1], -1, *model_residuals.shape[2:]
             ).swapaxes(0, 1)
         return all_residuals * self.counts
@@ -218,7 +218,7 @@ def _counts(
     """
     source = chunks.record.source_row
     is_scored = scored_rows[source] & (source >= 0) & (chunks.row >= 0)
-    is_scored[: lead_in_of(len(is_scored))] = False
+    is_scored[: count_lead_in(len(is_scored))] = False
     behind = scored_rows[
         np.maximum.accumulate(source, axis=0)
     ]  # for a filled row, that of the row before the gap

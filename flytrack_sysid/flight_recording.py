@@ -22,14 +22,14 @@ def write_flight_recording(
     Args:
         path: of the recording.
         log: the flight log.
-        models: as for ``trajectories.trajectories_of``.
-        residuals: as for ``trajectories.trajectories_of``.
+        models: as for ``trajectories.measure_trajectories``.
+        residuals: as for ``trajectories.measure_trajectories``.
     """
     try:
         from flytrack_env.viz_rerun import write_recording
-        from flytrack_sysid.trajectories import trajectories_of
+        from flytrack_sysid.trajectories import measure_trajectories
 
-        write_recording(path, trajectories_of(log, models, residuals), None)
+        write_recording(path, measure_trajectories(log, models, residuals), None)
     except (
         ImportError,
         ValueError,

@@ -114,7 +114,7 @@ def agreement(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> tuple[flo
     return best, slope
 
 
-def slope_of(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> float:
+def estimate_slope(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> float:
     """Return the ratio of a rate's integral to a change; NaN below ``MIN_CORRELATION``."""
     correlation, slope = agreement(log, change, rate)
     return slope if correlation >= MIN_CORRELATION else np.nan
@@ -323,7 +323,7 @@ def _rates(log: FlightLog) -> Iterator[str]:
     if "w" not in log:
         return
     if "q" in log:
-        slope = slope_of(
+        slope = estimate_slope(
             log, summed_turns(Rotation.from_quat(log["q"], scalar_first=True)), log["w"]
         )
         if _is_about(slope, np.rad2deg(1.0)):

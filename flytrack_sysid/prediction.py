@@ -12,7 +12,7 @@ from flytrack_env.quaternion import Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
 from flytrack_sysid.log_voltage import with_voltage
-from flytrack_sysid.record import Filled, Record, is_applied_certain, record_of
+from flytrack_sysid.record import Filled, Record, build_record, is_applied_certain
 from flytrack_sysid.replay import Step, replay, start_replay
 
 # For effects with memory, whose memory at the start of a segment is not known.
@@ -61,7 +61,7 @@ class Prediction(NamedTuple):
         return inputs_that_lack(self.model, self.log)
 
 
-def runs_of(rows: np.ndarray, record: Record) -> list[tuple[int, int]]:
+def find_runs(rows: np.ndarray, record: Record) -> list[tuple[int, int]]:
     """Return the runs of scored rows within a flight, as first row and end.
 
     Args:
@@ -137,7 +137,7 @@ def predict(model: ModelParameters, filled: Filled) -> Prediction:
     """
     filled = filled._replace(log=with_voltage(filled.log, model))
     log = filled.log
-    record = record_of(filled)._replace(is_applied_known=np.full(len(log), "uprev" in log))
+    record = build_record(filled)._replace(is_applied_known=np.full(len(log), "uprev" in log))
     gyro_b = log["w"] if "w" in log else np.zeros((len(log), 3))
     with jax.enable_x64(True):
         steps = _step_from_every_row(record, gyro_b, in_float64(model))

@@ -12,8 +12,8 @@ from flytrack_sysid.prediction import (
     MAX_S,
     Prediction,
     columns,
+    find_runs,
     free_flights,
-    runs_of,
     scored_steps,
 )
 from flytrack_sysid.sensors import specific_force_b
@@ -206,7 +206,7 @@ def _starts_and_ends(prediction: Prediction, rows: np.ndarray) -> tuple[np.ndarr
     """
     starts, ends = [], []
     half_step = 0.5 * prediction.step_s
-    for first, end in runs_of(rows, prediction.record):
+    for first, end in find_runs(rows, prediction.record):
         time, is_settled = prediction.log.time[first:end], prediction.is_settled[first:end]
         if not is_settled.any():
             continue

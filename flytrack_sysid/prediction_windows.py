@@ -19,7 +19,7 @@ from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_sysid.log import FlightLog, usual_step
 from flytrack_sysid.prediction import SETTLING_S
-from flytrack_sysid.record import Record, fill_gaps, record_of
+from flytrack_sysid.record import Record, build_record, fill_gaps
 from flytrack_sysid.replay import measured_drone, where_true
 
 HORIZONS_S = (0.1, 0.25, 0.5, 1.0, 2.0)
@@ -69,7 +69,7 @@ class Windows(NamedTuple):
         return sums
 
 
-def batches_of(windows: Windows) -> list[Windows]:
+def cut_batches(windows: Windows) -> list[Windows]:
     """Split windows into batches of WINDOWS_PER_BATCH; the first window pads the last batch."""
     num_windows = len(windows.start)
     indices_by_batch = np.resize(
@@ -126,7 +126,7 @@ def make_windows(
     index = np.minimum(starts + np.arange(-lead, ends[-1] + 1)[:, None], len(rows) - 1)
     has_channel = np.array([name in log for name in CHANNEL_OF.values()])
     gyro = filled.log["w"] if "w" in log else np.zeros((len(rows), 3))
-    record = record_of(filled)
+    record = build_record(filled)
     return Windows(
         record=Record(*(leaf[index] for leaf in record)),
         is_free=np.arange(len(index)) > lead,

@@ -157,7 +157,7 @@ def fill_gaps(log: FlightLog) -> Filled:
     return Filled(filled, np.where(is_measured, rows, -1), behind, doubt)
 
 
-def record_of(filled: Filled) -> Record:
+def build_record(filled: Filled) -> Record:
     """Return a log without gaps as a record, without padding and in one piece."""
     log, begins = filled.log, filled.log.is_start()
     zeros = np.zeros((len(log), 3))
@@ -186,7 +186,7 @@ def record_of(filled: Filled) -> Record:
 def make_record(log: FlightLog) -> Record:
     """Return a log ready for replay."""
     filled = fill_gaps(log)
-    record = record_of(filled)
+    record = build_record(filled)
     longest_s = WINDOW_S if "v_bat" in log else WINDOW_WITHOUT_VOLTAGE_S
     is_first = record.begins | np.append(True, np.diff(blocks_of(log)[filled.behind]) != 0)
     return _padded(record._replace(piece=cut_evenly(filled.log.time, is_first, longest_s)))

@@ -37,7 +37,7 @@ class Script(NamedTuple):
     commands: np.ndarray
 
 
-def script_of(flights: Iterable[excitation.ScriptedFlight]) -> Script:
+def build_script(flights: Iterable[excitation.ScriptedFlight]) -> Script:
     """Return the script of flights of equal length."""
     kinds, starts, commands = zip(*flights, strict=True)
     return Script(tuple(kinds), np.stack(starts).astype(float), np.stack(commands).astype(float))

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_sysid.prediction import Prediction, free_flights, runs_of
+from flytrack_sysid.prediction import Prediction, find_runs, free_flights
 
 AXES = ("roll", "pitch", "yaw")
 MIN_JUMP = 0.2
@@ -65,7 +65,7 @@ def _largest_steps(
     """Return the largest steps of an axis: first shown row, row of the step, end of shown rows."""
     largest, log = [], prediction.log
     command = log["u"][:, axis]
-    for start, end in runs_of(rows, prediction.record):
+    for start, end in find_runs(rows, prediction.record):
         time = log.time[start:end]
         for step in _steps_in(time, command[start:end]).tolist():
             step_time = time[step]

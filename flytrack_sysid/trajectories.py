@@ -55,7 +55,7 @@ class _Timed(NamedTuple):
     every: int
 
 
-def trajectories_of(
+def measure_trajectories(
     log: FlightLog, models: Mapping[str, ModelParameters], residuals: Traces | None = None
 ) -> list[Trajectory]:
     """Return the trajectories of a log: measured, and one of each model that can fly it.

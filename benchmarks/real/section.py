@@ -23,7 +23,7 @@ from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.evidence import words_of
 from flytrack_sysid.diagnosis.refinement import FlightErrors
 from flytrack_sysid.diagnosis.report import verdict_of
-from flytrack_sysid.prediction_windows import QUANTITIES, Windows, batches_of, prediction_errors
+from flytrack_sysid.prediction_windows import QUANTITIES, Windows, cut_batches, prediction_errors
 
 Record = dict[str, Any]
 STYLES: dict[str, dict[str, Any]] = {
@@ -70,7 +70,7 @@ _errors = jax.jit(prediction_errors)
 def test_model(model: ModelParameters, windows: Windows) -> FlightErrors:
     """Return a model's errors on windows; inside ``jax.enable_x64(True)``."""
     model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
-    parts = [np.asarray(_errors(model, chunk)) for chunk in batches_of(windows)]
+    parts = [np.asarray(_errors(model, chunk)) for chunk in cut_batches(windows)]
     errors = np.concatenate(parts, axis=1)[:, : len(windows.start)]
     return FlightErrors(errors.reshape(1, *errors.shape[:-1], len(QUANTITIES), 3), windows)
 

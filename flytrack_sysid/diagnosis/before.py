@@ -165,7 +165,7 @@ def diagnose_change(
             best, equivalents[change[0].candidate.effect] = change
             later, earlier = best.later, best.earlier
         report(2, 3)
-        selection = selection_of(later, earlier)
+        selection = build_selection(later, earlier)
         test = held_out_under(selection, parts.test)
         vetted = refined_within_range(selection, {}, test, parts)
         diagnosis = summarize(vetted, parts._replace(test=test))
@@ -340,7 +340,7 @@ def is_large(candidate: Candidate, change: np.ndarray, later: Estimate) -> bool:
     )
 
 
-def selection_of(later: Estimate, earlier: Estimate) -> Selection:
+def build_selection(later: Estimate, earlier: Estimate) -> Selection:
     """Return the model of the later log as a selection.
 
     Its unexplained part is what was explained, or much smaller, in the earlier log.

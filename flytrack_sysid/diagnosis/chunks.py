@@ -65,7 +65,7 @@ class Chunks(NamedTuple):
         return int(self.counts.any(axis=(2, 3)).sum())
 
 
-def lead_in_of(rows: int) -> int:
+def count_lead_in(rows: int) -> int:
     """Return the number of a chunk's rows that are its lead-in."""
     return rows * LEAD_IN_S // PIECES
 
@@ -132,7 +132,7 @@ def make_chunks(log: FlightLog, scored_rows: np.ndarray, tau: np.ndarray, gravit
     rate = 1.0 / float(np.median(record.step_s[record.source_row >= 0]))
     # The number of rows a second is rounded, so that logs share programs.
     index = _index(exists[:num_rows], max(MIN_ROWS_PER_S, int(float(f"{rate:.2g}"))))
-    is_real = (index >= 0) & (np.arange(len(index)) >= lead_in_of(len(index)))[:, None]
+    is_real = (index >= 0) & (np.arange(len(index)) >= count_lead_in(len(index)))[:, None]
     measured = measured_channels(log, record, gravity)
     no_rows = np.zeros(len(exists), bool)
     sides = (
@@ -197,7 +197,7 @@ def thinned(chunks: Chunks, max_chunks: int | None = None) -> Chunks:
     rows, num_chunks = chunks.row.shape
     max_chunks = (
         max_chunks
-        or max(MAX_ROWS // (rows - lead_in_of(rows)) // CHUNKS_PADDED_TO, 1) * CHUNKS_PADDED_TO
+        or max(MAX_ROWS // (rows - count_lead_in(rows)) // CHUNKS_PADDED_TO, 1) * CHUNKS_PADDED_TO
     )
     if num_chunks <= max_chunks:
         return chunks

@@ -29,18 +29,18 @@ from flytrack_sysid.diagnosis.learned import find_learned
 from flytrack_sysid.diagnosis.motion_choice import (
     MotionEstimate,
     build_problem,
+    choose_simulator_step,
     estimate_motion,
-    likelier_motion,
 )
 from flytrack_sysid.diagnosis.onset import (
     at_end,
+    describe_changes,
+    find_spans,
     first_row_as_at_end,
-    notes_of,
-    spans_of,
     windows_of,
     with_changes,
 )
-from flytrack_sysid.diagnosis.outliers import outlier_notes, outliers_of
+from flytrack_sysid.diagnosis.outliers import find_outliers, outlier_notes
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Refined, reduced, refine
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis
@@ -49,7 +49,7 @@ from flytrack_sysid.diagnosis.search import (
     FittedModel,
     SearchState,
     extended,
-    with_noise_of,
+    with_refitted_noise,
 )
 from flytrack_sysid.diagnosis.size import split_by_size
 from flytrack_sysid.diagnosis.vetoes import (
@@ -135,7 +135,7 @@ def diagnose(
             or motion_estimate.late_s
             or motion_estimate.motion is Motion.CONTINUOUS
         ):
-            likelier = likelier_motion(selection.state.problem, selection.model.vector)
+            likelier = choose_simulator_step(selection.state.problem, selection.model.vector)
             if likelier is not parts.motion_estimate.motion:
                 parts = split(log, model, held_out, likelier)
                 state, base = begun(parts)
@@ -170,7 +170,7 @@ def first_look(
 def begun(parts: Split) -> tuple[SearchState, FittedModel]:
     """Return the state before the search, with the noise of the training rows, and the base."""
     state = SearchState.start(parts.log, parts.train)
-    return with_noise_of(state, state.fitted((), state.problem.start))
+    return with_refitted_noise(state, state.fitted((), state.problem.start))
 
 
 def split(
@@ -346,7 +346,7 @@ def name_causes(vetted: VettedModel, parts: Split) -> NamedModel:
     ]
     extended = model if refined.fit is None else model._replace(vector=refined.fit.vector)
     causes = summary.with_refined_values([*effects, *in_base], refined, extended.vector)
-    spans = spans_of(selection, test, parts.log)
+    spans = find_spans(selection, test, parts.log)
     causes = tuple(replace(named, **spans.get(named.effect, {})) for named in causes)
 
     def without(cause: Cause) -> np.ndarray:
@@ -395,7 +395,7 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
     problem, unexplained = selection.state.problem, selection.unexplained
     causes = tuple(one for one in named.found if not one.beyond)
     beyond = (*vetted.refused, *(one for one in named.found if one.beyond))
-    outliers = outliers_of((problem, test), named.extended.vector)
+    outliers = find_outliers((problem, test), named.extended.vector)
     vectors = {
         "nominal": problem.start,
         "refitted_base": selection.base.vector,
@@ -409,15 +409,15 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
         vectors, flying = (with_and_without(learned, one, change) for one in (vectors, flying))
         extended = extended._replace(vector=vector)
         test, refined = test.with_law(learned.effect), refined.with_law(learned.effect)
-    prediction = summary.prediction_of(refined, flying)
+    prediction = summary.summarize_prediction(refined, flying)
     notes = [
         *outlier_notes(outliers),
-        *summary.warnings_of(problem, (*causes, *beyond), named.lost),
+        *summary.collect_warnings(problem, (*causes, *beyond), named.lost),
         *summary.refinement_notes(vetted.refined, selection.model),
         *summary.stand_in_notes(selection, flying["extended"]),
         *summary.given_law_notes(problem, unexplained),
         *summary.unseen_at_rest_notes(vetted.rejected),
-        *notes_of(selection, linearization, parts.log),
+        *describe_changes(selection, linearization, parts.log),
     ]
     all_unexplained = summary.with_lost_causes(unexplained, named.lost)
     all_unexplained = replace(all_unexplained, flagged=all_unexplained.flagged or bool(beyond))
@@ -444,7 +444,9 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
         warnings=(*parts.warnings, *notes),
         prediction=prediction,
         changed=summary.changed_parameters(linearization, extended, vetted.refined),
-        half_response_s=summary.half_responses_of(linearization, selection.model, refined, flying),
+        half_response_s=summary.summarize_half_responses(
+            linearization, selection.model, refined, flying
+        ),
         outliers=outliers,
         learned=learned,
     )

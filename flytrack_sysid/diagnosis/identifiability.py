@@ -21,7 +21,7 @@ from flytrack_sysid.collect import states_flown
 from flytrack_sysid.diagnosis.chunks import CHUNK_S, Chunks, make_chunks, voltages_of
 from flytrack_sysid.diagnosis.problem import SEARCHED, Problem
 from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG, NotIdentifiable
-from flytrack_sysid.diagnosis.score_test import Candidate, Linearization, candidates_of
+from flytrack_sysid.diagnosis.score_test import Candidate, Linearization, list_candidates
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.excitation import ANY_VOLTAGE, DT_S, FLIGHT_STEPS, SCRIPT_HEIGHTS, is_inside
 from flytrack_sysid.log import FlightLog, log_of_states
@@ -34,7 +34,7 @@ from flytrack_sysid.manoeuvres import (
 )
 from flytrack_sysid.parameters import TAUS, THRUST_COEFFS, from_vector
 from flytrack_sysid.record import UPRIGHT
-from flytrack_sysid.script_file import Script, ScriptError, script_of
+from flytrack_sysid.script_file import Script, ScriptError, build_script
 
 DETECTED = 30.0  # noncentrality from which a log shows an effect nearly always
 SEPARATE = 20.0  # noncentrality beside a rival from which a log tells the two apart
@@ -58,7 +58,7 @@ def _typical_candidate(effect: str) -> Candidate:
             for probe in candidate.probes
         )
 
-    return min(candidates_of(BY_NAME[effect]), key=distance)
+    return min(list_candidates(BY_NAME[effect]), key=distance)
 
 
 class Question:
@@ -408,4 +408,4 @@ def next_flight(path: str | Path, model: ModelParameters, seed: int = 0) -> Next
         )
     voltages = _voltages(path, content, model)
     hover = hover_action(model, voltages)
-    return NextFlight(script_of(flights_of(reasons, hover, seed, voltages)), reasons)
+    return NextFlight(build_script(flights_of(reasons, hover, seed, voltages)), reasons)

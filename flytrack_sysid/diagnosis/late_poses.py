@@ -7,7 +7,7 @@ import numpy as np
 
 from flytrack_env.effects import BY_NAME, MocapLatency
 from flytrack_sysid.diagnosis.chunks import Chunks
-from flytrack_sysid.diagnosis.lateness import latency_of
+from flytrack_sysid.diagnosis.lateness import get_latency
 from flytrack_sysid.diagnosis.motion_choice import STANDARD_ERRORS, MotionEstimate
 from flytrack_sysid.diagnosis.problem import Problem, robust_square, vector_of
 from flytrack_sysid.diagnosis.result import Cause, Changed, Diagnosis, Estimated
@@ -48,7 +48,7 @@ def with_late_poses(
         logged: the chunks of each problem, as logged.
     """
     before_s, late_s, sigma_s = (
-        latency_of(diagnosis.nominal),
+        get_latency(diagnosis.nominal),
         min(motion_estimate.late_s, BOUNDS.high),
         motion_estimate.sigma_s,
     )

@@ -23,7 +23,7 @@ from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import read_later
 from flytrack_sysid.diagnosis.chunks import NUM_AXES, Chunks
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.record import Record, fill_gaps, record_of
+from flytrack_sysid.record import Record, build_record, fill_gaps
 
 POSES = ("p", "v", "q")
 TAPS = (1, 0, -1, -2)  # rows that make up a delayed value, relative to its own row
@@ -55,7 +55,7 @@ class Late(NamedTuple):
         return result
 
 
-def latency_of(model: ModelParameters) -> float:
+def get_latency(model: ModelParameters) -> float:
     """Return the lateness of poses in a model (s)."""
     return float(model.effect("mocap_latency").latency_s)
 
@@ -109,7 +109,7 @@ def scored_as_logged(
         motion: of the log.
     """
     filled, moved = fill_gaps(logged), fill_gaps(corrected)
-    record, step_s = record_of(moved), float(np.median(np.diff(moved.log.time)))
+    record, step_s = build_record(moved), float(np.median(np.diff(moved.log.time)))
     gap_s = 2.0 * (np.ptp(logged.time) + late_s + 1.0)  # segments one after the other, well apart
     logged_s = filled.log.time + gap_s * logged.segment[filled.behind]
     corrected_s = moved.log.time + gap_s * corrected.segment[moved.behind]
@@ -122,7 +122,7 @@ def scored_as_logged(
     )
     is_logged &= run[nearest] == run[same]
     weights = _weights((corrected_s + late_s - logged_s[nearest]) / step_s, motion)
-    constant = _changes(record_of(filled))[nearest] - _delayed(_changes(record), weights, 0)
+    constant = _changes(build_record(filled))[nearest] - _delayed(_changes(record), weights, 0)
     constant = np.pad(np.where(record.begins[:, None], 0.0, constant), ((0, 0), (0, NUM_AXES - 6)))
     index = np.where(chunks.row < len(corrected_s), chunks.row, -1)
     is_inside = index >= 0

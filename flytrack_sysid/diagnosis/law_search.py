@@ -87,7 +87,7 @@ def moment_of_flight(problem: Problem, vector: np.ndarray, flight: FlightVariabl
     )
 
 
-def directions_of(term: Term, moment: Moment, rotation: np.ndarray) -> np.ndarray:
+def list_directions(term: Term, moment: Moment, rotation: np.ndarray) -> np.ndarray:
     """Return a term's unit directions in the world frame, (coefficients, rows, chunks, 3)."""
     body = [
         np.stack(np.broadcast_arrays(*unit, moment.time_s)[:-1], axis=-1)
@@ -134,7 +134,7 @@ class Side(NamedTuple):
     def white(self, term: Term) -> np.ndarray:
         """Return a term's unit coefficients as innovations, (coefficients, rows, chunks, 3, 2)."""
         signal = np.broadcast_to(term.signal(self.moment), np.shape(self.moment.time_s))[..., None]
-        directions = directions_of(term, self.moment, self.flight.body_to_world)
+        directions = list_directions(term, self.moment, self.flight.body_to_world)
         return whitened(self.problem, directions * signal, self.name)
 
     def vector_beside(self, given: np.ndarray) -> np.ndarray:
@@ -179,7 +179,7 @@ def _local(side: Side, quantity: str, shapes: Sequence[str], count: int) -> Iter
                 )
 
 
-def factors_of(side: Side) -> Iterator[tuple[str, tuple[Factor, ...]]]:
+def list_factors(side: Side) -> Iterator[tuple[str, tuple[Factor, ...]]]:
     """Yield the frames and factors that are tried."""
     airspeeds = ("airspeed_x", "airspeed_y", "airspeed_z", "edgewise", "airspeed")
     for quantity in airspeeds:
@@ -258,7 +258,7 @@ def num_numbers(term: Term) -> int:
     return term.num_coefficients + num_shaped(term)
 
 
-def price_of(term: Term) -> float:
+def term_price(term: Term) -> float:
     """Return the gain that a term needs to be preferred to no term."""
     return PER_COEFFICIENT * term.num_coefficients + PER_NUMBER * num_shaped(term)
 
@@ -269,7 +269,7 @@ def score_term(side: Side, test: SideTest, term: Term) -> Trial:
     if not np.isfinite(columns).all() or not np.abs(columns).max() > 0.0:
         return Trial(term, -np.inf, 0.0)
     gain = test.fit(columns, MIN_INDEPENDENT_FRACTION).gain
-    return Trial(term, gain - price_of(term), gain)
+    return Trial(term, gain - term_price(term), gain)
 
 
 def refine_shapes(side: Side, test: SideTest, start: Trial) -> Trial:
@@ -484,8 +484,8 @@ def find_law(side: Side, held: Side) -> FittedLaw | None:
     The search starts from the best terms of several quantities, since each wave of a sum may gain
     less than a bump.
     """
-    pool = [bare_term(side, *frame_and_factors) for frame_and_factors in factors_of(side)]
-    firsts, ranked = best_of(side, side.test, pool)
+    pool = [bare_term(side, *frame_and_factors) for frame_and_factors in list_factors(side)]
+    firsts, ranked = rank_terms(side, side.test, pool)
     limits = stats.chi2.isf(
         FALSE_POSITIVE_RATE / len(pool), [num_numbers(trial.term) for trial in firsts]
     )
@@ -502,12 +502,12 @@ def find_law(side: Side, held: Side) -> FittedLaw | None:
     confirmed = [law._replace(rivals=rivals) for law in laws if law is not None]
     return max(
         confirmed,
-        key=lambda law: law.gain - sum(price_of(term) for term in law.terms),
+        key=lambda law: law.gain - sum(term_price(term) for term in law.terms),
         default=None,
     )
 
 
-def best_of(side: Side, test: SideTest, pool: Sequence[Term]) -> tuple[list[Trial], list[Term]]:
+def rank_terms(side: Side, test: SideTest, pool: Sequence[Term]) -> tuple[list[Trial], list[Term]]:
     """Return the best terms of each kind, refined, and the whole pool; both sorted by merit."""
     trials = sorted((score_term(side, test, term) for term in pool), key=lambda trial: -trial.merit)
     best = [refine_shapes(side, test, trial) for trial in _of_different_kinds(trials)[:MAX_REFINED]]
@@ -551,7 +551,7 @@ def grow_law(
         if len(terms) == MAX_TERMS:
             break
         test = side.test.given_also(*(side.columns(term) for term in terms))
-        (first, *_), _ = best_of(side, test, pool)
+        (first, *_), _ = rank_terms(side, test, pool)
         if first.gain < stats.chi2.isf(
             FURTHER_FALSE_POSITIVE_RATE / num_tried, num_numbers(first.term)
         ):

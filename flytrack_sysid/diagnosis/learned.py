@@ -22,10 +22,10 @@ from flytrack_sysid.diagnosis.refinement import (
 )
 from flytrack_sysid.diagnosis.search import FittedModel
 from flytrack_sysid.diagnosis.unexplained import (
+    build_waves,
     find_dependences,
     find_lines,
     stochastic_shares,
-    waves_of,
 )
 
 MAX_ROWS = 12_000  # with their lead-ins: two minutes at 100 Hz
@@ -52,7 +52,7 @@ def find_learned(
         flight_test: free flights on held-out rows; None without any.
     """
     problem, test = thinned_problem(problem), thinned_problem(test)
-    waves = waves_of(problem, model, find_lines(problem, model))
+    waves = build_waves(problem, model, find_lines(problem, model))
     dependences = find_dependences(problem, model, base, waves)
     learned: Learned | None = None
     # A wandering disturbance may be a law of a variable that is not among the smooth functions.

@@ -15,7 +15,7 @@ from flytrack_sysid.diagnosis.score_test import (
     Candidate,
     Linearization,
     candidates_for,
-    inflation_of,
+    estimate_inflation,
     solve,
     threshold,
 )
@@ -329,7 +329,7 @@ class Marginal:
         self.information, share = linearization.projected(columns, given)
         blocks = linearization.score_by_block
         self.scores = blocks[:, columns] - blocks[:, given] @ share
-        self.inflation = inflation_of(self.information, self.scores)
+        self.inflation = estimate_inflation(self.information, self.scores)
 
     def covariance(self) -> np.ndarray:
         """Return the parameters' covariance, that of the information times its inflation."""

@@ -326,7 +326,7 @@ def _both(first: Trial, second: Trial) -> Trial:
     )
 
 
-def likelier_motion(problem: Problem, vector: np.ndarray) -> Motion:
+def choose_simulator_step(problem: Problem, vector: np.ndarray) -> Motion:
     """Return the motion with the least misfit of a fitted model; its own unless clearly worse.
 
     Before the search, an incomplete model may fit another simulator's step better than the true

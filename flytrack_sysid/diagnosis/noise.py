@@ -196,7 +196,7 @@ def innovations_of_row(
     return updated, direct_innovation * gain.direct_scale, level_innovation * gain.level_scale
 
 
-def conditions_of(chunks: Chunks) -> Conditions:
+def build_conditions(chunks: Chunks) -> Conditions:
     """Return the conditions of the rows of chunks, leaves (rows, chunks, ...)."""
     return Conditions(
         step_to(chunks)[..., None], chunks.is_known.astype(float), chunks.counts.astype(float)
@@ -241,7 +241,7 @@ class Whitener:
         """The gains and counts, by first chunk and first row."""
         zeros = jnp.zeros((NUM_CHUNKS, NUM_AXES))
         gains_by_part: dict[int, dict[int, tuple[Gains, jax.Array]]] = {}
-        for chunk, parts in cut_to_size(conditions_of(self._chunks)).items():
+        for chunk, parts in cut_to_size(build_conditions(self._chunks)).items():
             state, gains_by_part[chunk] = Variances(zeros, zeros, zeros), {}
             for begin, rows in parts.items():
                 state, gains = _gains_of_rows(self._log_noise, state, rows)
@@ -357,7 +357,7 @@ class Likelihood:
     """The likelihood of noises, given residuals of chunks (rows, chunks, NUM_AXES, 2)."""
 
     def __init__(self, chunks: Chunks, residuals: np.ndarray):
-        self._parts = cut_to_size((conditions_of(chunks), residuals))
+        self._parts = cut_to_size((build_conditions(chunks), residuals))
 
     def misfit(self, log_noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the sums of ``_misfit_rows`` over all rows."""
@@ -376,7 +376,7 @@ class Likelihood:
         return total, slopes, curvature
 
 
-def floors_of(chunks: Chunks) -> np.ndarray:
+def noise_floors(chunks: Chunks) -> np.ndarray:
     """Return the least noise of each channel, (2, NUM_AXES): of its last digit or of float32."""
     return np.maximum(FLOORS, chunks.quanta * UNIFORM)
 
@@ -388,7 +388,7 @@ def least_noise(chunks: Chunks) -> np.ndarray:
 
 def first_guess(chunks: Chunks, residuals: np.ndarray) -> np.ndarray:
     """Return a first estimate of log noise, (6, NUM_AXES), robust against slow residuals."""
-    counts, floors = chunks.counts, floors_of(chunks)
+    counts, floors = chunks.counts, noise_floors(chunks)
     is_pair = counts[1:] & counts[:-1]
     guess = np.zeros((6, NUM_AXES))
     for axis in range(NUM_AXES):
@@ -458,6 +458,6 @@ def _bounds(chunks: Chunks) -> tuple[np.ndarray, np.ndarray]:
     ]
     high = [np.log(1e3)] * 4 + [np.log(TAU_RANGE_S[1]), 5.0]
     lowest = np.concatenate(
-        [np.log(floors_of(chunks)), np.repeat(low, NUM_AXES).reshape(-1, NUM_AXES)]
+        [np.log(noise_floors(chunks)), np.repeat(low, NUM_AXES).reshape(-1, NUM_AXES)]
     )
     return lowest, np.array(high)[:, None]

@@ -19,14 +19,14 @@ import numpy as np
 from scipy import optimize, stats
 
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.chunks import CHUNK_S, Chunks, lead_in_of
+from flytrack_sysid.diagnosis.chunks import CHUNK_S, Chunks, count_lead_in
 from flytrack_sysid.diagnosis.problem import Problem, Window, robust_square
 from flytrack_sysid.diagnosis.result import Estimated
 from flytrack_sysid.diagnosis.score_test import (
     Candidate,
     Linearization,
     candidates_for,
-    inflation_of,
+    estimate_inflation,
     solve,
 )
 from flytrack_sysid.diagnosis.search import (
@@ -34,7 +34,7 @@ from flytrack_sysid.diagnosis.search import (
     FittedModel,
     SearchState,
     extended,
-    with_noise_of,
+    with_refitted_noise,
 )
 from flytrack_sysid.diagnosis.vetoes import Selection, select
 from flytrack_sysid.log import FlightLog
@@ -138,19 +138,19 @@ class Hypothesis(NamedTuple):
         return self.gain - threshold(self.num_parameters)
 
 
-def seconds_of(chunks: Chunks) -> tuple[np.ndarray, np.ndarray]:
+def split_seconds(chunks: Chunks) -> tuple[np.ndarray, np.ndarray]:
     """Return the first row of each second, and the rows at which an effect may begin or end.
 
     Seconds are in the order of ``problem.blocks_of``.
     """
-    rows = chunks.row[lead_in_of(len(chunks.row)) :]
+    rows = chunks.row[count_lead_in(len(chunks.row)) :]
     start = rows[:: len(rows) // CHUNK_S].ravel()
     known = np.sort(start[start >= 0])
     margin = int(np.ceil(max(MIN_SIDE_S, MIN_SIDE_FRACTION * len(known))))
     return start, known[margin : len(known) - margin + 1]
 
 
-def changes_of(
+def find_changes(
     linearization: Linearization, model: FittedModel, lacking: Sequence[str]
 ) -> list[Hypothesis]:
     """Return the likeliest change of each effect within the log, the likeliest effect first.
@@ -160,7 +160,7 @@ def changes_of(
         model: without changes.
         lacking: effects that are not searched for.
     """
-    seconds = seconds_of(linearization.problem.chunks)
+    seconds = split_seconds(linearization.problem.chunks)
     if not len(seconds[1]):
         return []
     best: dict[str, Hypothesis] = {}
@@ -187,7 +187,7 @@ def _change_of(
         linearization: of the model, along everything.
         model: without changes.
         candidate: the effect.
-        seconds: as of ``seconds_of``.
+        seconds: as of ``split_seconds``.
     """
     is_named = candidate.effect in model.effects
     columns = [linearization.column(field) for field in candidate.fields]
@@ -237,7 +237,7 @@ def _inflation(
     step = solve(
         projected + RIDGE * np.diag(np.diag(unprojected.sum(axis=0))), projected_score.sum(axis=0)
     )
-    return inflation_of(projected, projected_score - by_block @ step)
+    return estimate_inflation(projected, projected_score - by_block @ step)
 
 
 def is_one_flight(log: FlightLog) -> bool:
@@ -271,7 +271,7 @@ class Profile(NamedTuple):
         return int(self.rows[low]), int(self.rows[high])
 
 
-def profile_of(problem: Problem, test: Problem, vector: np.ndarray, row: int) -> Profile:
+def profile_change(problem: Problem, test: Problem, vector: np.ndarray, row: int) -> Profile:
     """Return the profile likelihood of a change's row, with the vector fixed.
 
     Args:
@@ -317,7 +317,7 @@ def log_rows(problem: Problem, test: Problem, rows: Sequence[int]) -> np.ndarray
     return np.interp(rows, rows_of_record[known][order], source[known][order])
 
 
-def spans_of(selection: Selection, test: Problem, log: FlightLog) -> dict[str, dict[str, Any]]:
+def find_spans(selection: Selection, test: Problem, log: FlightLog) -> dict[str, dict[str, Any]]:
     """Return the onset and end of effects with windows, by effect, as fields of a cause.
 
     Both are in seconds of the log's clock, with 95 % intervals; None if there is no onset or end.
@@ -327,7 +327,9 @@ def spans_of(selection: Selection, test: Problem, log: FlightLog) -> dict[str, d
     def time_of(effect: str, row: int) -> Estimated | None:
         if row in (ALWAYS, NEVER):
             return None
-        ends = profile_of(problem, test, vector, row).ends95(selection.ablations[effect].inflation)
+        ends = profile_change(problem, test, vector, row).ends95(
+            selection.ablations[effect].inflation
+        )
         indices = log_rows(problem, test, (row, *ends))
         value, low, high = np.interp(indices, np.arange(len(log)), log.time).tolist()
         return Estimated(value, (low, high), "s")
@@ -372,7 +374,9 @@ def first_row_as_at_end(selection: Selection, test: Problem) -> int:
     return int(np.ceil(log_rows(selection.state.problem, test, [max(rows)])[0])) if rows else 0
 
 
-def notes_of(selection: Selection, linearization: Linearization, log: FlightLog) -> list[str]:
+def describe_changes(
+    selection: Selection, linearization: Linearization, log: FlightLog
+) -> list[str]:
     """Return notes on changes within the log.
 
     Args:
@@ -390,7 +394,7 @@ def notes_of(selection: Selection, linearization: Linearization, log: FlightLog)
     if gone:
         notes.append(f"not in the extended model: {', '.join(gone)}, which ended within the log")
     lacking = (*selection.state.unobservable, *selection.state.refused)
-    changes = changes_of(linearization, selection.model, lacking) if is_one_flight(log) else []
+    changes = find_changes(linearization, selection.model, lacking) if is_one_flight(log) else []
     for change in changes:
         effect = change.candidate.effect
         if change.margin > 0.0 and effect in selection.model.effects:
@@ -433,7 +437,7 @@ def with_changes(selection: Selection, test: Problem, log: FlightLog) -> Selecti
 def _with_change(selection: Selection, test: Problem) -> Selection | None:
     """Return the selection with one more change; None if no change is clear."""
     state, linearization = selection.state.linearized(selection.model.vector)
-    changes = changes_of(linearization, selection.model, (*state.unobservable, *state.refused))
+    changes = find_changes(linearization, selection.model, (*state.unobservable, *state.refused))
     if not changes or changes[0].margin < 0.0 or changes[0].way == "drift":
         return None
     first, near = (
@@ -443,7 +447,7 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     state, model = _likeliest_side(
         selection, first, [one.candidate.effect for one in near[:MAX_NEAR]]
     )
-    state, model = with_noise_of(_at_best_row(state, test, model, first.row), model)
+    state, model = with_refitted_noise(_at_best_row(state, test, model, first.row), model)
     state, base, model = extended(state, state.fitted((), selection.base.vector), model)
     named = tuple(one for one in state.problem.windows if one.effect in model.effects)
     new_rows, old_rows = (
@@ -507,5 +511,5 @@ def _likeliest_side(
 
 def _at_best_row(state: SearchState, test: Problem, model: FittedModel, row: int) -> SearchState:
     """Return the state with the changes at a row moved to the likeliest row."""
-    best = profile_of(state.problem, test, model.vector, row).best
+    best = profile_change(state.problem, test, model.vector, row).best
     return windowed(state, moved(state.problem, row, best).windows)

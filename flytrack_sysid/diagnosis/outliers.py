@@ -19,7 +19,7 @@ FALSE_POSITIVE_RATE = 1e-6  # of this many outliers, if the noise is normal
 MIN_ROW_FRACTION = 1e-3  # of rows: fewer have no effect
 
 
-def outliers_of(problems: Sequence[Problem], vector: np.ndarray) -> dict[str, Outliers]:
+def find_outliers(problems: Sequence[Problem], vector: np.ndarray) -> dict[str, Outliers]:
     """Return the outliers of a model's residuals, by channel that has some.
 
     Args:

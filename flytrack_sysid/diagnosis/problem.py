@@ -29,7 +29,7 @@ from flytrack_env.dynamics import ModelParameters, read_sensors
 from flytrack_env.effects import BY_NAME, EFFECTS, LEARNED_LAW, Effect, LearnedLaw, effect_of
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.chunks import AXES, CHUNK_S, NUM_AXES, Chunks, lead_in_of
+from flytrack_sysid.diagnosis.chunks import AXES, CHUNK_S, NUM_AXES, Chunks, count_lead_in
 from flytrack_sysid.diagnosis.lateness import Late
 from flytrack_sysid.parameters import TAUS, from_vector, names_of, range_of, to_vector
 from flytrack_sysid.record import Record
@@ -504,7 +504,7 @@ def blocks_of(values: np.ndarray) -> np.ndarray:
     The lead-in is left out.
     """
     rows, chunks = values.shape[-4:-2]
-    kept = values[..., lead_in_of(rows) :, :, :, :]
+    kept = values[..., count_lead_in(rows) :, :, :, :]
     rows_per_s = kept.shape[-4] // CHUNK_S
     split = kept.reshape(*kept.shape[:-4], CHUNK_S, rows_per_s, chunks, kept.shape[-2] * 2)
     return np.moveaxis(split, (-4, -2), (0, 1)).reshape(

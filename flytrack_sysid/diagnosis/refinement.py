@@ -45,7 +45,7 @@ from flytrack_sysid.prediction_windows import (
     UNITS,
     WINDOWS_PER_BATCH,
     Windows,
-    batches_of,
+    cut_batches,
     make_windows,
     prediction_errors,
 )
@@ -149,7 +149,8 @@ def errors_at(problem: Problem, vectors: np.ndarray, windows: Windows) -> Flight
 
     def errors_of_batch(batch_vectors: np.ndarray) -> np.ndarray:
         by_batch = [
-            np.asarray(_errors(batch_vectors, problem.like, batch)) for batch in batches_of(windows)
+            np.asarray(_errors(batch_vectors, problem.like, batch))
+            for batch in cut_batches(windows)
         ]
         return np.concatenate(by_batch, axis=2)[:, :, : len(windows.start)]
 
@@ -453,7 +454,7 @@ class Refined(NamedTuple):
         """
         if self.flight_test is None:
             return {}
-        errors = table_of(self.flight_test.tested(vector).rms()[0])
+        errors = tabulate_errors(self.flight_test.tested(vector).rms()[0])
         keys = (
             f"{name}_{UNITS[name].replace('/', '_per_')}"
             for name in ("position", "attitude", "rates")
@@ -689,7 +690,7 @@ def _probed(problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate
     return result
 
 
-def table_of(rms: np.ndarray) -> dict[str, dict[str, float]]:
+def tabulate_errors(rms: np.ndarray) -> dict[str, dict[str, float]]:
     """Arrange RMS errors, (horizons, quantities), by quantity with unit and by horizon in s."""
     return {
         f"{quantity}_{UNITS[quantity].replace('/', '_per_')}": {

@@ -90,7 +90,7 @@ def _plus_minus(cause: Cause) -> str:
     )
 
 
-def when_of(cause: Cause) -> str:
+def format_span(cause: Cause) -> str:
     """Return when a cause acts, " from 31.2 ± 0.4 s on"; empty if it acts throughout."""
 
     def time(estimate: Estimated) -> str:
@@ -115,8 +115,8 @@ def _faults(diagnosis: Diagnosis) -> str:
     for cause in diagnosis.causes:
         equivalent = () if cause.effect == "thrust_scale" else cause.equivalent[:MAX_LISTED]
         alternatives = f" (or {' or '.join(map(words_of, equivalent))})" if equivalent else ""
-        name = words_of(cause.effect) + when_of(cause) + alternatives
-        by_fault.setdefault(fault_of(cause.effect, diagnosis), []).append(name)
+        name = words_of(cause.effect) + format_span(cause) + alternatives
+        by_fault.setdefault(describe_fault(cause.effect, diagnosis), []).append(name)
     clauses = [
         " ".join([fault, "; ".join(f"the {name}" if fault == WRONG else name for name in names)])
         for fault, names in by_fault.items()
@@ -124,7 +124,7 @@ def _faults(diagnosis: Diagnosis) -> str:
     return f"The model {', and it '.join(clauses)}."
 
 
-def fault_of(cause: str, diagnosis: Diagnosis) -> str:
+def describe_fault(cause: str, diagnosis: Diagnosis) -> str:
     """Return the verb for a cause: compares the value in the flight with that in the model."""
     if cause not in BY_NAME or cause.endswith("_scale"):
         return WRONG
@@ -221,7 +221,7 @@ def _causes_part(diagnosis: Diagnosis) -> Part:
         return Text("No cause is named. See below for what this log could not have shown.")
     rows = [
         [
-            f"{words_of(cause.effect)}{when_of(cause)}\n({cause.effect}, in {cause.channel})",
+            f"{words_of(cause.effect)}{format_span(cause)}\n({cause.effect}, in {cause.channel})",
             "\n".join(_parameter(name, estimate) for name, estimate in cause.parameters.items()),
             _number(cause.heldout_gain),
             _confused(cause),
@@ -383,7 +383,7 @@ LEARNT_READING = (
 )
 
 
-def traces_of(diagnosis: Diagnosis, log: FlightLog) -> Traces:
+def collect_traces(diagnosis: Diagnosis, log: FlightLog) -> Traces:
     """Return the residuals of both models, and of the extended model "without" each cause."""
     models = {"nominal": diagnosis.nominal, "extended": diagnosis.extended}
     for cause in diagnosis.causes:
@@ -415,7 +415,7 @@ def _evidence_parts(diagnosis: Diagnosis, model_traces: Traces, start_s: float) 
     """Return the pictures of the causes with the largest gain.
 
     Args:
-        model_traces: the result of ``traces_of``.
+        model_traces: the result of ``collect_traces``.
         start_s: time of the log's first row (s).
     """
     parts: list[Part] = []
@@ -423,10 +423,10 @@ def _evidence_parts(diagnosis: Diagnosis, model_traces: Traces, start_s: float) 
         evidence = EVIDENCE[cause.effect]
         acting = while_acting(model_traces, cause, start_s)
         figure = draw_cause(
-            cause.effect, evidence.panels, acting, _LESS + cause.effect, when_of(cause)
+            cause.effect, evidence.panels, acting, _LESS + cause.effect, format_span(cause)
         )
         parts.append(
-            Picture(png_of(figure), f"{evidence.reading} ({cause.effect}{when_of(cause)})")
+            Picture(png_of(figure), f"{evidence.reading} ({cause.effect}{format_span(cause)})")
         )
     if parts and any(model_traces.used(name) != name for name in ("rates_x", "force_x")):
         parts.append(Text(DIFFERENCES))
@@ -435,7 +435,7 @@ def _evidence_parts(diagnosis: Diagnosis, model_traces: Traces, start_s: float) 
 
 def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
     """Return the report of a diagnosis of a log as a self-contained page."""
-    model_traces = traces_of(diagnosis, log)
+    model_traces = collect_traces(diagnosis, log)
     minutes = model_traces.elapsed_s[-1] / SECONDS_PER_MINUTE
     introduction: list[Part] = [
         verdict_of(diagnosis),
@@ -505,7 +505,7 @@ def text_of(diagnosis: Diagnosis) -> str:
         ]
         twins = f"; not told apart from {', '.join(names)}" if names else ""
         lines.append(
-            f"  {cause.effect}{when_of(cause)}: {values}; held-out gain "
+            f"  {cause.effect}{format_span(cause)}: {values}; held-out gain "
             f"{cause.heldout_gain:.4g}{twins}"
         )
     for cause in diagnosis.beyond:

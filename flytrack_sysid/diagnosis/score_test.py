@@ -87,7 +87,7 @@ class Candidate(NamedTuple):
         fields = set(self.fields)
         contained = [
             group.fields
-            for group in candidates_of(BY_NAME[self.effect])
+            for group in list_candidates(BY_NAME[self.effect])
             if fields.issuperset(group.fields)
         ]
         largest = [
@@ -107,7 +107,7 @@ class Candidate(NamedTuple):
         fields, other_fields = {*self.fields}, {*other.fields}
         return any(
             fields & family and other_fields & family
-            for family in families_of(BY_NAME[self.effect])
+            for family in find_families(BY_NAME[self.effect])
         )
 
     @property
@@ -116,7 +116,7 @@ class Candidate(NamedTuple):
         return tuple(field for field in self.fields if field not in dict(self.probes))
 
 
-def candidates_of(effect: Effect) -> list[Candidate]:
+def list_candidates(effect: Effect) -> list[Candidate]:
     """Return the candidates of an effect."""
     candidates = []
     for group in effect.search.groups or (tuple(effect.ranges),):
@@ -131,17 +131,17 @@ def candidates_of(effect: Effect) -> list[Candidate]:
     return candidates
 
 
-def families_of(effect: Effect) -> list[set[str]]:
+def find_families(effect: Effect) -> list[set[str]]:
     """Return sets of parameters that groups connect: one weak motor, say, or another, or two."""
     families: list[set[str]] = []
-    for candidate in candidates_of(effect):
+    for candidate in list_candidates(effect):
         family = {*candidate.fields}
         family |= set().union(*(known for known in families if known & family))
         families = [*(known for known in families if not known & family), family]
     return families
 
 
-CANDIDATES = [candidate for effect in SEARCHED for candidate in candidates_of(effect)]
+CANDIDATES = [candidate for effect in SEARCHED for candidate in list_candidates(effect)]
 
 
 def candidates_for(problem: Problem) -> list[Candidate]:
@@ -153,7 +153,7 @@ def candidates_for(problem: Problem) -> list[Candidate]:
             candidate
             for effect in given
             if effect.search.groups
-            for candidate in candidates_of(effect)
+            for candidate in list_candidates(effect)
         ),
     ]
 
@@ -224,7 +224,7 @@ class Linearization:
         change = (self.vector - self.problem.start)[self.indices]
         prior_score = self.prior * np.append(change, np.zeros(len(self.probes)))
         self.score = self.score_by_block.sum(axis=0) - prior_score
-        self.cost = costs_of(self.problem, self.vector[None], self.white[None])[0]
+        self.cost = compute_costs(self.problem, self.vector[None], self.white[None])[0]
 
     def moved(self, vector: np.ndarray, white: np.ndarray | None = None) -> "Linearization":
         """Return the linearization at a nearby model, with the slopes of this one.
@@ -343,7 +343,7 @@ class Linearization:
         scores = scores[:, len(given) :] - scores[:, : len(given)] @ share
         return Gain(
             float(score @ step),
-            inflation_of(information, scores),
+            estimate_inflation(information, scores),
             step,
             joint[: len(given)],
             information,
@@ -426,7 +426,7 @@ def step_inside(
     return step
 
 
-def inflation_of(information: np.ndarray, scores: np.ndarray) -> float:
+def estimate_inflation(information: np.ndarray, scores: np.ndarray) -> float:
     """Return how much more scores vary than information says, at least 1.
 
     Args:
@@ -458,7 +458,7 @@ def prior_information(problem: Problem) -> np.ndarray:
     return 1.0 / np.where(finite, width, 10.0 * problem.scale) ** 2
 
 
-def costs_of(problem: Problem, vectors: np.ndarray, white: np.ndarray) -> np.ndarray:
+def compute_costs(problem: Problem, vectors: np.ndarray, white: np.ndarray) -> np.ndarray:
     """Return minus twice the log likelihood of models plus their prior, (num_models,).
 
     Args:

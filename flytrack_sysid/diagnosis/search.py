@@ -14,7 +14,7 @@ from flytrack_sysid.diagnosis.score_test import (
     Gain,
     Linearization,
     candidates_for,
-    costs_of,
+    compute_costs,
     threshold,
 )
 from flytrack_sysid.log import FlightLog
@@ -262,7 +262,7 @@ def _step(problem: Problem, current: Linearization) -> tuple[float, Linearizatio
         vectors[:, current.indices] += shares[:, None] * step
         vectors = problem.clipped(vectors)
         white = problem.whitened_residuals(*vectors)
-        costs = costs_of(problem, vectors, white)
+        costs = compute_costs(problem, vectors, white)
         index = int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))
         if current.cost - costs[index] > gain:
             best, gain = current.moved(vectors[index], white[index]), current.cost - costs[index]
@@ -398,10 +398,10 @@ def saturated_residuals(linearization: Linearization) -> np.ndarray:
     vectors[:, indices] += SATURATED_SHARES[:, None] * linearization.step(range(len(indices)))
     vectors = problem.clipped(vectors)
     residuals = problem.residuals(vectors)
-    return residuals[int(np.nanargmin(costs_of(problem, vectors, problem.whiten(residuals))))]
+    return residuals[int(np.nanargmin(compute_costs(problem, vectors, problem.whiten(residuals))))]
 
 
-def with_noise_of(state: SearchState, model: FittedModel) -> tuple[SearchState, FittedModel]:
+def with_refitted_noise(state: SearchState, model: FittedModel) -> tuple[SearchState, FittedModel]:
     """Return the state with the noise fitted beside a model, and the model refitted under it.
 
     The noise is fitted to the saturated residuals, which lack no effect.
@@ -425,5 +425,5 @@ def extended(
         state, extended_model = add_effects(state, model)
         if extended_model is model:
             return state, base, model
-        state, model = with_noise_of(state, extended_model)
+        state, model = with_refitted_noise(state, extended_model)
         base = state.fitted((), base.vector)

@@ -18,7 +18,7 @@ from flytrack_sysid.diagnosis.model_selection import (
     separation,
 )
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.refinement import Refined, at_bounds, errors_at, table_of
+from flytrack_sysid.diagnosis.refinement import Refined, at_bounds, errors_at, tabulate_errors
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
     CHANNELS,
@@ -115,7 +115,7 @@ def mean_factor(problem: Problem, vector: np.ndarray, half_n: float) -> dict[str
     return {"mean_factor": Estimated.around(after / before, half_n / before, "1")}
 
 
-def half_responses_of(
+def summarize_half_responses(
     linearization: Linearization,
     model: FittedModel,
     refined: Refined,
@@ -521,7 +521,7 @@ def with_refined_values(
     return tuple(result)
 
 
-def prediction_of(refined: Refined, vectors: Mapping[str, np.ndarray]) -> Prediction:
+def summarize_prediction(refined: Refined, vectors: Mapping[str, np.ndarray]) -> Prediction:
     """Return the errors of models on held-out flights, by horizon; empty without a flight test."""
     flight_test = refined.flight_test
     if flight_test is None:
@@ -530,8 +530,8 @@ def prediction_of(refined: Refined, vectors: Mapping[str, np.ndarray]) -> Predic
     if refined.base is not None:
         models["refitted_to_flights"] = refined.base
     rms = errors_at(refined.problem, np.stack(list(models.values())), flight_test.windows).rms()
-    errors = {name: table_of(value) for name, value in zip(models, rms, strict=True)}
-    errors["placebo"] = table_of(flight_test.placebo.rms()[0])
+    errors = {name: tabulate_errors(value) for name, value in zip(models, rms, strict=True)}
+    errors["placebo"] = tabulate_errors(flight_test.placebo.rms()[0])
     evidence = {
         quantity: tuple(
             float(value) for value in np.array(HORIZONS_S)[flight_test.matters[:, index]]
@@ -610,7 +610,7 @@ def refinement_notes(refined: Refined, model: FittedModel) -> list[str]:
     return notes
 
 
-def warnings_of(
+def collect_warnings(
     problem: Problem, causes: Sequence[Cause], contradicted: Sequence[str]
 ) -> list[str]:
     """Return what a reader must know before trusting causes or the extended model.

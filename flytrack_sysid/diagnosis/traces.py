@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters, lag
 from flytrack_env.state import Action
-from flytrack_sysid.diagnosis.chunks import Chunks, cut_chunks, lead_in_of
-from flytrack_sysid.diagnosis.lateness import latency_of, read_poses
+from flytrack_sysid.diagnosis.chunks import Chunks, count_lead_in, cut_chunks
+from flytrack_sysid.diagnosis.lateness import get_latency, read_poses
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import PLACES
 from flytrack_sysid.log import FlightLog
@@ -156,7 +156,7 @@ class _Rows(NamedTuple):
 
 def _rows_of(chunks: Chunks) -> _Rows:
     row = np.where(
-        (np.arange(len(chunks.row)) >= lead_in_of(len(chunks.row)))[:, None], chunks.row, -1
+        (np.arange(len(chunks.row)) >= count_lead_in(len(chunks.row)))[:, None], chunks.row, -1
     )
     chunk, row_in_chunk = np.nonzero(row.T >= 0)  # chunk after chunk is the record's order
     record = Record(*(leaf[row_in_chunk, chunk] for leaf in chunks.record))
@@ -274,10 +274,10 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
         KeyError: ``like`` is not one of the models.
     """
     base = models[like]
-    logs = {late_s: read_poses(log, late_s) for late_s in map(latency_of, models.values())}
+    logs = {late_s: read_poses(log, late_s) for late_s in map(get_latency, models.values())}
     is_known = np.logical_and.reduce([is_row_known for _, is_row_known in logs.values()])
     in_time = {late_s: shifted.select(is_known) for late_s, (shifted, _) in logs.items()}
-    log = in_time[latency_of(base)]
+    log = in_time[get_latency(base)]
     with jax.enable_x64(True):
         by_lateness = {
             late_s: cut_chunks(late_log, np.ones(len(late_log), bool), base)
@@ -285,9 +285,11 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
         }
         chunk_residuals = []
         for model in models.values():
-            problem = Problem.of(by_lateness[latency_of(model)], model._replace(motion=base.motion))
+            problem = Problem.of(
+                by_lateness[get_latency(model)], model._replace(motion=base.motion)
+            )
             chunk_residuals.append(problem.residuals(problem.start[None])[0])
-        chunks = by_lateness[latency_of(base)]
+        chunks = by_lateness[get_latency(base)]
         lagged = _lagged(chunks.record, np.asarray(base.tau, float))
         applied = np.stack([np.asarray(stick) for stick in lagged], axis=-1)
     rows = _rows_of(chunks)

@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.state import ACTION_SIZE
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.chunks import AXES, lead_in_of
+from flytrack_sysid.diagnosis.chunks import AXES, count_lead_in
 from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_weight
 from flytrack_sysid.diagnosis.result import Unexplained
-from flytrack_sysid.diagnosis.score_test import inflation_of, solve, threshold
+from flytrack_sysid.diagnosis.score_test import estimate_inflation, solve, threshold
 from flytrack_sysid.diagnosis.search import FittedModel
 from flytrack_sysid.parameters import TAUS
 
@@ -360,7 +360,7 @@ class SideTest(NamedTuple):
             np.einsum("bfn,bn->bf", columns, after)
             - np.einsum("bgn,bn->bg", self.given, after) @ share
         )
-        inflation = inflation_of(information, blocks) if is_independent.any() else 1.0
+        inflation = estimate_inflation(information, blocks) if is_independent.any() else 1.0
         fit = SideFit(
             np.zeros(len(is_independent)),
             np.zeros(len(is_independent)),
@@ -573,7 +573,7 @@ def find_lines(problem: Problem, model: FittedModel) -> list[Line]:
             np.einsum("rlji,rlj->rli", flight.body_to_world, residuals[..., axes, 0])
             * counts[..., None]
         )
-        series = np.swapaxes(body[lead_in_of(len(body)) :], 0, 1).reshape(-1, 3)
+        series = np.swapaxes(body[count_lead_in(len(body)) :], 0, 1).reshape(-1, 3)
         step_s = float(np.median(noises.step_to(problem.chunks)))
         power = (np.abs(np.fft.rfft(series, axis=0)) ** 2).max(axis=1)
         frequency = np.fft.rfftfreq(len(series), step_s)
@@ -588,7 +588,9 @@ def find_lines(problem: Problem, model: FittedModel) -> list[Line]:
     return result
 
 
-def waves_of(problem: Problem, model: FittedModel, lines: Sequence[Line]) -> dict[str, np.ndarray]:
+def build_waves(
+    problem: Problem, model: FittedModel, lines: Sequence[Line]
+) -> dict[str, np.ndarray]:
     """Return sine and cosine at the frequencies of lines, along the body's axes, by side."""
     flight = flight_of(problem, model)
     body = np.moveaxis(flight.body_to_world, -1, 0)
@@ -623,7 +625,7 @@ def find_unexplained(
         base: vector of the refitted model without effects.
     """
     lines = find_lines(problem, model)
-    clear = find_dependences(problem, model, base, waves_of(problem, model, lines))
+    clear = find_dependences(problem, model, base, build_waves(problem, model, lines))
     shares = {
         f"{pattern.side}: periodic at {pattern.frequency_hz:.3g} Hz": pattern.share
         for pattern in lines

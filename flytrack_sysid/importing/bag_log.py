@@ -15,7 +15,7 @@ from flytrack_sysid.importing.table_flight import (
     MAX_LIST_LENGTH,
     RECORDED,
     TIMESTAMP,
-    flight_of_topics,
+    build_flight,
 )
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import Table
@@ -72,5 +72,5 @@ def read_bag(path: Path, mapping: Mapping) -> ImportedFlight:
                 f"{path}: topic {name}: no stamps in its messages: times are those of their "
                 "recording"
             )
-    flight = flight_of_topics(str(path), topics, mapping)
+    flight = build_flight(str(path), topics, mapping)
     return flight._replace(notes=(*remarks, *flight.notes))

@@ -45,7 +45,7 @@ class CommandRules(NamedTuple):
     motor_torque: tuple[tuple[float, ...], ...] | None = None
 
 
-def commands_of(
+def read_commands(
     source: str,
     time: np.ndarray,
     channels: Channels[str, np.ndarray],
@@ -180,7 +180,7 @@ def _identified_attitude_gain(
     Args:
         source: the log, for messages.
         time: (num_rows,) s.
-        channels: as for ``commands_of``.
+        channels: as for ``read_commands``.
         errors: of the attitude, (num_rows, 3) rad.
         given: stated gains, rad/s per rad; those of 0 are identified.
     """

@@ -14,7 +14,7 @@ from flytrack_env.messages import quote_name
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, read_log_file
 from flytrack_sysid.importing.mapping import Channel, Mapping
-from flytrack_sysid.importing.table_flight import TIMESTAMP, flight_of_topics
+from flytrack_sysid.importing.table_flight import TIMESTAMP, build_flight
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, vector_from
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import Table
@@ -115,7 +115,7 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
         for name, fields in chosen.items()
         if TIME in fields
     ]
-    flight = flight_of_topics(
+    flight = build_flight(
         str(path), topics, mapping._replace(channels=tuple(channels), craft=craft)
     )
     return flight._replace(notes=(*(f"{path}: {text}" for text in remarks), *flight.notes))

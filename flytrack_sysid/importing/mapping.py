@@ -49,7 +49,7 @@ class Channel(NamedTuple):
 
     Attributes:
         table: table of the mapping, for messages.
-        name: one of ``CHANNELS``, ``t``, or a name as in ``commands_of``.
+        name: one of ``CHANNELS``, ``t``, or a name as in ``read_commands``.
         columns: columns of the file.
         convert: returns the channel's columns from the file's table, (num_rows, n), in SI units and
             our frames.
@@ -221,7 +221,7 @@ class Command(Fields):
             values = rows.matrix(self.columns)
             is_past = ((values < lowest) | (values > highest)) & (
                 not self.clip
-            )  # else ``commands_of`` clips
+            )  # else ``read_commands`` clips
             for row, stick in np.argwhere(is_past)[:1]:
                 text = (
                     f"found {values[row, stick]:g}, expected {low[stick]:g} to {high[stick]:g} by "

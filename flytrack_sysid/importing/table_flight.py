@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from flytrack_env.messages import quote_name
-from flytrack_sysid.importing.commands import commands_of
+from flytrack_sysid.importing.commands import read_commands
 from flytrack_sysid.importing.file_kinds import EMPTY, GZIP, UNKNOWN, check_kind
 from flytrack_sysid.importing.flight import ImportedFlight
 from flytrack_sysid.importing.mapping import Channel, CsvFile, Mapping
@@ -125,7 +125,7 @@ def _read_files(folder: Path, mapping: Mapping) -> ImportedFlight:
             problem = f"found {len(paths)} files of the name {quote_name(file.file)} among {listed}"
             raise LogError(f"{folder}: {problem}; expected one by {mapping.source}: files.{name}")
         tables.append(_read_file(paths[0], name, file, list(fields), mapping))
-    return flight_of_topics(str(folder), tables, mapping)
+    return build_flight(str(folder), tables, mapping)
 
 
 def _read_file(path: Path, name: str, file: CsvFile, fields: list[str], mapping: Mapping) -> Table:
@@ -146,7 +146,7 @@ def _read_file(path: Path, name: str, file: CsvFile, fields: list[str], mapping:
     return Table(str(path), {TIMESTAMP: times, **columns}, table.lines)
 
 
-def flight_of_topics(source: str, topics: Sequence[Table], mapping: Mapping) -> ImportedFlight:
+def build_flight(source: str, topics: Sequence[Table], mapping: Mapping) -> ImportedFlight:
     """Return the flight in tables that each have a clock and a time column.
 
     The rows are those of the body rates, else of the attitude or the position. Other sensors are
@@ -214,7 +214,7 @@ def _flight(
     mapping: Mapping,
 ) -> ImportedFlight:
     """Return the flight of converted channels; steps above ``max_gap_s`` begin a new segment."""
-    commands, notes = commands_of(
+    commands, notes = read_commands(
         table.source, time, values, mapping.rules, mapping.craft.max_rate_deg_s
     )
     columns = columns_of(time, {**values, "u": commands})

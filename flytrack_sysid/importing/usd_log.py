@@ -21,7 +21,7 @@ import numpy as np
 from flytrack_env.messages import error_text, quote_name
 from flytrack_sysid.importing.flight import ImportedFlight, read_log_file
 from flytrack_sysid.importing.mapping import Mapping
-from flytrack_sysid.importing.table_flight import TIMESTAMP, flight_of_topics
+from flytrack_sysid.importing.table_flight import TIMESTAMP, build_flight
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import Table
 
@@ -59,7 +59,7 @@ def read_usd(path: Path, mapping: Mapping) -> ImportedFlight:
     end = _find_records(content, end, len(content) - NUM_CRC_BYTES * is_whole, events)
     wanted = {column for channel in mapping.channels for column in channel.columns}
     topics = [_table(path, content, event, stamp_s, wanted) for event in events.values()]
-    flight = flight_of_topics(str(path), topics, mapping)
+    flight = build_flight(str(path), topics, mapping)
     if is_whole:
         return flight
     note = (

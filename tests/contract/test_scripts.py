@@ -16,10 +16,10 @@ from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, HEIGHTS
 from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights_of, hover_action
 from flytrack_sysid.script_file import (
     ScriptError,
+    build_script,
     check_script,
     load_script,
     save_script,
-    script_of,
 )
 from tests.support.black_boxes import SHIPPED
 from tests.support.handout_plant import HandoutPlant
@@ -28,7 +28,7 @@ HOVER = hover_action(HandoutPlant().model())
 
 
 def made(*names):
-    return script_of(flights_of(names or MANOEUVRES, HOVER))
+    return build_script(flights_of(names or MANOEUVRES, HOVER))
 
 
 def test_every_manoeuvre_can_be_flown_and_says_how():

@@ -20,7 +20,7 @@ from flytrack_env.state import ACCELERATION, BATTERY, RATES, Action, pack, unpac
 from flytrack_sysid import CollectError, collect, diagnose_change, import_log, load_log, save_log
 from flytrack_sysid.excitation import script, start_state
 from flytrack_sysid.manoeuvres import hover_action
-from flytrack_sysid.script_file import script_of
+from flytrack_sysid.script_file import build_script
 from tests.support.pages import DOCS, run_examples
 from tests.support.simulated_flights import flown_by
 
@@ -249,7 +249,7 @@ def known_model(plant):
 
 def test_loop_with_the_numbers_of_the_body_flies_as_the_firmware_does(plant):
     model = known_model(plant)
-    flown = script_of(script(24, hover_action(nominal_parameters()), np.random.default_rng(3)))
+    flown = build_script(script(24, hover_action(nominal_parameters()), np.random.default_rng(3)))
     expected = plant.fly(flown.starts, flown.commands)
     found = fly_compiled(Simulator(), flown.starts, flown.commands, model)
     off = np.sqrt(np.mean((found - expected) ** 2, axis=(0, 1))) / expected.std(axis=(0, 1))

@@ -33,7 +33,7 @@ from flytrack_sysid.diagnosis.refinement import Fit, Refined
 from flytrack_sysid.diagnosis.report import verdict_of
 from flytrack_sysid.diagnosis.result import Cause, Estimated
 from flytrack_sysid.diagnosis.search import SearchState
-from flytrack_sysid.diagnosis.summary import stand_in_notes, warnings_of, with_refined_values
+from flytrack_sysid.diagnosis.summary import collect_warnings, stand_in_notes, with_refined_values
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log_file import save_log
 from flytrack_sysid.parameters import THRUST_COEFFS
@@ -341,7 +341,7 @@ def test_values_at_the_end_of_their_range_are_beyond_the_list(state, field, valu
     )
     found = with_refined_values([cause], Refined((), None, None, (), {}, problem, None), vector)
     assert found[0].beyond.startswith(f"{name} at most {value:g}" if is_warned_of else "")
-    warned = [one for one in warnings_of(problem, found, []) if "beyond the list" in one]
+    warned = [one for one in collect_warnings(problem, found, []) if "beyond the list" in one]
     assert len(warned) == is_warned_of and bool(found[0].beyond) == is_warned_of
 
 

@@ -51,7 +51,7 @@ def models(flown):
 @pytest.fixture(scope="module")
 def flights(flown, models):
     """What is shown, by name."""
-    return {flight.name: flight for flight in trajectories.trajectories_of(flown[1], models)}
+    return {flight.name: flight for flight in trajectories.measure_trajectories(flown[1], models)}
 
 
 def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, models, tmp_path):
@@ -85,7 +85,7 @@ def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, models
 def test_ends_of_late_poses_have_no_force(flown, models):
     """Where the true pose of a row was never logged; all other rows keep their places."""
     late = models["nominal"].with_effects(MocapLatency(0.03))
-    shown, *_ = trajectories.trajectories_of(flown[1], {"late": late})
+    shown, *_ = trajectories.measure_trajectories(flown[1], {"late": late})
     known = np.isfinite(shown.residuals_w["late"]).all(axis=1)
     assert len(known) == len(flown[1]) and not known[[-1, SECOND - 1]].any()
     assert known[SETTLED : SECOND - 5].all() and known[SECOND + SETTLED : -5].all()
@@ -126,19 +126,19 @@ def made():
 
 def test_position_is_integrated_where_it_was_not_measured(made):
     halves = made.without("p")
-    (shown,) = trajectories.trajectories_of(halves, {})
+    (shown,) = trajectories.measure_trajectories(halves, {})
     assert shown.name == "measured (position integrated)"
     moved = made["p"] - np.repeat(made["p"][[0, 300]], 300, axis=0)
     assert np.abs(moved).max() > 1.0
     np.testing.assert_allclose(shown.positions, moved, atol=2e-3)
-    (still,) = trajectories.trajectories_of(made.without("p", "v"), {})
+    (still,) = trajectories.measure_trajectories(made.without("p", "v"), {})
     assert still.name == "measured (no position)" and (still.positions == 0.0).all()
     assert np.isnan(still.states[:, 3:9]).all() and np.isfinite(still.states[:, 9:16]).all()
 
 
 def test_of_a_long_log_rows_are_left_out_but_no_start(monkeypatch, made):
     monkeypatch.setattr(trajectories, "MAX_ROWS", 150)
-    (shown,) = trajectories.trajectories_of(made, {})
+    (shown,) = trajectories.measure_trajectories(made, {})
     kept = [*range(0, 300, 4), *range(300, 600, 4)]
     np.testing.assert_array_equal(shown.positions, made["p"][kept])
     assert np.flatnonzero(shown.restarts).tolist() == [0, 75] and "1 row in 4" in shown.ended

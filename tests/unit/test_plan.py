@@ -16,7 +16,7 @@ from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import Linearization
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.manoeuvres import MANOEUVRES, flights_of, hover_action
-from flytrack_sysid.script_file import script_of
+from flytrack_sysid.script_file import build_script
 
 MODEL = nominal_parameters()
 GYRO, FORCE, ATTITUDE, VELOCITY, VOLTAGE = 0.1, 1.5, 0.009, 0.05, 0.01  # rad/s, m/s^2, rad, m/s, V
@@ -64,7 +64,7 @@ def in_float64():
 def hover():
     """Twenty seconds of hover, the nose in one direction."""
     first = flights_of(["headings"], hover_action(MODEL))[0]
-    return logged(collect(Simulator(), script=script_of([first] * 8)).without("uprev"))
+    return logged(collect(Simulator(), script=build_script([first] * 8)).without("uprev"))
 
 
 def test_a_hovering_log_cannot_tell_wind_from_tilt(hover):
@@ -78,7 +78,7 @@ def test_a_hovering_log_cannot_tell_wind_from_tilt(hover):
 @pytest.mark.slow
 def test_what_is_advised_shows_once_it_is_flown(hover):
     """In flights that are collected with other commands than foreseen."""
-    script = script_of(flights_of(MANOEUVRES, hover_action(MODEL), seed=1))
+    script = build_script(flights_of(MANOEUVRES, hover_action(MODEL), seed=1))
     log = collect(Simulator(), script=script).without("uprev")
     kinds = np.array(script.kinds)[log.segment]
 
