@@ -147,6 +147,7 @@ def run_diagnose(flags: Diagnose) -> None:
     logs, before = [*train, *test], [load_log(path) for path in flags.before]
     for one in (*logs, *before):
         check_plausible(one)
+        print(describe(one), flush=True)  # what follows takes a while
     log = joined(logs)
     held_out = np.arange(len(log)) >= sum(map(len, train)) if test else None
     model = None if flags.model is None else load_model(flags.model)
