@@ -12,6 +12,7 @@ from flytrack_env import __version__
 from flytrack_env.dynamics import ModelParameters, collective_thrust, nominal_parameters
 from flytrack_env.effects import BY_NAME
 from flytrack_env.motion import Motion
+from flytrack_sysid.diagnosis.result import TWO_SIDED_95
 from flytrack_sysid.estimate import Estimate, FitError, estimate
 from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
 from flytrack_sysid.log_motion import motion_notes, required_motion
@@ -39,7 +40,6 @@ from flytrack_sysid.parameters import (
 from flytrack_sysid.plausibility import check_plausible
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
-TWO_SIDED_95 = 1.959964  # standard deviations of a normal distribution
 # Half-widths of 95 % intervals above which there is a warning: relative to a time constant, and to
 # full thrust.
 UNCERTAIN_TAU, UNCERTAIN_THRUST = 0.2, 0.02

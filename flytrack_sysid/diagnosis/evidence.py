@@ -11,7 +11,7 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import ThrustScale
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.toml_file import parse_toml, read_text
-from flytrack_sysid.diagnosis.result import DRIFT
+from flytrack_sysid.diagnosis.result import DRIFT, TWO_SIDED_95
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
 from flytrack_sysid.diagnosis.traces import REGRESSORS, UNITS, Traces
 from flytrack_sysid.parameters import names_of, to_vector, with_values
@@ -28,7 +28,6 @@ SHOWN_PERCENTILES = (0.5, 99.5)  # of the regressor: outliers would compress all
 WANTED_ROWS, WANTED_PIECES, MIN_ROWS = 20, 5, 2
 BLOCK_S = 1.0  # rows further apart than this count as independent
 MIN_BLOCKS = 10  # the scatter of fewer blocks is too uncertain
-TWO_SIDED_95 = 1.959964  # standard deviations
 # Attitude and velocity are noisy in each row: their change over a piece has the same noise as over
 # a step.
 PIECE_S = 0.2

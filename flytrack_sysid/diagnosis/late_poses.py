@@ -10,8 +10,14 @@ from flytrack_sysid.diagnosis.chunks import Chunks
 from flytrack_sysid.diagnosis.lateness import get_latency
 from flytrack_sysid.diagnosis.motion_choice import STANDARD_ERRORS, MotionEstimate
 from flytrack_sysid.diagnosis.problem import Problem, robust_square, vector_of
-from flytrack_sysid.diagnosis.result import Cause, Changed, Diagnosis, Estimated
-from flytrack_sysid.diagnosis.summary import TWO_SIDED_95, verdict_of
+from flytrack_sysid.diagnosis.result import (
+    TWO_SIDED_95,
+    Cause,
+    Changed,
+    Diagnosis,
+    Estimated,
+)
+from flytrack_sysid.diagnosis.summary import verdict_of
 
 EFFECT = BY_NAME["mocap_latency"]
 BOUNDS = EFFECT.ranges["latency_s"]

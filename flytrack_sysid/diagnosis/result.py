@@ -10,6 +10,7 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis.beyond import Learned
 from flytrack_sysid.diagnosis.chunks import AXES
 
+TWO_SIDED_95 = 1.959964  # standard deviations of a normal distribution: half of its 95 % interval
 SCHEMA = 1
 TO_LOG = "log "  # begins the recommendation where a channel is missing, in place of a manoeuvre
 CONSISTENT, CAUSES_FOUND, UNEXPLAINED = "consistent", "causes_found", "unexplained"

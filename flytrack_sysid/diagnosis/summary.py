@@ -26,6 +26,7 @@ from flytrack_sysid.diagnosis.result import (
     DRIFT,
     PLACES,
     TO_LOG,
+    TWO_SIDED_95,
     UNEXPLAINED,
     Cause,
     Changed,
@@ -51,7 +52,6 @@ from flytrack_sysid.parameters import (
 from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES
 from flytrack_sysid.response import FULL_STEP, SMALL_STEP, half_responses
 
-TWO_SIDED_95 = 1.959964
 LOOSE = 0.5  # of the prior's width: a parameter with a wider interval is not determined
 SCALE_TWINS = (
     "thrust_curve",

@@ -8,9 +8,8 @@ heading at the start).
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.dynamics import nominal_parameters
+from flytrack_sysid.plausibility import GRAVITY, HALF_TURN, TURN_SIGNS
 
-GRAVITY = float(nominal_parameters().g)  # m/s^2
 PER_DEGREE = float(np.deg2rad(1.0))
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
@@ -23,8 +22,6 @@ UNITS: dict[str, dict[str, float]] = {
 }
 # Half a turn about x converts the frames that are True to ours, and back.
 TURNED = {"body": {"flu": False, "frd": True}, "world": {"z_up": False, "ned": True}}
-AXES_TURNED = np.array([1.0, -1.0, -1.0])
-HALF_TURN = Rotation.from_rotvec([np.pi, 0.0, 0.0])
 
 
 def vector_from(vectors: np.ndarray, is_turned: bool) -> np.ndarray:
@@ -34,7 +31,7 @@ def vector_from(vectors: np.ndarray, is_turned: bool) -> np.ndarray:
         vectors: (num_rows, 3).
         is_turned: whether they are in FRD or NED axes.
     """
-    return vectors * AXES_TURNED if is_turned else vectors
+    return vectors * TURN_SIGNS if is_turned else vectors
 
 
 def quaternion_from(attitude: Rotation, is_body_turned: bool, is_world_turned: bool) -> np.ndarray:

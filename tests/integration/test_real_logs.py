@@ -8,8 +8,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid import diagnose, import_log
-from flytrack_sysid.importing.units import GRAVITY
-from flytrack_sysid.plausibility import summed_turns, windows_of
+from flytrack_sysid.plausibility import GRAVITY, summed_turns, windows_of
 from tests.support.real_logs import CRAZYFLIE, import_shared, shared
 from tests.support.tables import table
 
