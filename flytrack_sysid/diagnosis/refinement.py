@@ -340,19 +340,11 @@ class FlightTest(NamedTuple):
         cls, problem: Problem, learnt: Windows, held_out_windows: Windows, base: np.ndarray
     ) -> "FlightTest":
         """Build the test of a base model; only that model decides which cells are evidence."""
-        base_errors, placebo = (
-            errors_at(problem, base[None], held_out_windows),
-            placebo_errors(learnt, held_out_windows),
-        )
-        matters = np.zeros(base_errors.scale.shape, bool)
-        return cls(
-            problem,
-            held_out_windows,
-            base_errors,
-            FlightErrors(placebo, held_out_windows),
-            base_errors.scale,
-            matters,
-        ).seeing(base)
+        errors = errors_at(problem, base[None], held_out_windows)
+        placebo = FlightErrors(placebo_errors(learnt, held_out_windows), held_out_windows)
+        matters = np.zeros(errors.scale.shape, bool)
+        flight_test = cls(problem, held_out_windows, errors, placebo, errors.scale, matters)
+        return flight_test._with_evidence(errors)
 
     @property
     def is_known(self) -> np.ndarray:
@@ -367,7 +359,10 @@ class FlightTest(NamedTuple):
 
     def seeing(self, vector: np.ndarray) -> "FlightTest":
         """Return the test with those cells added as evidence where a model beats the placebo."""
-        gain = self.placebo.by_block(self.scale)[0] - self.tested(vector).by_block(self.scale)[0]
+        return self._with_evidence(self.tested(vector))
+
+    def _with_evidence(self, errors: FlightErrors) -> "FlightTest":
+        gain = self.placebo.by_block(self.scale)[0] - errors.by_block(self.scale)[0]
         beats = sureness(gain) > SURE_OF_COMMANDS
         return self._replace(matters=self.matters | (beats & self.is_known))
 
