@@ -126,15 +126,18 @@ class SearchState:
         lacking = tuple(
             effect.name for effect in SEARCHED if not set(effect.search.needs) <= channels
         )
-        # Without voltages, the replay assumes one at every row. A drop within a step would then
-        # pass for thrust.
-        held = () if voltages_of(problem.chunks) else (HeldParameter(DRAIN, ""),)
-        return cls(problem.with_noise(noise), unobservable=lacking, held=held)
+        return cls(problem.with_noise(noise), unobservable=lacking)
 
     @property
     def base_indices(self) -> list[int]:
-        """The indices of the free base parameters."""
+        """The indices of the free base parameters.
+
+        Without measured voltages the drain stays nominal: the replay assumes a voltage at every
+        row, so that a drop within a step would pass for thrust.
+        """
         held_fields = {parameter.field for parameter in self.held}
+        if voltages_of(self.problem.chunks) is None:
+            held_fields.add(DRAIN)
         return self.problem.indices_of(
             [name for name in base_of(self.problem.like) if name not in held_fields]
         )

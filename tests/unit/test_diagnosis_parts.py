@@ -28,6 +28,7 @@ from flytrack_sysid.diagnosis.chunks import (
 from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
 from flytrack_sysid.diagnosis.learned import improves_flights
 from flytrack_sysid.diagnosis.model_selection import Ablation
+from flytrack_sysid.diagnosis.onset import windowed
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Fit, Refined
 from flytrack_sysid.diagnosis.report import verdict_of
@@ -36,7 +37,7 @@ from flytrack_sysid.diagnosis.search import SearchState
 from flytrack_sysid.diagnosis.summary import collect_warnings, stand_in_notes, with_refined_values
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log_file import save_log
-from flytrack_sysid.parameters import THRUST_COEFFS
+from flytrack_sysid.parameters import DRAIN, THRUST_COEFFS
 from flytrack_sysid.record import make_record
 from flytrack_sysid.replay import replay, start_replay
 from tests.support.hidden_flights import scripted
@@ -221,6 +222,15 @@ def test_a_fast_log_keeps_rows_at_a_usual_rate_and_the_means_of_its_commands(flo
     np.testing.assert_array_equal(slower["u"][500], log["u"][1000])
     as_it_was, is_kept, notes = at_usual_rate(flown[1])
     assert as_it_was is flown[1] and is_kept.all() and notes == []
+
+
+def test_without_measured_voltages_the_drain_stays_nominal_also_where_effects_change(flown):
+    truth, log = flown
+    for without, is_free in ((log, True), (log.without("v_bat"), False)):
+        chunks = cut_chunks(without, np.ones(len(log), bool), model_of(truth))
+        state = windowed(SearchState(Problem.of(chunks, model_of(truth))), ())
+        names = [state.problem.names[index] for index in state.base_indices]
+        assert (DRAIN in names) is is_free and "tau_roll" in names
 
 
 def test_the_first_look_ranks_what_is_hidden_and_says_what_it_did_not_check(tmp_path, capsys):
