@@ -58,9 +58,11 @@ def train(
     every: int = EVERY,
     clock: Callable[[], float] = time.process_time,
 ) -> list[Point]:
-    """Train one seed; return its evaluations, one every so many environment steps.
+    """Train one seed and return its evaluations.
 
-    clock: of the seconds of training, without compilation and evaluations.
+    Args:
+        every: environment steps between evaluations.
+        clock: measures training alone, without compilation and evaluations.
     """
     config = trainer.config
     runner = trainer.start(jax.random.key(seed))

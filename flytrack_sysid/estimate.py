@@ -292,7 +292,7 @@ def _acting(linearization: Linearization, free: tuple[str, ...], may_be_idle: bo
         raise FitError(
             f"{', '.join(idle)}: nothing that the log measured depends on it; expected it fixed"
         )
-    return linearization.problem.indices_of(names)
+    return linearization.problem.parameter_indices(names)
 
 
 def _polished(
@@ -336,7 +336,9 @@ def estimate(
         for round_index, steps in enumerate(LAST_STEPS):
             problem = replace(Channels.of_log(log, scored_rows, model), noise=noise)
             vector = problem.clipped(problem.start)
-            free_indices = problem.indices_of([name for name in free if name in problem.names])
+            free_indices = problem.parameter_indices(
+                [name for name in free if name in problem.names]
+            )
             initial = Linearization(problem, problem.slopes(vector, free_indices))
             indices = _acting(initial, free, may_be_idle=round_index == 0)
             vector, _ = refine(problem, vector, indices, initial)

@@ -68,7 +68,7 @@ class Windows(NamedTuple):
         return self.change_of(integral) / self.durations[:, None]
 
 
-def windows_of(log: FlightLog, length_s: float) -> Windows:
+def cut_windows(log: FlightLog, length_s: float) -> Windows:
     """Return the windows of a log, without those that a gap makes more than twice as long."""
     is_start = log.is_start()
     flight = np.cumsum(is_start) - 1
@@ -100,7 +100,7 @@ def agreement(log: FlightLog, change: np.ndarray, rate: np.ndarray) -> tuple[flo
     """
     best, slope = np.nan, np.nan
     for length_s in WINDOWS_S:
-        windows = windows_of(log, length_s)
+        windows = cut_windows(log, length_s)
         if len(windows.starts) < MIN_WINDOWS:
             continue
         changes = windows.change_of(change) / windows.durations[:, None]
@@ -178,7 +178,7 @@ def _attitude(log: FlightLog) -> Iterator[str]:
     """Find an attitude that does not change although the body rates do not vanish."""
     if "q" not in log or "w" not in log:
         return
-    windows = windows_of(log, WINDOWS_S[-1])
+    windows = cut_windows(log, WINDOWS_S[-1])
     turn = np.linalg.norm(windows.mean_of(log, log["w"]), axis=1) * windows.durations
     if np.ptp(log["q"], axis=0).max() <= STILL and len(turn) and turn.max() > MIN_TURN:
         problem = (
@@ -341,7 +341,7 @@ def _acceleration(log: FlightLog) -> Iterator[str]:
     """Compare the mean of ``a_z`` with the growth of ``v_z``."""
     if "a" not in log or "v" not in log:
         return
-    windows = windows_of(log, WINDOWS_S[-1])
+    windows = cut_windows(log, WINDOWS_S[-1])
     if len(windows.starts) == 0:
         return
     changes = windows.change_of(log["v"]) / windows.durations[:, None]
@@ -359,7 +359,7 @@ def _force(log: FlightLog) -> Iterator[str]:
 
 def _force_unit(log: FlightLog) -> Iterator[str]:
     """Compare the specific force with that from the velocity, or with the weight."""
-    windows = windows_of(log, WINDOWS_S[0])
+    windows = cut_windows(log, WINDOWS_S[0])
     if len(windows.starts) < MIN_WINDOWS:
         return
     median_size = float(np.median(np.linalg.norm(windows.mean_of(log, log["f"]), axis=1)))

@@ -106,7 +106,7 @@ def _scale_known(state: SearchState, model: FittedModel) -> Known:
 
     Against the nominal curve, all else fitted, and the best rival beside that.
     """
-    curve = state.problem.indices_of(THRUST_COEFFS)
+    curve = state.problem.parameter_indices(THRUST_COEFFS)
     vector = model.vector.copy()
     vector[curve] = state.problem.start[curve]
     state = replace(state, held=tuple(HeldParameter(field, "") for field in THRUST_COEFFS))

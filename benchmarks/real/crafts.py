@@ -28,7 +28,7 @@ from benchmarks.report import table
 from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_sysid import FlightLog, import_log
 from flytrack_sysid.diagnosis import joined
-from flytrack_sysid.diagnosis.refinement import windows_of
+from flytrack_sysid.diagnosis.refinement import sample_windows
 from flytrack_sysid.log import usual_step
 from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES, make_windows
 
@@ -74,7 +74,7 @@ def gecko(data: Path) -> Record:
     diagnosis, record = diagnose_log(log, flight.nominal_model(), held_out)
     base, posed = diagnosis.base._replace(effects=()), with_pose(log)
     with jax.enable_x64(True):
-        windows = windows_of(log, held_out)
+        windows = sample_windows(log, held_out)
         assert windows is not None
         steps, rows = base_steps(base, posed), rows_of(posed.select(~held_out), base)
         for name, black_box in fit_linear_boxes(rows).items():

@@ -179,15 +179,15 @@ def fit_policies(
         is_used = np.ones(len(log), bool)
         if len(log) < MIN_ROWS:
             continue
-        windows = refinement.windows_of(log, is_used)
+        windows = refinement.sample_windows(log, is_used)
         assert windows is not None
         problem = Problem.of(thinned(cut_chunks(log, is_used, model)), model)
         vector = problem.start.copy()
-        vector[problem.indices_of(list(start))] = list(start.values())
+        vector[problem.parameter_indices(list(start))] = list(start.values())
         scale = refinement.errors_at(problem, vector[None], windows).rms()[0]
         target = refinement.Target(problem, windows, scale, np.ones(scale.shape, bool))
         fields = [name for name in problem.names if name.partition(".")[0] in structure]
-        fitted = problem.indices_of([*TAUS, *THRUST_COEFFS, *fields])
+        fitted = problem.parameter_indices([*TAUS, *THRUST_COEFFS, *fields])
         fit = target.fitted(vector, fitted, refinement.MAX_ROUNDS)
         half_s = half_responses(fit.vector[None], problem.like, SMALL_STEP)[0]
         times = dict(zip(STICKS, half_s.tolist(), strict=True))

@@ -5,6 +5,7 @@ The section has a paragraph for pilots, a picture and tables.
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -22,7 +23,7 @@ from flytrack_sysid import FlightLog, Imported, diagnose, import_log
 from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.evidence import words_of
 from flytrack_sysid.diagnosis.refinement import FlightErrors
-from flytrack_sysid.diagnosis.report import verdict_of
+from flytrack_sysid.diagnosis.report import describe_verdict
 from flytrack_sysid.prediction_windows import QUANTITIES, Windows, cut_batches, prediction_errors
 
 Record = dict[str, Any]
@@ -45,13 +46,14 @@ def diagnose_log(
 ) -> tuple[Diagnosis, Record]:
     """Return a log's diagnosis, and a record of it: JSON values, number of rows, CPU time."""
     started = time.process_time()
+    log = replace(log, source=Path(log.source).name)  # warnings name it, and records are published
     diagnosis = diagnose(log, model, held_out)
     return diagnosis, {
         "num_rows": len(log),
         "cpu_s": time.process_time() - started,
         "jax": jax.__version__,
         "commit": commit_of_checkout(),
-        "sentence": verdict_of(diagnosis).text,
+        "sentence": describe_verdict(diagnosis).text,
         "diagnosis": diagnosis.as_json(),
     }
 

@@ -39,7 +39,7 @@ from flytrack_sysid.diagnosis.score_test import (
     threshold,
 )
 from flytrack_sysid.diagnosis.size import is_notable
-from flytrack_sysid.diagnosis.summary import effect_causes, mean_factor, mean_thrust, verdict_of
+from flytrack_sysid.diagnosis.summary import classify, effect_causes, mean_factor, mean_thrust
 from flytrack_sysid.diagnosis.unexplained import find_unexplained
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log import FlightLog
@@ -183,7 +183,7 @@ def diagnose_change(
     return replace(
         diagnosis,
         nominal=model._replace(motion=diagnosis.extended.motion),
-        verdict=verdict_of(causes, diagnosis.unexplained),
+        verdict=classify(causes, diagnosis.unexplained),
         causes=causes,
         warnings=(
             *diagnosis.warnings,
@@ -328,7 +328,7 @@ def is_large(candidate: Candidate, change: np.ndarray, later: Estimate) -> bool:
     """
     problem = later.state.problem
     to_probes = [
-        probe.value - problem.start[problem.indices_of([probe.field])[0]]
+        probe.value - problem.start[problem.parameter_indices([probe.field])[0]]
         for probe in candidate.probes
     ]
     sizes = np.concatenate([np.array(to_probes), np.ones(len(candidate.other_fields))]) * change
@@ -361,7 +361,7 @@ def build_selection(later: Estimate, earlier: Estimate) -> Selection:
 
 def change_between(later: Estimate, earlier: Estimate, fields: Sequence[str]) -> Change:
     """Return the change of parameters between both models."""
-    indices = later.state.problem.indices_of(fields)
+    indices = later.state.problem.parameter_indices(fields)
     size = later.model.vector[indices] - earlier.model.vector[indices]
     margins = [Marginal(one.linearization, one.model, fields) for one in (later, earlier)]
     half = np.hypot(*(one.half_widths() for one in margins))
@@ -390,7 +390,7 @@ def changed_values(
     """Return the new values of a cause's parameters; none without a clear change."""
     problem, name = later.state.problem, cause.effect
     change = change_between(later, earlier, fields)
-    indices, vector = problem.indices_of(fields), problem.start.copy()
+    indices, vector = problem.parameter_indices(fields), problem.start.copy()
     vector[indices] += change.size
     factor: dict[str, Estimated] = {}  # by which the mean thrust changed
     if tuple(fields) == THRUST_COEFFS:

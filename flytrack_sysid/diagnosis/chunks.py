@@ -186,7 +186,7 @@ def at_usual_rate(log: FlightLog) -> tuple[FlightLog, np.ndarray, list[str]]:
     return replace(kept, channels={**kept.channels, "u": command}), is_kept, [note]
 
 
-def voltages_of(chunks: Chunks) -> tuple[float, float] | None:
+def measured_voltage_range(chunks: Chunks) -> tuple[float, float] | None:
     """Return the lowest and the highest measured voltage (V); None without any."""
     measured = chunks.record.battery_v[chunks.counts[..., -1, 1]]
     return (float(measured.min()), float(measured.max())) if len(measured) else None

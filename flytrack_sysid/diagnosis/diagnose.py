@@ -19,8 +19,8 @@ from flytrack_sysid.diagnosis.chunks import (
     Chunks,
     at_usual_rate,
     cut_chunks,
+    measured_voltage_range,
     thinned,
-    voltages_of,
 )
 from flytrack_sysid.diagnosis.first_look import FirstLook
 from flytrack_sysid.diagnosis.late_poses import with_late_poses
@@ -33,11 +33,11 @@ from flytrack_sysid.diagnosis.motion_choice import (
     estimate_motion,
 )
 from flytrack_sysid.diagnosis.onset import (
+    active_windows,
     at_end,
     describe_changes,
     find_spans,
     first_row_as_at_end,
-    windows_of,
     with_changes,
 )
 from flytrack_sysid.diagnosis.outliers import find_outliers, outlier_notes
@@ -263,7 +263,7 @@ def vetoed_in_time(selection: Selection, parts: Split) -> tuple[Selection, dict[
         if later is not selection:
             selection, further = apply_vetoes(later, held_out_under(later, parts.test))
             rejected |= further
-            if windows_of(selection):
+            if active_windows(selection):
                 rejected = {
                     name: veto for name, veto in rejected.items() if name not in contradicted
                 }
@@ -422,7 +422,7 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
     all_unexplained = summary.with_lost_causes(unexplained, named.lost)
     all_unexplained = replace(all_unexplained, flagged=all_unexplained.flagged or bool(beyond))
     return Diagnosis(
-        verdict=summary.verdict_of(causes, all_unexplained),
+        verdict=summary.classify(causes, all_unexplained),
         causes=causes,
         negligible=named.negligible,
         beyond=beyond,
@@ -438,7 +438,7 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
         base=summary.model_of(problem, selection.base),
         extended=with_learned(summary.model_of(problem, extended), learned),
         noise=summary.sensor_noise(problem),
-        voltages=voltages_of(problem.chunks),
+        voltages=measured_voltage_range(problem.chunks),
         source=Path(parts.logged.source).name,
         sha256=parts.logged.sha256,
         warnings=(*parts.warnings, *notes),

@@ -18,7 +18,7 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, MAX_DELAY_STEPS
 from flytrack_env.plants import Simulator
 from flytrack_sysid.collect import states_flown
-from flytrack_sysid.diagnosis.chunks import CHUNK_S, Chunks, make_chunks, voltages_of
+from flytrack_sysid.diagnosis.chunks import CHUNK_S, Chunks, make_chunks, measured_voltage_range
 from flytrack_sysid.diagnosis.problem import SEARCHED, Problem
 from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG, NotIdentifiable
 from flytrack_sysid.diagnosis.score_test import Candidate, Linearization, list_candidates
@@ -201,7 +201,7 @@ def _absent_channels(chunks: Chunks) -> list[str]:
         "q": bool(has_turns or np.any(record.quat != UPRIGHT)),
         "v": bool(has_velocity),
         "p": bool(record.pos_w.any()),
-        "v_bat": voltages_of(chunks) is not None,
+        "v_bat": measured_voltage_range(chunks) is not None,
         "uprev": bool(record.is_applied_known.any()),
     }
     return [name for name, is_present in present.items() if not is_present]
@@ -212,8 +212,8 @@ def _seen_flights(problem: Problem, vector: np.ndarray) -> tuple[FlightLog, np.n
 
     The log has the channels of the problem's log.
     """
-    model = problem.like._replace(thrust_coeffs=vector[problem.indices_of(THRUST_COEFFS)])
-    voltages = voltages_of(problem.chunks) or _battery_range(problem.like)
+    model = problem.like._replace(thrust_coeffs=vector[problem.parameter_indices(THRUST_COEFFS)])
+    voltages = measured_voltage_range(problem.chunks) or _battery_range(problem.like)
     flights = flights_of(MANOEUVRES, hover_action(model, voltages), voltages=voltages)
     starts = np.stack([flight.start for flight in flights])
     commands = np.stack([flight.command for flight in flights])
@@ -261,7 +261,9 @@ def information_of_manoeuvres(
     """
     columns = sorted(set(columns))
     log, counts = _seen_flights(problem, model.vector)
-    chunks = make_chunks(log, counts, model.vector[problem.indices_of(TAUS)], float(problem.like.g))
+    chunks = make_chunks(
+        log, counts, model.vector[problem.parameter_indices(TAUS)], float(problem.like.g)
+    )
     by_chunk = []
     # As many chunks at a time as the log has, for which programs are compiled.
     for part in _in_parts(chunks, problem.counts.shape[1]):

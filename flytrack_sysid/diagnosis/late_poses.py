@@ -17,13 +17,13 @@ from flytrack_sysid.diagnosis.result import (
     Diagnosis,
     Estimated,
 )
-from flytrack_sysid.diagnosis.summary import verdict_of
+from flytrack_sysid.diagnosis.summary import classify
 
 EFFECT = BY_NAME["mocap_latency"]
 BOUNDS = EFFECT.ranges["latency_s"]
 
 
-def gain_of(problem: Problem, as_logged: Chunks, vector: np.ndarray) -> float:
+def chi2_gain(problem: Problem, as_logged: Chunks, vector: np.ndarray) -> float:
     """Return the gain of corrected over logged poses, in minus twice the log likelihood.
 
     Nothing is refitted.
@@ -67,7 +67,7 @@ def with_late_poses(
     latency = Estimated.around(late_s, TWO_SIDED_95 * sigma_s, unit, BOUNDS.low)
     if abs(late_s - before_s) <= STANDARD_ERRORS * sigma_s:
         return diagnosis
-    gains = [gain_of(*pair, vector_of(extended)) for pair in zip(problems, logged, strict=True)]
+    gains = [chi2_gain(*pair, vector_of(extended)) for pair in zip(problems, logged, strict=True)]
     size = float((late_s - before_s) / max(sigma_s, 1e-6)) ** 2
     cause = Cause(
         effect=EFFECT.name,
@@ -89,4 +89,4 @@ def with_late_poses(
         diagnosis = replace(diagnosis, beyond=(cause, *diagnosis.beyond), unexplained=unexplained)
     else:
         diagnosis = replace(diagnosis, causes=(cause, *diagnosis.causes))
-    return replace(diagnosis, verdict=verdict_of(diagnosis.causes, diagnosis.unexplained))
+    return replace(diagnosis, verdict=classify(diagnosis.causes, diagnosis.unexplained))

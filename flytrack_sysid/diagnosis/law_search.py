@@ -30,7 +30,7 @@ from flytrack_sysid.diagnosis.unexplained import (
     FlightVariables,
     SideFit,
     SideTest,
-    flight_of,
+    build_flight_variables,
     linearized_residuals,
     whitened,
 )
@@ -66,7 +66,7 @@ def moment_of_flight(problem: Problem, vector: np.ndarray, flight: FlightVariabl
     airspeed_b = np.einsum("rlji,rlj->rli", rotation, flight.vel_w - wind_w)
     volts = np.concatenate([record.battery_v[:1], record.battery_v[:-1]])
     thrust = collective_thrust(flight.applied[..., 3], volts, model.thrust_coeffs)
-    max_rates = np.radians(vector[problem.indices_of(MAX_RATES)])
+    max_rates = np.radians(vector[problem.parameter_indices(MAX_RATES)])
     rates_b = flight.applied[..., :XYZ] * max_rates
     if "w" in problem.chunks.measured:
         gyro = problem.chunks.measured["w"]
@@ -121,7 +121,7 @@ class Side(NamedTuple):
     def of(cls, name: str, problem: Problem, model: FittedModel) -> "Side":
         """Build a side ("rate" or "force") of a problem and a model."""
         white, slopes = linearized_residuals(problem, model)
-        flight = flight_of(problem, model)
+        flight = build_flight_variables(problem, model)
         squared = np.square(slopes).sum(axis=(1, 2, 4))
         on_side = squared[:, SIDES[name]].sum(axis=1)
         # A parameter that acts mostly on the other side is fitted there.

@@ -220,7 +220,7 @@ def other_groups(linearization: Linearization, model: FittedModel, effect: str) 
         given = linearization.columns_at(model.indices, without=columns)
         price = PER_PARAMETER * len(changed)
         if not added:
-            size = (model.vector - problem.start)[problem.indices_of(changed)]
+            size = (model.vector - problem.start)[problem.parameter_indices(changed)]
             is_cheaper = size @ linearization.projected(columns, given)[0] @ size < price
         else:
             gain = linearization.gain(columns, given)
@@ -255,7 +255,9 @@ def with_lags_anew(state: SearchState, model: FittedModel) -> list[FittedModel]:
     There a lag has no slope that leads back.
     """
     problem, vector = state.problem, model.vector.copy()
-    shortest = [index for index in problem.indices_of(TAUS) if vector[index] <= problem.low[index]]
+    shortest = [
+        index for index in problem.parameter_indices(TAUS) if vector[index] <= problem.low[index]
+    ]
     shortest = [
         index
         for index in shortest
@@ -289,7 +291,7 @@ def separation(linearization: Linearization, model: FittedModel, effect: str) ->
     """Return how clearly a log shows an effect of a model, alone and beside its rivals."""
     problem, effect_candidate = linearization.problem, model.candidate(effect)
     columns = [linearization.column(field) for field in effect_candidate.fields]
-    size = (model.vector - problem.start)[problem.indices_of(effect_candidate.fields)]
+    size = (model.vector - problem.start)[problem.parameter_indices(effect_candidate.fields)]
     given = linearization.columns_at(model.indices, without=columns)
 
     def beside(others: list[int]) -> float:
@@ -382,7 +384,7 @@ def _is_immaterial(problem: Problem, fields: Sequence[str], model: FittedModel) 
 
     Rounding causes differences of that size.
     """
-    indices = problem.indices_of(fields)
+    indices = problem.parameter_indices(fields)
     change = model.vector[indices] - problem.start[indices]
     if fields != THRUST_COEFFS:
         return bool(np.all(np.abs(change) < IMMATERIAL * np.abs(problem.start[indices])))
@@ -396,12 +398,12 @@ def base_change(
     problem, free = state.problem, set(state.base_indices)
     acting = [
         field
-        for field, index in zip(fields, problem.indices_of(fields), strict=True)
+        for field, index in zip(fields, problem.parameter_indices(fields), strict=True)
         if index in free and linearization.acting([linearization.column(field)])
     ]
     if not acting or _is_immaterial(problem, fields, model):
         return None
-    indices = problem.indices_of(acting)
+    indices = problem.parameter_indices(acting)
     marginal = Marginal(linearization, model, acting)
     change = model.vector[indices] - problem.start[indices]
     gain = float(change @ marginal.information @ change)
@@ -470,7 +472,7 @@ def is_determined(
 ) -> tuple[SearchState, bool]:
     """Return whether the log shows that some parameter of an effect is not neutral."""
     problem = state.problem
-    indices = problem.indices_of(fields)
+    indices = problem.parameter_indices(fields)
     change = np.abs(model.vector[indices] - problem.start[indices])
     acting = [
         field.split(".")[1] not in BY_NAME[field.split(".")[0]].search.shapes for field in fields

@@ -148,7 +148,7 @@ class LogPart(NamedTuple):
 def _indices(problem: Problem, motion_estimate: MotionEstimate) -> list[int]:
     """Return the indices that are fitted; the sensors' latency only if poses would be early."""
     names = [f"{effect.name}.{name}" for effect in LOOK_ALIKES for name in effect.ranges]
-    return problem.indices_of(
+    return problem.parameter_indices(
         [
             *base_of(problem.like),
             *(name for name in names if name != IMU_LATENCY or motion_estimate.late_s < 0.0),

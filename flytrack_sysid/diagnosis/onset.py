@@ -339,11 +339,11 @@ def find_spans(selection: Selection, test: Problem, log: FlightLog) -> dict[str,
             "onset_s": time_of(window.effect, window.start),
             "end_s": time_of(window.effect, window.end),
         }
-        for window in windows_of(selection)
+        for window in active_windows(selection)
     }
 
 
-def windows_of(selection: Selection) -> list[Window]:
+def active_windows(selection: Selection) -> list[Window]:
     """Return the windows of a selected model's effects."""
     return [
         window
@@ -354,7 +354,7 @@ def windows_of(selection: Selection) -> list[Window]:
 
 def ended(selection: Selection) -> list[str]:
     """Return the effects that end within the log."""
-    return [window.effect for window in windows_of(selection) if window.end != NEVER]
+    return [window.effect for window in active_windows(selection) if window.end != NEVER]
 
 
 def at_end(selection: Selection, model: FittedModel) -> FittedModel:
@@ -367,7 +367,7 @@ def at_end(selection: Selection, model: FittedModel) -> FittedModel:
 
 def first_row_as_at_end(selection: Selection, test: Problem) -> int:
     """Return the row of the log after which the same effects act as at its end."""
-    rows = {row for window in windows_of(selection) for row in (window.start, window.end)} - {
+    rows = {row for window in active_windows(selection) for row in (window.start, window.end)} - {
         ALWAYS,
         NEVER,
     }
@@ -384,7 +384,7 @@ def describe_changes(
         linearization: of the model.
         log: that was diagnosed.
     """
-    windows, notes = windows_of(selection), []
+    windows, notes = active_windows(selection), []
     begun = [window.effect for window in windows if window.end == NEVER]
     if begun:
         notes.append(

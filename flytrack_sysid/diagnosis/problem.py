@@ -403,7 +403,7 @@ class Problem:
 
     def at_start(self, vectors: np.ndarray, fields: Sequence[str]) -> np.ndarray:
         """Return vectors (..., parameters) with some parameters as in the given model."""
-        vectors, indices = vectors.copy(), self.indices_of(fields)
+        vectors, indices = vectors.copy(), self.parameter_indices(fields)
         vectors[..., indices] = self.start[indices]
         return vectors
 
@@ -450,7 +450,7 @@ class Problem:
         columns[: len(step)] /= step[:, None, None, None, None]
         return Slopes(vector, residuals[0], tuple(indices), columns)
 
-    def indices_of(self, names: Sequence[str]) -> list[int]:
+    def parameter_indices(self, names: Sequence[str]) -> list[int]:
         """Return the indices of parameters in the vector."""
         return [self.names.index(name) for name in names]
 

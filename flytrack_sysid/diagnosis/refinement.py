@@ -457,7 +457,7 @@ class Refined(NamedTuple):
         return next((errors[key] for key in keys if key in errors), {})
 
 
-def windows_of(
+def sample_windows(
     log: FlightLog, rows: np.ndarray, max_windows: int = MAX_SCORED_WINDOWS
 ) -> Windows | None:
     """Return windows over some rows of a log; None if there are none."""
@@ -470,7 +470,7 @@ def windows_of(
 def at_bounds(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> list[str]:
     """Return those parameters that are at the end of their searched range, except for shapes."""
     result = []
-    for index in problem.indices_of(fields):
+    for index in problem.parameter_indices(fields):
         effect, _, field = problem.names[index].partition(".")
         low, high, value = problem.low[index], problem.high[index], vector[index]
         room = 1e-6 * max(abs(value), 1.0)
@@ -487,7 +487,7 @@ def widened(problem: Problem, fields: Sequence[str]) -> Problem:
     A non-negative range stays non-negative, and a one-sided range stays one-sided.
     """
     low, high = problem.low.copy(), problem.high.copy()
-    for name, index in zip(fields, problem.indices_of(fields), strict=True):
+    for name, index in zip(fields, problem.parameter_indices(fields), strict=True):
         effect, _, field = name.partition(".")
         if not field or field in BY_NAME[effect].max_steps:
             continue
@@ -516,8 +516,8 @@ def refine(
             one already, and stands unless it predicts a horizon worse than the base.
     """
     learnt, held_out_windows = (
-        windows_of(log, ~held_out, MAX_FITTED_WINDOWS),
-        windows_of(log, held_out),
+        sample_windows(log, ~held_out, MAX_FITTED_WINDOWS),
+        sample_windows(log, held_out),
     )
     problem, candidates, extended = state.problem, model.candidates, model.vector
     unrefined = Refined(candidates, None, None, (), {}, problem, None)
@@ -575,7 +575,7 @@ class _Refinement(NamedTuple):
     def indices(self, problem: Problem, candidates: Sequence[Candidate]) -> list[int]:
         """Return the indices of the free parameters that act on the windows."""
         base_indices = [index for index in self.base_indices if problem.names[index] != DRAIN]
-        return base_indices + problem.indices_of(self.fields_of(candidates))
+        return base_indices + problem.parameter_indices(self.fields_of(candidates))
 
     def run(self, extended: np.ndarray, unrefined: Refined) -> Refined:
         """Return the refined model with the effects that held-out prediction needs."""
@@ -672,7 +672,7 @@ def _is_neutral(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> 
         for name in fields
         if name.split(".")[1] not in BY_NAME[name.split(".")[0]].search.shapes
     ]
-    indices = problem.indices_of(scaled_fields)
+    indices = problem.parameter_indices(scaled_fields)
     return bool(np.all(np.abs(vector - problem.start)[indices] < NEUTRAL * problem.scale[indices]))
 
 

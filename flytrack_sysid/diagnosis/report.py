@@ -193,7 +193,7 @@ def _learned(diagnosis: Diagnosis) -> str:
     return "The extended model has a law for it, learnt from this log."
 
 
-def verdict_of(diagnosis: Diagnosis) -> Verdict:
+def describe_verdict(diagnosis: Diagnosis) -> Verdict:
     """Return the verdict in a sentence or two."""
     unexplained = diagnosis.unexplained
     depends = (
@@ -438,7 +438,7 @@ def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
     model_traces = collect_traces(diagnosis, log)
     minutes = model_traces.elapsed_s[-1] / SECONDS_PER_MINUTE
     introduction: list[Part] = [
-        verdict_of(diagnosis),
+        describe_verdict(diagnosis),
         Text(
             f"{diagnosis.source}: {len(log)} rows, {minutes:.1f} min. SHA-256 "
             f"{diagnosis.sha256[:12]}."

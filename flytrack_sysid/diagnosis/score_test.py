@@ -246,7 +246,7 @@ class Linearization:
         change = vector - self.slopes.vector
         indices = np.array(self.indices)
         fixed_change = np.delete(change, indices)
-        probed = self.problem.indices_of(sorted({probe.field for probe in self.probes}))
+        probed = self.problem.parameter_indices(sorted({probe.field for probe in self.probes}))
         size = np.maximum(np.abs(vector), np.abs(self.slopes.vector))
         # First order cannot measure the distance along parameters without a slope.
         if np.any(fixed_change != 0.0) or np.any((np.abs(change) > SAME_SLOPE * size)[probed]):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.chunks import voltages_of
+from flytrack_sysid.diagnosis.chunks import measured_voltage_range
 from flytrack_sysid.diagnosis.problem import NUM_PAIRS, SEARCHED, Problem
 from flytrack_sysid.diagnosis.score_test import (
     Candidate,
@@ -136,9 +136,9 @@ class SearchState:
         row, so that a drop within a step would pass for thrust.
         """
         held_fields = {parameter.field for parameter in self.held}
-        if voltages_of(self.problem.chunks) is None:
+        if measured_voltage_range(self.problem.chunks) is None:
             held_fields.add(DRAIN)
-        return self.problem.indices_of(
+        return self.problem.parameter_indices(
             [name for name in base_of(self.problem.like) if name not in held_fields]
         )
 
@@ -149,7 +149,9 @@ class SearchState:
             self.base_indices,
             [candidate.fields for candidate in candidates_for(self.problem)],
         )
-        others = {index for fields in groups for index in self.problem.indices_of(fields)} - {*base}
+        others = {
+            index for fields in groups for index in self.problem.parameter_indices(fields)
+        } - {*base}
         return base + sorted(others)
 
     def with_noise(self, noise: np.ndarray) -> "SearchState":
@@ -206,7 +208,9 @@ class SearchState:
             limit: as in ``refine``.
         """
         effect_indices = [
-            index for candidate in candidates for index in self.problem.indices_of(candidate.fields)
+            index
+            for candidate in candidates
+            for index in self.problem.parameter_indices(candidate.fields)
         ]
         indices = self.base_indices + effect_indices
         vector, cost = refine(self.problem, vector, indices, nearby, limit)
@@ -327,7 +331,7 @@ def add_effect(
     candidates = model.joined_by(candidate)
     if not candidate.probes:
         vector = model.vector.copy()
-        vector[problem.indices_of(candidate.fields)] += gain.step
+        vector[problem.parameter_indices(candidate.fields)] += gain.step
         return state.fitted(candidates, problem.clipped(vector), linearization, limit)
     best = state.fitted(candidates, _on_the_way(problem, model, scored), limit=limit)
     if model.cost - best.cost < KEPT_PROMISE * gain.chi2:
@@ -344,7 +348,7 @@ def _on_the_way(problem: Problem, model: FittedModel, scored: Scored) -> np.ndar
     candidate, gain = scored
     vector = model.vector.copy()
     vector[list(model.indices)] += gain.given_step
-    vector[problem.indices_of(candidate.other_fields)] += gain.step[len(candidate.probes) :]
+    vector[problem.parameter_indices(candidate.other_fields)] += gain.step[len(candidate.probes) :]
     for probe, step in zip(candidate.probes, gain.step, strict=False):
         index = problem.names.index(probe.field)
         share = np.sign(step) * np.clip(np.abs(step), *SHARE_OF_WAY)

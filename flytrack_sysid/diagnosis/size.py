@@ -75,7 +75,7 @@ def is_notable(name: str, problem: Problem, vector: np.ndarray) -> bool:
 
 
 def _change(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> np.ndarray:
-    indices = problem.indices_of(fields)
+    indices = problem.parameter_indices(fields)
     return vector[indices] - problem.start[indices]
 
 

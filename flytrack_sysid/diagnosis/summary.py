@@ -8,7 +8,7 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_env.effects import BY_NAME, effect_of
 from flytrack_sysid.diagnosis import vetoes
-from flytrack_sysid.diagnosis.chunks import voltages_of
+from flytrack_sysid.diagnosis.chunks import measured_voltage_range
 from flytrack_sysid.diagnosis.identifiability import advise, unit_of, unseen_effects
 from flytrack_sysid.diagnosis.model_selection import (
     BaseChange,
@@ -108,7 +108,7 @@ def mean_factor(problem: Problem, vector: np.ndarray, half_n: float) -> dict[str
     Returns:
         The ratio as ``mean_factor``; empty if the nominal model has no thrust.
     """
-    indices, slopes = problem.indices_of(THRUST_COEFFS), mean_thrust(problem)
+    indices, slopes = problem.parameter_indices(THRUST_COEFFS), mean_thrust(problem)
     before, after = (float(slopes @ parameters[indices]) for parameters in (problem.start, vector))
     if before <= 0.0:
         return {}
@@ -149,7 +149,7 @@ def summarize_half_responses(
     return result
 
 
-def channel_of(problem: Problem, reduced: np.ndarray, full: np.ndarray) -> str:
+def find_channel(problem: Problem, reduced: np.ndarray, full: np.ndarray) -> str:
     """Return the channel in which two models differ most, in multiples of the noise."""
     white = problem.whitened_residuals(reduced, full)
     by_axis = np.square(white[1] - white[0]).sum(axis=(0, 1))
@@ -177,7 +177,7 @@ def effect_causes(
         }
         closest = min(rivals, key=lambda name: rivals[name], default="")
         equivalent = equivalents(ablation, separated)
-        channel = channel_of(problem, reduced, model.vector)
+        channel = find_channel(problem, reduced, model.vector)
         if channel in CHANNELS[1]:
             equivalent += tuple(
                 name
@@ -231,7 +231,7 @@ def base_causes(
     for name, change in base_changes(selection.state, linearization, model).items():
         if name in selection.stand_ins:
             continue
-        channel = channel_of(problem, problem.at_start(model.vector, change.fields), model.vector)
+        channel = find_channel(problem, problem.at_start(model.vector, change.fields), model.vector)
         refitted = _refitted_to_first_order(linearization, model, change.fields)
         gain, expected = vetoes.held_out_gain(test, refitted, model.vector)
         if vetoes.is_contradicted(gain, expected, change.marginal.inflation):
@@ -263,7 +263,7 @@ def _refitted_to_first_order(
 ) -> np.ndarray:
     """Return the vector with some parameters at nominal, the others refitted to first order."""
     problem = linearization.problem
-    indices, vector = problem.indices_of(fields), problem.at_start(model.vector, fields)
+    indices, vector = problem.parameter_indices(fields), problem.at_start(model.vector, fields)
     free = [index for index in model.indices if index not in set(indices)]
     free_columns, held_columns = linearization.columns_at(free), linearization.columns_at(indices)
     change = vector[indices] - model.vector[indices]
@@ -281,7 +281,7 @@ def _as_thrust_scale(
     """Convert a thrust curve to a scale of thrust if one factor explains all of its change."""
     if cause.effect != "thrust_curve":
         return cause
-    indices, information = problem.indices_of(change.fields), change.marginal.information
+    indices, information = problem.parameter_indices(change.fields), change.marginal.information
     nominal, values = problem.start[indices], model.vector[indices]
     projection = nominal @ information
     norm = float(projection @ nominal)
@@ -326,7 +326,7 @@ def not_identifiable(
     return tuple(result)
 
 
-def verdict_of(causes: Sequence[Cause], unexplained: Unexplained) -> str:
+def classify(causes: Sequence[Cause], unexplained: Unexplained) -> str:
     """Return the verdict, as in ``Diagnosis``."""
     if causes and unexplained.flagged:
         return f"{CAUSES_FOUND}+{UNEXPLAINED}"
@@ -403,10 +403,10 @@ def errors_of(
     Args:
         test: the problem of the held-out rows.
         vectors: parameters of each model, by name.
-        prediction: errors of free flight, of which the position errors are used.
+        prediction: errors of free flight; only the position errors are read.
     """
     motionless = test.start.copy()
-    motionless[test.indices_of(STILL)] = 0.0
+    motionless[test.parameter_indices(STILL)] = 0.0
     residuals = [
         _with_voltage_summed(model_residuals, test.counts)
         for model_residuals in test.residuals(np.stack([motionless, *vectors.values()]))
@@ -505,7 +505,7 @@ def with_refined_values(
         fields = [field for field in fields if field.split(".")[-1] in values]
         if "mean_factor" in values and fit is not None:
             thrust_columns = [
-                fit.indices.index(index) for index in problem.indices_of(THRUST_COEFFS)
+                fit.indices.index(index) for index in problem.parameter_indices(THRUST_COEFFS)
             ]
             slopes = mean_thrust(problem)
             half_n = float(
@@ -685,7 +685,7 @@ def _at_bound(cause: Cause) -> str:
 def _voltage_unknown(problem: Problem, causes: Sequence[Cause]) -> list[str]:
     """Return a warning if thrust is named and the voltage that it depends on was not measured."""
     thrust = [cause.effect for cause in causes if cause.effect in ("thrust_curve", "thrust_scale")]
-    if not thrust or voltages_of(problem.chunks) is not None:
+    if not thrust or measured_voltage_range(problem.chunks) is not None:
         return []
     assumed = (
         f"no voltage was logged and {problem.chunks.record.battery_v.flat[0]:.4g} V were assumed"

@@ -154,7 +154,7 @@ class _Rows(NamedTuple):
         return np.asarray(values)[self.place]
 
 
-def _rows_of(chunks: Chunks) -> _Rows:
+def _collect_rows(chunks: Chunks) -> _Rows:
     row = np.where(
         (np.arange(len(chunks.row)) >= count_lead_in(len(chunks.row)))[:, None], chunks.row, -1
     )
@@ -292,7 +292,7 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
         chunks = by_lateness[get_latency(base)]
         lagged = _lagged(chunks.record, np.asarray(base.tau, float))
         applied = np.stack([np.asarray(stick) for stick in lagged], axis=-1)
-    rows = _rows_of(chunks)
+    rows = _collect_rows(chunks)
     residuals = {
         name: _residuals(model_residuals, rows)
         for name, model_residuals in zip(models, chunk_residuals, strict=True)

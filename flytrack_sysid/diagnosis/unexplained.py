@@ -64,9 +64,9 @@ class FlightVariables(NamedTuple):
     is_counted: np.ndarray
 
 
-def flight_of(problem: Problem, model: FittedModel) -> FlightVariables:
+def build_flight_variables(problem: Problem, model: FittedModel) -> FlightVariables:
     """Return the variables of a flight, with a model's lags between commands and applied action."""
-    chunks, tau = problem.chunks, model.vector[problem.indices_of(TAUS)]
+    chunks, tau = problem.chunks, model.vector[problem.parameter_indices(TAUS)]
 
     def previous(values: np.ndarray) -> np.ndarray:  # a step begins at the row before
         return np.concatenate([values[:1], values[:-1]])
@@ -437,7 +437,7 @@ def find_dependences(
         base: vector of the refitted model without effects.
         waves: periodic features that are given, by side.
     """
-    flight = flight_of(problem, model)
+    flight = build_flight_variables(problem, model)
     features = dependences(flight)
     white, slopes = linearized_residuals(problem, model)
     result = []
@@ -474,9 +474,9 @@ def is_like_drift(problem: Problem, model: FittedModel, fields: Sequence[str]) -
     Within one flight the voltage falls with the time, so that a change of the thrust curve can
     stand in for motors that warm up.
     """
-    axes, flight = SIDES["force"], flight_of(problem, model)
+    axes, flight = SIDES["force"], build_flight_variables(problem, model)
     residuals, slopes = linearized_residuals(problem, model)
-    indices = problem.indices_of(fields)
+    indices = problem.parameter_indices(fields)
     rows = [model.indices.index(index) for index in indices]
     test = SideTest.of("force", residuals, np.delete(slopes, rows, axis=0))
     columns, size = (
@@ -562,7 +562,7 @@ class Line(NamedTuple):
 
 def find_lines(problem: Problem, model: FittedModel) -> list[Line]:
     """Return the spectral lines of a model's residuals, at most one on each side."""
-    flight = flight_of(problem, model)
+    flight = build_flight_variables(problem, model)
     residuals = problem.residuals(model.vector[None])[0]
     result = []
     for side, axes in SIDES.items():
@@ -592,7 +592,7 @@ def build_waves(
     problem: Problem, model: FittedModel, lines: Sequence[Line]
 ) -> dict[str, np.ndarray]:
     """Return sine and cosine at the frequencies of lines, along the body's axes, by side."""
-    flight = flight_of(problem, model)
+    flight = build_flight_variables(problem, model)
     body = np.moveaxis(flight.body_to_world, -1, 0)
     result = {}
     for line in lines:

@@ -21,9 +21,9 @@ from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.record import Record
 
-# Held-out rows contradict a cause if its gain there is lower, by so many standard deviations, than
-# the gain expected of it, and if less than this share of its size shows there: laws are not exact
-# in harder flight.
+# Held-out rows contradict a cause if two conditions hold. Its gain is HELD_OUT_SIGMAS standard
+# deviations below the expected gain, and less than HELD_OUT_SHARE of its size shows. The second one
+# is needed because laws are not exact in harder flight.
 HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.35
 HELD_OUT_SHOWN = 20.0  # of chi2: held-out rows with a lower expected gain contradict nothing
 LOSS_SIGMAS = 2.5  # instead of both, where held-out rows are likelier without the cause
@@ -160,19 +160,21 @@ def find_stand_ins(
     """
     problem, model = selection.state.problem, selection.model
     residuals, slopes = unknown.linearized_residuals(problem, model)
-    flight = unknown.flight_of(problem, model)
+    flight = unknown.build_flight_variables(problem, model)
     disturbed = {name.split(":")[0] for name in selection.unexplained.shares}
 
     def noncentralities(suspect: Suspect, side: str) -> tuple[float, float]:
         """Return a suspect's noncentrality on a side, alone and beside the found dependences."""
         axes = unknown.SIDES[side]
-        own_columns = [model.indices.index(index) for index in problem.indices_of(suspect.fields)]
+        own_columns = [
+            model.indices.index(index) for index in problem.parameter_indices(suspect.fields)
+        ]
         acting = slopes[own_columns][..., axes, :]
         if not (problem.counts[..., axes, :].any() and np.abs(acting).max() > 0.0):
             return 0.0, 0.0
         test = unknown.SideTest.of(side, residuals, np.delete(slopes, own_columns, axis=0))
         columns = blocks_of(acting * test.root)
-        size = (model.vector - problem.start)[problem.indices_of(suspect.fields)]
+        size = (model.vector - problem.start)[problem.parameter_indices(suspect.fields)]
         before = test.noncentrality(columns, size)
         smooth_columns = [
             dependence.columns for dependence in dependences if dependence.side == side

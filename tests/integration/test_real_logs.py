@@ -8,7 +8,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid import diagnose, import_log
-from flytrack_sysid.plausibility import GRAVITY, summed_turns, windows_of
+from flytrack_sysid.plausibility import GRAVITY, cut_windows, summed_turns
 from tests.support.real_logs import CRAZYFLIE, import_shared, shared
 from tests.support.tables import table
 
@@ -36,7 +36,7 @@ def check(imported, least, tolerance):
     if "p" in log and "v" in log:
         pairs.append((log["p"], log["v"]))
     assert pairs
-    windows = windows_of(log, WINDOW_S)
+    windows = cut_windows(log, WINDOW_S)
     for change, rate in pairs:
         shown, measured = (
             windows.change_of(change) / windows.durations[:, None],

@@ -31,7 +31,7 @@ from flytrack_sysid.diagnosis.model_selection import Ablation
 from flytrack_sysid.diagnosis.onset import windowed
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Fit, Refined
-from flytrack_sysid.diagnosis.report import verdict_of
+from flytrack_sysid.diagnosis.report import describe_verdict
 from flytrack_sysid.diagnosis.result import Cause, Estimated
 from flytrack_sysid.diagnosis.search import SearchState
 from flytrack_sysid.diagnosis.summary import collect_warnings, stand_in_notes, with_refined_values
@@ -299,7 +299,7 @@ def test_a_force_may_be_a_law_whose_channels_the_log_lacks():
     blind = diagnose(log.without("p", "v", "q"), model_of(truth))
     (cause,) = blind.causes
     assert cause.effect == "thrust_tilt" and {"linear_drag", "wind"} <= {*cause.equivalent}
-    assert "tilt of the thrust axis (or " in verdict_of(blind).text
+    assert "tilt of the thrust axis (or " in describe_verdict(blind).text
 
 
 @pytest.mark.slow
@@ -320,7 +320,7 @@ def test_a_sensor_farther_off_than_any_on_the_list_is_told_and_not_named():
 def test_what_may_be_something_unknown_is_told_with_its_size_and_not_named(state):
     problem = state.problem
     vector = problem.start.copy()
-    vector[problem.indices_of(THRUST_COEFFS)] *= 1.146
+    vector[problem.parameter_indices(THRUST_COEFFS)] *= 1.146
     selection = Selection(state, None, None, {}, stand_ins=("thrust_curve", "wind", "tau_yaw"))
     thrust, lag = stand_in_notes(selection, vector)
     assert (
@@ -358,7 +358,7 @@ def test_values_at_the_end_of_their_range_are_beyond_the_list(state, field, valu
 def test_a_value_that_no_flight_depends_on_is_not_told(state):
     """A yaw that is ahead of the others by more than their delay is in time, whatever the value."""
     problem, names = state.problem, ("delay_s", "yaw_extra_s")
-    indices = tuple(problem.indices_of([f"command_delay.{name}" for name in names]))
+    indices = tuple(problem.parameter_indices([f"command_delay.{name}" for name in names]))
     fit = Fit(problem.start, indices, np.diag([1e-6, 0.0]))
     told = {name: Estimated(0.01, (0.0, 0.02), "s") for name in names}
     cause = replace(CAUSE, effect="command_delay", parameters=told)

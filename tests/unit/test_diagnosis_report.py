@@ -253,7 +253,7 @@ def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):
     drag, lag, _ = diagnosis.causes
     at_end = replace(lag, beyond="tau_roll at most 0.001 s")
     found = replace(diagnosis, causes=(drag,), beyond=(at_end,))
-    text = report.verdict_of(found).text
+    text = report.describe_verdict(found).text
     assert text.startswith(
         "The model lacks drag in proportion to airspeed. Named linear_drag: flies"
     )
@@ -262,11 +262,11 @@ def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):
         in text
     )
     alone = replace(found, causes=(), unexplained=Unexplained())
-    assert "lag of roll (tau_roll at most 0.001 s)" in report.verdict_of(alone).text
+    assert "lag of roll (tau_roll at most 0.001 s)" in report.describe_verdict(alone).text
     (stored,) = alone.as_json()["beyond_the_list"]
     assert stored["effect"] == "tau_roll" and alone.as_json()["causes"] == []
-    assert summary.verdict_of((), Unexplained(flagged=True)) == UNEXPLAINED
-    assert summary.verdict_of((drag,), Unexplained(flagged=True)) == f"{CAUSES_FOUND}+{UNEXPLAINED}"
+    assert summary.classify((), Unexplained(flagged=True)) == UNEXPLAINED
+    assert summary.classify((drag,), Unexplained(flagged=True)) == f"{CAUSES_FOUND}+{UNEXPLAINED}"
 
 
 @pytest.mark.slow

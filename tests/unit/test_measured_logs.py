@@ -206,7 +206,7 @@ def test_what_matters_is_a_share_of_the_battery(battery, drain, sag_v, truth):
     ):
         for factor, expected in ((0.99, False), (1.01, True)):
             vector = problem.start.copy()
-            vector[problem.indices_of([field])] += factor * size
+            vector[problem.parameter_indices([field])] += factor * size
             assert is_notable(cause, problem, vector) is expected
 
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.diagnosis import model_of
 from flytrack_sysid.diagnosis.chunks import cut_chunks
 from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.refinement import FlightTest, errors_at, refine, windows_of
+from flytrack_sysid.diagnosis.refinement import FlightTest, errors_at, refine, sample_windows
 from flytrack_sysid.diagnosis.score_test import CANDIDATES
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.log import FlightLog
@@ -75,7 +75,7 @@ def test_a_late_gyro_starts_flights_at_the_rates_of_their_time(step_s):
     late = {"imu_latency": {"latency_s": 3.7 * step_s}}
     truth, log = scripted(3, SECONDS, effects=late, step_s=step_s)
     with jax.enable_x64(True):
-        problem, windows = build_problem(truth, log), windows_of(log, held_out_rows(log))
+        problem, windows = build_problem(truth, log), sample_windows(log, held_out_rows(log))
         late = problem.start.copy()
         late[problem.names.index("imu_latency.latency_s")] = 3.7 * step_s
         base, own = errors_at(problem, np.stack([problem.start, late]), windows).rms()
@@ -109,7 +109,9 @@ def test_a_path_that_is_known_without_commands_is_no_evidence(dragged):
     with jax.enable_x64(True):
         for one, is_evidence in ((circle(), False), (log, True)):
             problem = build_problem(truth, one)
-            parts = (windows_of(one, rows) for rows in (~held_out_rows(one), held_out_rows(one)))
+            parts = (
+                sample_windows(one, rows) for rows in (~held_out_rows(one), held_out_rows(one))
+            )
             flight_test = FlightTest.of(problem, *parts, problem.start)
             assert flight_test.is_known[:3].all()
             assert (
