@@ -177,7 +177,7 @@ def is_in_kernel() -> bool:
 def has_kernels() -> bool:
     """Return whether what is compiled now can be one kernel: on the CPU, unless switched off.
 
-    Not where the types of arrays say how they are divided among devices: a kernel is of one.
+    A kernel runs on one device, so that explicit mesh axes rule it out.
     """
     is_explicit = AxisType.Explicit in jax.sharding.get_abstract_mesh().axis_types
     return os.environ.get(SWITCH, "1") != "0" and jax.default_backend() == "cpu" and not is_explicit

@@ -168,8 +168,8 @@ class Config:
         return config
 
 
-# By device. A GPU takes about as long for many environments as for few, and for a large minibatch
-# as for a small one, so that there each update is of more environments and fewer of their steps.
+# Hyperparameters by device. A GPU takes about as long for many environments and large minibatches
+# as for few and small ones: 9.1 M steps/s, beside 2.4 M with those for a CPU (docs/results/gpu.md).
 RECIPES = {"cpu": Config(), "gpu": Config(num_envs=4096, num_steps=16, num_minibatches=32)}
 
 

@@ -206,7 +206,7 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
         if scene is not None:
             self._log([scene], NONE_BEGAN)
         self._show()
-        return observation.copy(), reward, terminated, truncated, info
+        return observation, reward, terminated, truncated, info
 
     def _show(self) -> None:
         """Show the state in the window, if there is one."""

@@ -74,11 +74,11 @@ class Packed:
         return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[1:]), self.unpack())
 
     def to_python(self) -> Any:
-        """Return the pytree that is packed as a batch of one, of Python's numbers and arrays."""
+        """Return the pytree that is packed as a batch of one: Python's numbers, new arrays."""
         rows = [np.asarray(matrix)[:, 0] for matrix in self.matrices]
         numbers = [row.tolist() for row in rows]  # at once: each conversion costs as much as this
         leaves = [
-            rows[matrix][first:end].reshape(shape) if shape else numbers[matrix][first]
+            rows[matrix][first:end].reshape(shape).copy() if shape else numbers[matrix][first]
             for shape, matrix, first, end in self.layout.slots
         ]
         return jax.tree.unflatten(self.layout.structure, leaves)
