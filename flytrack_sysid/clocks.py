@@ -153,9 +153,16 @@ def _stretches(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> list[_Str
     return stretches
 
 
-def _cost(stretches: list[_Stretch], offset_s: float) -> float:
-    differences = (stretch.differences(offset_s) for stretch in stretches)
-    return sum(float(np.sum((change - integral) ** 2)) for change, integral, _ in differences)
+def _costs(stretches: list[_Stretch], offsets_s: np.ndarray) -> np.ndarray:
+    """Return the squared differences of changes and integrated rates at offsets, (num_offsets,)."""
+    costs = np.zeros(len(offsets_s))
+    for stretch in stretches:
+        starts, ends = (
+            np.subtract.outer(times, offsets_s) for times in (stretch.starts, stretch.ends)
+        )
+        difference = stretch.change[:, None] - stretch.integral(ends) + stretch.integral(starts)
+        costs += np.square(difference - difference.mean(axis=0)).sum(axis=(0, 2))
+    return costs
 
 
 def _sums(stretches: list[_Stretch], offset_s: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -192,7 +199,7 @@ def offset_between(
         return *unknown, "not compared: correlation 0.00: they do not show one motion clearly"
     # Windows keep the largest offset away from the ends of the data; the grid stays within it.
     grid = np.arange(-MAX_OFFSET_S + GRID_S, MAX_OFFSET_S - GRID_S / 2, GRID_S)
-    best = int(np.argmin([_cost(stretches, offset) for offset in grid]))
+    best = int(np.argmin(_costs(stretches, grid)))
     if best in (0, len(grid) - 1):
         return *unknown, f"not compared: they agree at no offset within {MAX_OFFSET_S:g} s"
     offset = float(grid[best])

@@ -285,7 +285,7 @@ def _acting(linearization: Linearization, free: tuple[str, ...], may_be_idle: bo
     """
     if not np.isfinite(linearization.columns).all() or not np.isfinite(linearization.cost):
         raise FitError("the fit diverged: residuals are not finite")
-    acts = np.flatnonzero(np.abs(linearization.columns).max(axis=(0, 2), initial=0.0))
+    acts = np.flatnonzero(np.abs(linearization.columns).max(axis=(0, 1, 3), initial=0.0))
     names = [linearization.problem.names[linearization.indices[column]] for column in acts]
     idle = [name for name in free if name not in names]
     if idle and not may_be_idle:

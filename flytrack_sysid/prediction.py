@@ -14,6 +14,7 @@ from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
 from flytrack_sysid.log_voltage import with_voltage
 from flytrack_sysid.record import Filled, Record, build_record, is_applied_certain
 from flytrack_sysid.replay import Step, replay, start_replay
+from flytrack_sysid.trace_cache import fast_jit
 
 # For effects with memory, whose memory at the start of a segment is not known.
 SETTLING_S = 0.5
@@ -116,7 +117,7 @@ def in_float64(model: ModelParameters) -> ModelParameters:
     return jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
 
 
-@jax.jit
+@fast_jit
 def _step_from_every_row(
     record: Record, gyro_b: np.ndarray, model: ModelParameters
 ) -> tuple[Drone, tuple[Any, ...], Drone, Vec3]:
@@ -152,7 +153,7 @@ def predict(model: ModelParameters, filled: Filled) -> Prediction:
     )
 
 
-@jax.jit
+@fast_jit
 def _fly(
     starts: tuple[Drone, tuple[Any, ...]],
     commands: Action,

@@ -78,6 +78,31 @@ def start_replay(model: ModelParameters, row: Record) -> ReplayState:
     return ReplayState(drone.applied, drone.rates_b, memories)
 
 
+def replay_row(
+    model: ModelParameters,
+    state: ReplayState,
+    row: Record,
+    gyro_b: jax.Array,
+    is_gyro_fed: bool = False,
+) -> tuple[ReplayState, Step]:
+    """Return the state after a row, and the step from it; arguments are those of ``replay``."""
+    applied = where_true(row.begins | row.is_applied_known, Action(*row.applied), state.applied)
+    steady_b = body_rates(applied, model.max_rate)
+    first_b = where_true(jnp.isnan(gyro_b[0]), steady_b, Vec3(*gyro_b))
+    rates_b = first_b if is_gyro_fed else where_true(row.begins, first_b, state.rates_b)
+    before = measured_drone(row, applied, rates_b)
+    # The logged action, which is the applied one where a flight begins: so past commands depend on
+    # no model of a batch.
+    begun = before._replace(applied=Action(*row.applied))
+    memories = where_true(
+        row.begins, start_memories(model.effects, begun, MAX_DELAY_STEPS), state.memories
+    )
+    memories = at_row(memories, row.time_s)
+    moved = move(before, memories, Action(*row.command), row.step_s, model)
+    after = ReplayState(moved.after.applied, moved.after.rates_b, moved.memories)
+    return after, Step(row, before, memories, moved, model)
+
+
 def replay(
     model: ModelParameters,
     state: ReplayState,
@@ -106,21 +131,8 @@ def replay(
         model: ModelParameters, state: ReplayState, inputs: tuple[Any, ...]
     ) -> tuple[ReplayState, Any]:
         row, gyro, extra = inputs
-        applied = where_true(row.begins | row.is_applied_known, Action(*row.applied), state.applied)
-        steady_b = body_rates(applied, model.max_rate)
-        first_b = where_true(jnp.isnan(gyro[0]), steady_b, Vec3(*gyro))
-        rates_b = first_b if is_gyro_fed else where_true(row.begins, first_b, state.rates_b)
-        before = measured_drone(row, applied, rates_b)
-        # The logged action, which is the applied one where a flight begins: so past commands depend
-        # on no model of a batch.
-        begun = before._replace(applied=Action(*row.applied))
-        memories = where_true(
-            row.begins, start_memories(model.effects, begun, MAX_DELAY_STEPS), state.memories
-        )
-        memories = at_row(memories, row.time_s)
-        moved = move(before, memories, Action(*row.command), row.step_s, model)
-        later = ReplayState(moved.after.applied, moved.after.rates_b, moved.memories)
-        return later, observe(Step(row, before, memories, moved, model), extra)
+        after, step = replay_row(model, state, row, gyro, is_gyro_fed)
+        return after, observe(step, extra)
 
     kernel = partial(one_kernel(next_row), model)
     return jax.lax.scan(kernel, state, (record, gyro_b, extras))

@@ -35,6 +35,7 @@ from flytrack_sysid.manoeuvres import (
 from flytrack_sysid.parameters import TAUS, THRUST_COEFFS, from_vector
 from flytrack_sysid.record import UPRIGHT
 from flytrack_sysid.script_file import Script, ScriptError, build_script
+from flytrack_sysid.trace_cache import fast_jit
 
 DETECTED = 30.0  # noncentrality from which a log shows an effect nearly always
 SEPARATE = 20.0  # noncentrality beside a rival from which a log tells the two apart
@@ -179,7 +180,7 @@ def _look_alikes(state: SearchState, model: FittedModel, question: Question) -> 
     return tuple(result)
 
 
-@jax.jit
+@fast_jit
 def _flown(
     vector: jax.Array, like: ModelParameters, starts: jax.Array, commands: jax.Array
 ) -> jax.Array:

@@ -30,7 +30,13 @@ from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.chunks import Chunks, cut_chunks
 from flytrack_sysid.diagnosis.lateness import read_poses, scored_as_logged
 from flytrack_sysid.diagnosis.motion_of_sensors import apparent_lateness, motion_of_sensors
-from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_weight
+from flytrack_sysid.diagnosis.problem import (
+    Problem,
+    blocks_of,
+    by_second,
+    in_line,
+    robust_weight,
+)
 from flytrack_sysid.diagnosis.score_test import Linearization, solve
 from flytrack_sysid.diagnosis.search import refine
 from flytrack_sysid.log import FlightLog, usual_step
@@ -183,7 +189,8 @@ def _with_later_poses(log_part: LogPart, trial: Trial) -> MotionEstimate:
     )
     root = np.sqrt(robust_weight(linearization.white))
     column = problem.whiten(np.where(problem.counts & later.counts, change, 0.0))
-    late, given = blocks_of(column * root)[:, 0], linearization.columns * blocks_of(root)[:, None]
+    late = blocks_of(column * root)[:, 0]
+    given = in_line(linearization.columns * by_second(root)[:, :, None])
     across = np.einsum("bpn,bn->p", given, late)
     share = solve(linearization.total, across)
     information = float(np.sum(late**2) - across @ share)

@@ -15,6 +15,7 @@ without wander, a level counts from the first row to the last; with much wander,
 count.
 """
 
+from collections.abc import Iterator, Mapping
 from functools import cached_property, partial
 from itertools import product
 from typing import Any, NamedTuple
@@ -25,6 +26,7 @@ import numpy as np
 
 from flytrack_env.fusion import one_kernel
 from flytrack_sysid.diagnosis.chunks import NUM_AXES, Chunks
+from flytrack_sysid.trace_cache import fast_jit
 
 # Variance of a level at its first row, over that of its noise: its first innovation is about 0.
 UNKNOWN_START = 1e8
@@ -39,9 +41,11 @@ TAU_RANGE_S = (0.02, 5.0)
 FIRST_DAMPING, MORE, LESS = 1e-2, 10.0, 0.2
 MAX_ROUNDS = 12
 ENOUGH = 1.0  # of minus twice the log likelihood: the error of one parameter
-# Sizes of the compiled programs: rows of chunks, and models, at a time.
-NUM_ROWS, NUM_CHUNKS, NUM_MODELS = 200, 8, 8
 OUTLIER = 4.0  # innovations beyond this count by their size, not by its square
+DIFFERENCE = 1e-4  # of logarithms, for slopes
+# Sizes of the compiled programs: rows of chunks at a time, and models: one, or many.
+NUM_ROWS, NUM_CHUNKS, NUM_MODELS = 200, 16, 16
+MIN_FILLED = 8  # models of a batch: fewer are faster one by one
 
 
 class Noise(NamedTuple):
@@ -65,17 +69,17 @@ class Noise(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """The filter of a noise at every row, (..., NUM_AXES) each; direct channels before levels.
+    """The filter of a noise at every row, (rows, NUM_AXES, chunks, 1) each.
 
     Attributes:
         keep: share of the disturbance that is left after a step.
         push: what a step adds to the error of the level, over the disturbance (s).
         direct_d: gain from a direct innovation to the disturbance.
         direct_e: gain from a direct innovation to the error of the level.
-        direct_scale: one over the standard deviation of a direct innovation.
+        direct_scale: one over the standard deviation of a direct innovation; 0 where none counts.
         level_d: gain from a level's innovation to the disturbance.
         level_e: gain from a level's innovation to the error of the level.
-        level_scale: one over the standard deviation of a level's innovation.
+        level_scale: one over the standard deviation of a level's innovation; 0 where none counts.
     """
 
     keep: Any
@@ -88,7 +92,7 @@ class Gains(NamedTuple):
     level_scale: Any
 
 
-class Variances(NamedTuple):
+class Covariance(NamedTuple):
     """Covariance of the filter's state.
 
     Attributes:
@@ -106,9 +110,10 @@ class Conditions(NamedTuple):
     """Inputs of the filter at rows besides their residuals; floats.
 
     Attributes:
-        step_s: time since the row before, (..., 1).
-        is_known: 1 where the row continues a flight and no lost command acts, (..., NUM_AXES).
-        counts: 1 for scored residuals, (..., NUM_AXES, 2).
+        step_s: time since the row before, (rows, 1, chunks, 1).
+        is_known: 1 where the row continues a flight and no lost command acts, (rows, NUM_AXES,
+            chunks, 1).
+        counts: 1 for scored residuals, (rows, 2, NUM_AXES, chunks, 1).
     """
 
     step_s: Any
@@ -116,44 +121,50 @@ class Conditions(NamedTuple):
     counts: Any
 
 
-def gains_of_row(
-    noise: "Noise", variances: Variances, row: Conditions, keep: Any
-) -> tuple[Variances, Gains]:
+def build_conditions(chunks: Chunks) -> Conditions:
+    """Return the conditions of the rows of chunks."""
+    return Conditions(
+        step_to(chunks)[:, None, :, None],
+        np.swapaxes(chunks.is_known, 1, 2)[..., None].astype(float),
+        chunks.counts.transpose(0, 3, 2, 1)[..., None].astype(float),
+    )
+
+
+def gains_of_row(noise: Noise, before: Covariance, row: Conditions) -> tuple[Covariance, Gains]:
     """Return the covariance after a row, and the gains at it.
 
     Args:
         noise: of all axes.
-        variances: the covariance before the row.
+        before: the covariance before the row.
         row: its conditions.
-        keep: exp(-step / tau).
     """
     joined, new = row.is_known, 1.0 - row.is_known
+    keep = jnp.exp(-row.step_s / noise.tau)
     stationary = noise.disturbance * noise.disturbance
     push = noise.coupling * row.step_s
-    d = joined * (keep * keep * variances.disturbance - keep * keep * stationary) + stationary
-    across = joined * (keep * variances.across + push * d)
+    d = joined * (keep * keep * before.disturbance - keep * keep * stationary) + stationary
+    across = joined * (keep * before.across + push * d)
     walk = noise.wander * noise.wander * row.step_s
-    e = variances.level + 2.0 * push * keep * variances.across + push * push * d + walk
+    e = before.level + 2.0 * push * keep * before.across + push * push * d + walk
     e = joined * e + new * UNKNOWN_START * noise.level * noise.level
     direct_size = d + noise.direct * noise.direct
-    inverse = row.counts[..., 0] / direct_size
+    inverse = row.counts[0] / direct_size
     direct_d, direct_e = d * inverse, across * inverse
     e, across, d = e - direct_e * across, across - direct_e * d, d - direct_d * d
     level_size = e + noise.level * noise.level
-    inverse = row.counts[..., 1] / level_size
+    inverse = row.counts[1] / level_size
     level_d, level_e = across * inverse, e * inverse
-    updated = Variances(e - level_e * e, across - level_e * across, d - level_d * across)
     gains = Gains(
         keep=joined * keep,
         push=joined * push,
         direct_d=direct_d,
         direct_e=direct_e,
-        direct_scale=jax.lax.rsqrt(direct_size),
+        direct_scale=row.counts[0] * jax.lax.rsqrt(direct_size),
         level_d=level_d,
         level_e=level_e,
-        level_scale=jax.lax.rsqrt(level_size),
+        level_scale=row.counts[1] * jax.lax.rsqrt(level_size),
     )
-    return updated, gains
+    return Covariance(e - level_e * e, across - level_e * across, d - level_d * across), gains
 
 
 class Filtered(NamedTuple):
@@ -171,126 +182,184 @@ class Filtered(NamedTuple):
 
 
 def innovations_of_row(
-    state: Filtered, residuals: Any, gain: Gains, counts: Any
-) -> tuple[Filtered, Any, Any]:
-    """Return the state after a row, and its innovations, direct and level.
+    before: Filtered, residuals: jax.Array, gain: Gains
+) -> tuple[Filtered, jax.Array]:
+    """Return the state after a row, and its innovations, (axes, 2, ...).
 
     Args:
-        state: before the row.
-        residuals: of the row, (..., NUM_AXES, 2).
+        before: the state before the row.
+        residuals: of the row, (axes, 2, ...).
         gain: of the row.
-        counts: 1 for scored residuals, (..., NUM_AXES, 2).
     """
-    level = state.level + residuals[..., 1]
-    disturbance = gain.keep * state.disturbance
-    error = state.error + gain.push * disturbance
-    direct_innovation = (residuals[..., 0] - disturbance) * counts[..., 0]
-    disturbance = disturbance + gain.direct_d * direct_innovation
-    error = error + gain.direct_e * direct_innovation
-    level_innovation = (level - error) * counts[..., 1]
-    updated = Filtered(
-        level,
-        error + gain.level_e * level_innovation,
-        disturbance + gain.level_d * level_innovation,
-    )
-    return updated, direct_innovation * gain.direct_scale, level_innovation * gain.level_scale
+    level = before.level + residuals[:, 1]
+    disturbance = gain.keep * before.disturbance
+    error = before.error + gain.push * disturbance
+    # Where a residual does not count, its gains and its scale are 0.
+    direct = residuals[:, 0] - disturbance
+    disturbance = disturbance + gain.direct_d * direct
+    error = error + gain.direct_e * direct
+    change = level - error
+    after = Filtered(level, error + gain.level_e * change, disturbance + gain.level_d * change)
+    return after, jnp.stack([direct * gain.direct_scale, change * gain.level_scale], axis=1)
 
 
-def build_conditions(chunks: Chunks) -> Conditions:
-    """Return the conditions of the rows of chunks, leaves (rows, chunks, ...)."""
-    return Conditions(
-        step_to(chunks)[..., None], chunks.is_known.astype(float), chunks.counts.astype(float)
-    )
-
-
-@jax.jit
+@fast_jit
 def _gains_of_rows(
-    log_noise: jax.Array, state: Variances, rows: Conditions
-) -> tuple[Variances, Gains]:
-    """Return the covariance after some rows, and the gains at them, (NUM_ROWS, NUM_CHUNKS, ...)."""
-    noise = noise_of(log_noise)
+    log_noise: jax.Array, state: Covariance, rows: Conditions
+) -> tuple[Covariance, Gains]:
+    """Return the covariance after ``NUM_ROWS`` rows of ``NUM_CHUNKS`` chunks, and the gains there.
 
-    def next_row(state: Variances, row: Conditions) -> tuple[Variances, Gains]:
-        return gains_of_row(noise, state, row, jnp.exp(-row.step_s / noise.tau))
+    Args:
+        log_noise: of each chunk, (6, NUM_AXES, NUM_CHUNKS, 1).
+        state: the covariance before the rows.
+        rows: their conditions.
+    """
+    return jax.lax.scan(partial(one_kernel(gains_of_row), noise_of(log_noise)), state, rows)
 
-    return jax.lax.scan(next_row, state, rows)
+
+@fast_jit
+def _whiten_rows(state: Filtered, gains: Gains, residuals: jax.Array) -> tuple[Filtered, jax.Array]:
+    """Return the state after some rows, and their innovations.
+
+    Args:
+        state: before the rows.
+        gains: of the axes at the rows.
+        residuals: (NUM_ROWS, axes, 2, NUM_CHUNKS, models).
+    """
+    return jax.lax.scan(
+        lambda state, row: innovations_of_row(state, *row), state, (residuals, gains)
+    )
 
 
-@jax.jit
-def _whiten_rows(
-    state: Filtered, gains: Gains, counts: jax.Array, residuals: jax.Array
-) -> tuple[Filtered, jax.Array]:
-    """Return the state after some rows, and innovations (NUM_ROWS, NUM_MODELS, NUM_CHUNKS, ...)."""
+class Filter(NamedTuple):
+    """The filters of chunks, each of a noise: linear maps for residuals and their slopes.
 
-    def next_row(state: Filtered, inputs: tuple[Any, ...]) -> tuple[Filtered, jax.Array]:
-        gain, counting, values = inputs
-        state, direct, level = innovations_of_row(state, values, gain, counting)
-        return state, jnp.stack([direct, level], axis=-1)
+    Attributes:
+        gains: of some axes, by the first chunk and the first row of each part.
+    """
 
-    return jax.lax.scan(next_row, state, (gains, counts, residuals))
+    gains: Mapping[int, Mapping[int, Gains]]
+
+    @classmethod
+    def of(cls, conditions: Conditions, log_noise: np.ndarray) -> "Filter":
+        """Return the filter of all axes.
+
+        Args:
+            conditions: of the rows of chunks.
+            log_noise: the noise of each chunk, (6, NUM_AXES, chunks).
+        """
+        num_rows, _, num_chunks, _ = conditions.step_s.shape
+        gains: dict[int, dict[int, Gains]] = {}
+        for chunk in range(0, num_chunks, NUM_CHUNKS):
+            noise = _cut(log_noise[..., None], (6, NUM_AXES, NUM_CHUNKS, 1), chunk=chunk)
+            state = Covariance(*[jnp.zeros((NUM_AXES, NUM_CHUNKS, 1))] * 3)
+            gains[chunk] = {}
+            for row in range(0, num_rows, NUM_ROWS):
+                part = Conditions(
+                    *(
+                        _cut(leaf, (NUM_ROWS, *leaf.shape[1:-2], NUM_CHUNKS, 1), row, chunk)
+                        for leaf in conditions
+                    )
+                )
+                state, gains[chunk][row] = _gains_of_rows(noise, state, part)
+        return cls(gains)
+
+    def of_axes(self, axes: slice) -> "Filter":
+        """Return the filter of some axes, of ``NUM_AXES``."""
+        gains = {
+            chunk: {row: Gains(*(gain[:, axes] for gain in part)) for row, part in parts.items()}
+            for chunk, parts in self.gains.items()
+        }
+        return Filter(gains)
+
+    def whiten(self, residuals: np.ndarray, white: np.ndarray) -> None:
+        """Fill an array with the innovations of residuals, of variance 1; 0 where nothing counts.
+
+        Args:
+            residuals: (rows, axes, 2, chunks, models).
+            white: of the same shape.
+        """
+        batches = list(_batches_of_models(residuals.shape[-1]))
+        for (chunk, parts), (model, size) in product(self.gains.items(), batches):
+            shape = NUM_ROWS, *residuals.shape[1:3], NUM_CHUNKS, size
+            state = Filtered(*[np.zeros((shape[1], NUM_CHUNKS, size))] * 3)
+            for row, gains in parts.items():
+                state, result = _whiten_rows(
+                    state, gains, _cut(residuals, shape, row, chunk, model)
+                )
+                part = white[row:, ..., chunk:, model : model + size][:NUM_ROWS, :, :, :NUM_CHUNKS]
+                part[...] = np.asarray(result)[tuple(map(slice, part.shape))]
+
+    def scale(self, num_rows: int, num_chunks: int) -> np.ndarray:
+        """Return one over the standard deviation of innovations, (rows, NUM_AXES, 2, chunks).
+
+        It is 0 where a residual does not count.
+        """
+        by_chunk = [
+            np.concatenate(
+                [np.stack([part.direct_scale, part.level_scale], axis=2) for part in parts.values()]
+            )
+            for parts in self.gains.values()
+        ]
+        return np.concatenate(by_chunk, axis=3)[:num_rows, ..., :num_chunks, 0]
+
+
+def _batches_of_models(num_models: int) -> Iterator[tuple[int, int]]:
+    """Yield the first model and the size of each batch."""
+    num_batches, rest = divmod(num_models, NUM_MODELS)
+    num_batches += rest >= MIN_FILLED
+    first_single = num_batches * NUM_MODELS
+    yield from ((model, NUM_MODELS) for model in range(0, first_single, NUM_MODELS))
+    yield from ((model, 1) for model in range(first_single, num_models))
+
+
+def _cut(
+    values: np.ndarray, shape: tuple[int, ...], row: int = 0, chunk: int = 0, model: int = 0
+) -> np.ndarray:
+    """Return a part of values (..., chunks, models) from an index on, padded with 0 to a shape."""
+    part = values[row:, ..., chunk:, model:]
+    part = part[tuple(map(slice, shape))]
+    padded = np.zeros(shape)
+    padded[tuple(map(slice, part.shape))] = part
+    return padded
 
 
 class Whitener:
-    """The filter of a noise for rows of chunks: a linear map for residuals and their slopes."""
+    """The filter of a noise for rows of chunks."""
 
     def __init__(self, chunks: Chunks, log_noise: np.ndarray):
         self._chunks, self._log_noise = chunks, log_noise
+        self._of_axes: dict[tuple[int, ...], Filter] = {}
 
     @cached_property
-    def _parts(self) -> dict[int, dict[int, tuple[Gains, jax.Array]]]:
-        """The gains and counts, by first chunk and first row."""
-        zeros = jnp.zeros((NUM_CHUNKS, NUM_AXES))
-        gains_by_part: dict[int, dict[int, tuple[Gains, jax.Array]]] = {}
-        for chunk, parts in cut_to_size(build_conditions(self._chunks)).items():
-            state, gains_by_part[chunk] = Variances(zeros, zeros, zeros), {}
-            for begin, rows in parts.items():
-                state, gains = _gains_of_rows(self._log_noise, state, rows)
-                gains_by_part[chunk][begin] = gains, rows.counts
-        return gains_by_part
+    def _filter(self) -> Filter:
+        num_chunks = self._chunks.row.shape[1]
+        by_chunk = np.repeat(self._log_noise[..., None], num_chunks, axis=2)
+        return Filter.of(build_conditions(self._chunks), by_chunk)
+
+    def _filter_of(self, axes: slice) -> Filter:
+        key = axes.indices(NUM_AXES)
+        if key == (0, NUM_AXES, 1):
+            return self._filter
+        if key not in self._of_axes:
+            self._of_axes[key] = self._filter.of_axes(axes)
+        return self._of_axes[key]
 
     def __call__(self, residuals: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
         """Return residuals as innovations of variance 1; they are 0 where nothing counts.
+
+        In memory the innovations of a row of a chunk are together, and models are last.
 
         Args:
             residuals: (models, rows, chunks, axes, 2).
             axes: the axes of the residuals, of ``NUM_AXES``.
         """
-        num_models, (num_rows, num_chunks) = len(residuals), self._chunks.row.shape
-        padding = -num_models % NUM_MODELS, -num_rows % NUM_ROWS, -num_chunks % NUM_CHUNKS
-        size = np.add((num_models, num_rows, num_chunks), padding)
-        values = np.zeros((size[1], size[0], size[2], NUM_AXES, 2))
-        chosen = values[:num_rows, :num_models, :num_chunks, axes]
-        chosen[...] = np.moveaxis(residuals, 0, 1)
-        zeros = jnp.zeros((NUM_MODELS, NUM_CHUNKS, NUM_AXES))
-        for (chunk, parts), model in product(self._parts.items(), range(0, size[0], NUM_MODELS)):
-            state = Filtered(zeros, zeros, zeros)
-            for begin, (gains, counts) in parts.items():
-                part = (
-                    slice(begin, begin + NUM_ROWS),
-                    slice(model, model + NUM_MODELS),
-                    slice(chunk, chunk + NUM_CHUNKS),
-                )
-                state, values[part] = _whiten_rows(state, gains, counts, values[part])
-        return np.moveaxis(chosen, 0, 1)
-
-
-def cut_to_size(tree: Any) -> dict[int, dict[int, Any]]:
-    """Return leaves (rows, chunks, ...) in parts of one size, by first chunk and first row.
-
-    Parts are padded with 0, so that one program serves logs of any length and rate.
-    """
-    num_rows, num_chunks = jax.tree.leaves(tree)[0].shape[:2]
-    padding = [(0, -num_rows % NUM_ROWS), (0, -num_chunks % NUM_CHUNKS)]
-    padded = jax.tree.map(lambda leaf: np.pad(leaf, padding + [(0, 0)] * (leaf.ndim - 2)), tree)
-
-    def part(row: int, chunk: int) -> Any:
-        part_slices = slice(row, row + NUM_ROWS), slice(chunk, chunk + NUM_CHUNKS)
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf[part_slices]), padded)
-
-    return {
-        chunk: {row: part(row, chunk) for row in range(0, num_rows, NUM_ROWS)}
-        for chunk in range(0, num_chunks, NUM_CHUNKS)
-    }
+        num_models, num_rows, num_chunks = residuals.shape[:3]
+        white = np.empty((num_chunks, num_rows, *residuals.shape[3:], num_models))
+        self._filter_of(axes).whiten(
+            residuals.transpose(1, 3, 4, 2, 0), white.transpose(1, 2, 3, 0, 4)
+        )
+        return white.transpose(4, 1, 0, 2, 3)
 
 
 def step_to(chunks: Chunks) -> np.ndarray:
@@ -300,7 +369,7 @@ def step_to(chunks: Chunks) -> np.ndarray:
 
 
 def noise_of(log_noise: jax.Array | np.ndarray) -> Noise:
-    """Return the noise from its logarithms and a logit, (6, NUM_AXES)."""
+    """Return the noise from its logarithms and a logit, (6, NUM_AXES, ...)."""
     direct, level = jnp.exp(log_noise[0]), jnp.exp(log_noise[1])
     disturbance, wander = direct * jnp.exp(log_noise[3]), level * jnp.exp(log_noise[2])
     return Noise(
@@ -308,72 +377,45 @@ def noise_of(log_noise: jax.Array | np.ndarray) -> Noise:
     )
 
 
-DIFFERENCE = 1e-4  # of logarithms, for slopes
-
-
-@jax.jit
-def _misfit_rows(
-    log_noise: jax.Array, state: Any, rows: Conditions, residuals: jax.Array
-) -> tuple[Any, tuple[jax.Array, jax.Array, jax.Array]]:
-    """Return the state after some rows, and the contributions of these to the misfit of a noise.
-
-    The contributions are each axis's misfit (NUM_AXES,), its slopes (6, NUM_AXES) and its expected
-    curvature (NUM_AXES, 6, 6). The misfit is minus twice the log likelihood; outliers count by
-    their size. Axes do not depend on each other, so that one difference serves all.
-    """
-    shifts = DIFFERENCE * jnp.eye(len(log_noise))[:, :, None]
-    noise = jax.vmap(noise_of)(jnp.concatenate([log_noise[None], log_noise + shifts]))
-    noise = jax.tree.map(lambda leaf: leaf[:, None, :], noise)  # (noises, chunks, axes)
-
-    def next_row(noise: Noise, state: Any, inputs: Any) -> Any:
-        row, values = inputs
-        (variances, filtered), keep = state, jnp.exp(-row.step_s / noise.tau)
-        variances, gain = gains_of_row(noise, variances, row, keep)
-        filtered, direct, level = innovations_of_row(filtered, values, gain, row.counts)
-        white = jnp.stack([direct, level], axis=-1)
-        scale = jnp.stack([gain.direct_scale, gain.level_scale], axis=-1)
-        return (variances, filtered), (white, scale)
-
-    kernel = partial(one_kernel(next_row), noise)
-    state, (white, scale) = jax.lax.scan(kernel, state, (rows, residuals))
-    size = jnp.abs(white)
-    squares = jnp.where(size < OUTLIER, size**2, OUTLIER * (2.0 * size - OUTLIER))
-    logs = -2.0 * jnp.log(scale) * rows.counts[:, None]
-    errors = white / scale
-    misfit = (squares + logs).sum(axis=(0, 2, 4))
-
-    def slopes(values: jax.Array, axis: int = 0) -> jax.Array:
-        shifted = jax.lax.slice_in_dim(values, 1, None, axis=axis)
-        return (shifted - jax.lax.slice_in_dim(values, 0, 1, axis=axis)) / DIFFERENCE
-
-    log_slopes = slopes(logs, axis=1)
-    error_slopes = slopes(errors, axis=1) * scale[:, :1]
-    curvature = jnp.einsum("rjlac,rklac->ajk", log_slopes, log_slopes)
-    curvature += 2.0 * jnp.einsum("rjlac,rklac->ajk", error_slopes, error_slopes)
-    return state, (misfit[0], slopes(misfit), curvature)
-
-
 class Likelihood:
     """The likelihood of noises, given residuals of chunks (rows, chunks, NUM_AXES, 2)."""
 
     def __init__(self, chunks: Chunks, residuals: np.ndarray):
-        self._parts = cut_to_size((build_conditions(chunks), residuals))
+        # A noise and six like it are compared on copies of the chunks.
+        conditions = build_conditions(chunks)
+        self._conditions = Conditions(*(np.concatenate([leaf] * 7, axis=-2) for leaf in conditions))
+        of_chunks = residuals.transpose(0, 2, 3, 1)[..., None]
+        self._residuals = np.concatenate([of_chunks] * 7, axis=3)
 
     def misfit(self, log_noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the sums of ``_misfit_rows`` over all rows."""
-        zeros = jnp.zeros((1 + len(log_noise), NUM_CHUNKS, NUM_AXES))
-        begin = Variances(*[zeros] * 3), Filtered(*[zeros] * 3)
-        sums = []
-        for parts in self._parts.values():
-            state = begin
-            for rows, residuals in parts.values():
-                state, added = _misfit_rows(log_noise, state, rows, residuals)
-                sums.append(added)
-        total, slopes, curvature = (
-            np.sum([np.asarray(leaf) for leaf in leaves], axis=0)
-            for leaves in zip(*sums, strict=True)
+        """Return each axis's misfit of a noise, (NUM_AXES,), its slopes and expected curvature.
+
+        The misfit is minus twice the log likelihood; outliers count by their size. Axes do not
+        depend on each other, so that one difference serves all. The slopes are (6, NUM_AXES), the
+        curvature is (NUM_AXES, 6, 6).
+        """
+        shifts = DIFFERENCE * np.concatenate([np.zeros((1, 6)), np.eye(6)]).T
+        num_chunks = self._residuals.shape[3] // 7
+        by_chunk = np.repeat(log_noise[:, :, None] + shifts[:, None], num_chunks, axis=2)
+        white_filter, white = Filter.of(self._conditions, by_chunk), np.empty_like(self._residuals)
+        white_filter.whiten(self._residuals, white)
+        scale = white_filter.scale(len(white), white.shape[3])
+        white, scale = (
+            np.moveaxis(values.reshape(*values.shape[:3], 7, num_chunks), 3, 0)
+            for values in (white[..., 0], np.where(scale > 0.0, scale, 1.0))
         )
-        return total, slopes, curvature
+        size, logs = np.abs(white), -2.0 * np.log(scale)
+        squares = np.where(size < OUTLIER, size**2, OUTLIER * (2.0 * size - OUTLIER))
+        misfit = (squares + logs).sum(axis=(1, 3, 4))
+
+        def slopes(values: np.ndarray) -> np.ndarray:
+            return (values[1:] - values[0]) / DIFFERENCE
+
+        curvature = np.zeros((NUM_AXES, 6, 6))
+        for weight, changes in ((1.0, slopes(logs)), (2.0, slopes(white / scale) * scale[0])):
+            by_axis = np.moveaxis(changes, 2, 0).reshape(NUM_AXES, 6, -1)
+            curvature += weight * by_axis @ np.swapaxes(by_axis, 1, 2)
+        return misfit[0], slopes(misfit), curvature
 
 
 def noise_floors(chunks: Chunks) -> np.ndarray:

@@ -15,9 +15,11 @@ channel   residual of a row                                                     
 ========  ==============================================================================  =======
 """
 
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Any, NamedTuple, Self
 
 import jax
@@ -27,13 +29,14 @@ from scipy import special
 
 from flytrack_env.dynamics import ModelParameters, read_sensors
 from flytrack_env.effects import BY_NAME, EFFECTS, LEARNED_LAW, Effect, LearnedLaw, effect_of
+from flytrack_env.fusion import one_kernel
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.chunks import AXES, CHUNK_S, NUM_AXES, Chunks, count_lead_in
 from flytrack_sysid.diagnosis.lateness import Late
 from flytrack_sysid.parameters import TAUS, from_vector, names_of, range_of, to_vector
 from flytrack_sysid.record import Record
-from flytrack_sysid.replay import Step, replay, start_replay
+from flytrack_sysid.replay import ReplayState, Step, replay_row, start_replay
 from flytrack_sysid.trace_cache import keep_trace
 
 # The effects that a replay can show of any craft. It is fed with poses, so their lateness has to be
@@ -72,13 +75,13 @@ class Measured(NamedTuple):
     force_b: Any
 
 
-class Rows(NamedTuple):
-    """Rows of chunks, and measurements.
+class Row(NamedTuple):
+    """A row of a chunk, and measurements.
 
     Attributes:
-        row: the rows.
-        gyro_b: rates at the rows, body (rad/s).
-        later: the measurements at the rows after them.
+        row: the row.
+        gyro_b: rates at the row, body (rad/s).
+        later: the measurements at the row after it.
     """
 
     row: Record
@@ -86,8 +89,58 @@ class Rows(NamedTuple):
     later: Measured
 
 
-def _of_step(step: Step, measured: Measured) -> jax.Array:
-    """Return the residuals of the row after a step, (NUM_AXES, 2)."""
+def _numbers(*shape: int) -> Any:
+    return jax.ShapeDtypeStruct(shape, np.float64)
+
+
+_FLAG: Any = jax.ShapeDtypeStruct((), np.bool_)
+ROW = Row(
+    Record(
+        source_row=_numbers(),
+        step_s=_numbers(),
+        command=_numbers(4),
+        command_doubt=_numbers(4),
+        begins=_FLAG,
+        is_applied_known=_FLAG,
+        applied=_numbers(4),
+        pos_w=_numbers(3),
+        vel_w=_numbers(3),
+        quat=_numbers(4),
+        battery_v=_numbers(),
+        piece=_numbers(),
+        time_s=_numbers(),
+    ),
+    gyro_b=_numbers(3),
+    later=Measured(_numbers(4), _numbers(3), _numbers(), _numbers(3), _numbers(3)),
+)
+
+
+def _count_numbers(like: Any) -> int:
+    """Return how many numbers a tree of shapes has."""
+    return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(like))
+
+
+def _unpacked(numbers: jax.Array, like: Any) -> Any:
+    """Return the tree of numbers (num_numbers,) with the structure and types of another."""
+    leaves, structure = jax.tree.flatten(like)
+    sizes = [math.prod(leaf.shape) for leaf in leaves]
+    starts = np.cumsum(sizes) - sizes
+    return jax.tree.unflatten(
+        structure,
+        [
+            numbers[start : start + size].reshape(leaf.shape).astype(leaf.dtype)
+            for start, size, leaf in zip(starts, sizes, leaves, strict=True)
+        ],
+    )
+
+
+def _packed(leaves: Sequence[jax.Array]) -> jax.Array:
+    """Return the numbers of leaves (pairs, ...) as one array, (num_numbers, pairs)."""
+    return jnp.concatenate([leaf.reshape(len(leaf), -1).astype(float).T for leaf in leaves])
+
+
+def _of_step(step: Step, measured: Measured) -> list[Any]:
+    """Return the residuals of the row after a step: of each axis, direct and level."""
     row, before, after = step.row, step.before, step.after
     sensors = read_sensors(step.moved, step.model)
     to_world = before.quat.rotate  # whatever attitude the sensors' force had
@@ -96,97 +149,100 @@ def _of_step(step: Step, measured: Measured) -> jax.Array:
     force = to_world(Vec3(*measured.force_b) - sensors.force_b)
     vel_change = Vec3(*measured.vel_w) - before.vel_w - after.acc_w.scale(row.step_s)
     voltage_change = measured.battery_v - after.battery_v
-    direct, level = (*rates, *force, 0.0), (*turn, *vel_change, voltage_change)
-    return jnp.stack([jnp.stack(direct), jnp.stack(level)], axis=-1)
+    direct, level = (*rates, *force, jnp.zeros(())), (*turn, *vel_change, voltage_change)
+    return [channel for axis in zip(direct, level, strict=True) for channel in axis]
 
 
-States = tuple[jax.Array, ...]  # leaves of the states of pairs, (NUM_PAIRS, ...)
+def _state_like(model: ModelParameters) -> ReplayState:
+    """Return the shapes and types of the state of a model's replay."""
+    return jax.eval_shape(start_replay, model, ROW.row)
 
 
-@jax.jit
-def _start_states(vectors: jax.Array, like: ModelParameters, row: Record) -> States:
-    """Return the states before the first rows of pairs.
+@cache
+def _no_state(
+    structure: jax.tree_util.PyTreeDef, shapes: tuple[tuple[int, ...], ...]
+) -> np.ndarray:
+    """Return a state to begin with, where every chunk begins a flight, so that it is not read.
 
     Args:
-        vectors: the model of each pair, (NUM_PAIRS, parameters).
-        like: the model whose parameters the vectors have.
-        row: leaves (NUM_PAIRS, ...).
+        structure: of a model.
+        shapes: of its leaves.
     """
-    start = jax.vmap(lambda vector, row: start_replay(from_vector(vector, like), row))
-    return tuple(jax.tree.leaves(start(vectors, row)))
+    like = jax.tree.unflatten(structure, [_numbers(*shape) for shape in shapes])
+    return np.zeros((_count_numbers(_state_like(like)), NUM_PAIRS))
 
 
 @keep_trace
 def _replay_rows(
-    vectors: jax.Array, like: ModelParameters, states: States, rows: Rows
-) -> tuple[States, jax.Array]:
-    """Return the states of pairs after some rows, and (rows, NUM_PAIRS, NUM_AXES, 2) residuals.
+    vectors: jax.Array, like: ModelParameters, state: jax.Array, rows: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return the state of pairs of a model and a chunk after some rows, and their residuals.
+
+    A state and a row are one array each, of all their numbers: a loop that carries hundreds of
+    small arrays takes longer for these than for the physics.
 
     Args:
-        vectors: the model of each pair, (NUM_PAIRS, parameters), in the order of
+        vectors: the model of each pair, (parameters, NUM_PAIRS), in the order of
             ``parameters.names_of(like)``.
         like: the model whose parameters the vectors have.
-        states: before the rows.
-        rows: the chunk of each pair, leaves (rows, NUM_PAIRS, ...).
+        state: before the rows, (num_numbers, NUM_PAIRS).
+        rows: the rows of each pair's chunk, (NUM_ROWS, num_numbers, NUM_PAIRS), each a ``Row``.
+
+    Returns:
+        The state, and the residuals, (NUM_ROWS, 2 * NUM_AXES, NUM_PAIRS).
     """
 
-    def of_pair(vector: jax.Array, leaves: States, rows: Rows) -> Any:
-        model = from_vector(vector, like)
-        first = jax.tree.map(lambda leaf: leaf[0], rows.row)
-        structure = jax.tree.structure(jax.eval_shape(start_replay, model, first))
-        state = jax.tree.unflatten(structure, leaves)
-        state, residuals = replay(model, state, rows.row, rows.gyro_b, _of_step, rows.later)
-        return tuple(jax.tree.leaves(state)), residuals
+    def of_pair(vector: jax.Array, numbers: jax.Array, row_numbers: jax.Array) -> Any:
+        model, row = from_vector(vector, like), _unpacked(row_numbers, ROW)
+        state = _unpacked(numbers, _state_like(model))
+        state, step = replay_row(model, state, row.row, row.gyro_b)
+        return jax.tree.leaves(state), _of_step(step, row.later)
 
-    return jax.vmap(of_pair, in_axes=(0, 0, 1), out_axes=(0, 1))(vectors, states, rows)
+    def of_row(vectors: jax.Array, state: jax.Array, row: jax.Array) -> Any:
+        leaves, residuals = jax.vmap(of_pair, in_axes=1)(vectors, state, row)
+        return _packed(leaves), jnp.stack(residuals)
 
-
-class Batch(NamedTuple):
-    """Rows with which ``NUM_PAIRS`` pairs of a model and a chunk are replayed.
-
-    Attributes:
-        first: the first row of each pair's chunk.
-        parts: all rows, ``NUM_ROWS`` at a time.
-    """
-
-    first: Record
-    parts: tuple[Rows, ...]
+    return jax.lax.scan(partial(one_kernel(of_row), vectors), state, rows)
 
 
 class Batches:
-    """Batches of chunks: pairs of all chunks and the first model, then of the second, and so on.
+    """The rows with which ``NUM_PAIRS`` pairs of a model and a chunk are replayed.
 
-    One size serves logs of any length, rate and channels.
+    The pairs are those of all chunks and the first model, then of the second, and so on. One size
+    serves logs of any length, rate and channels.
     """
 
     def __init__(self, chunks: Chunks):
         nowhere = np.zeros((*chunks.row.shape, 3))
         record, gyro_b = chunks.record, chunks.measured.get("w", nowhere + np.nan)
         force_b = chunks.measured.get("f", nowhere)
-        self._record, self._gyro_b = record, gyro_b
-        self._measured = Measured(record.quat, record.vel_w, record.battery_v, gyro_b, force_b)
-        self._num_rows, self._num_chunks = chunks.row.shape
-        self._known: dict[int, Batch] = {}
+        measured = Measured(record.quat, record.vel_w, record.battery_v, gyro_b, force_b)
+        record, gyro_b = jax.tree.map(lambda leaf: leaf[:-1], (record, gyro_b))
+        row = Row(record, gyro_b, jax.tree.map(lambda leaf: leaf[1:], measured))
+        num_rows, self._num_chunks = len(chunks.row) - 1, chunks.row.shape[1]
+        self._rows = np.zeros(
+            (num_rows + -num_rows % NUM_ROWS, _count_numbers(ROW), self._num_chunks)
+        )
+        leaves = [
+            leaf.reshape(num_rows, self._num_chunks, -1).astype(float)
+            for leaf in jax.tree.leaves(row)
+        ]
+        self._rows[:num_rows] = np.swapaxes(np.concatenate(leaves, axis=-1), 1, 2)
+        self._known: dict[int, tuple[jax.Array, ...]] = {}
 
-    def at(self, first_pair: int) -> Batch:
-        """Return the batch that begins with a pair; it is made once for each first chunk."""
+    def at(self, first_pair: int) -> tuple[jax.Array, ...]:
+        """Return the rows of the batch that begins with a pair, ``NUM_ROWS`` at a time.
+
+        They are made once for each first chunk.
+        """
         first_chunk = first_pair % self._num_chunks
         if first_chunk not in self._known:
-            self._known[first_chunk] = self._beginning_with(first_chunk)
+            pair = (first_chunk + np.arange(NUM_PAIRS)) % self._num_chunks
+            self._known[first_chunk] = tuple(
+                jnp.asarray(self._rows[row : row + NUM_ROWS, :, pair])
+                for row in range(0, len(self._rows), NUM_ROWS)
+            )
         return self._known[first_chunk]
-
-    def _beginning_with(self, first_chunk: int) -> Batch:
-        pair = (first_chunk + np.arange(NUM_PAIRS)) % self._num_chunks
-
-        def at(first: int, values: Any) -> Any:
-            row = np.minimum(first + np.arange(NUM_ROWS), self._num_rows - 1)
-            return jax.tree.map(lambda leaf: jnp.asarray(leaf[row[:, None], pair]), values)
-
-        parts = tuple(
-            Rows(at(row, self._record), at(row, self._gyro_b), at(row + 1, self._measured))
-            for row in range(0, self._num_rows - 1, NUM_ROWS)
-        )
-        return Batch(jax.tree.map(lambda leaf: jnp.asarray(leaf[0, pair]), self._record), parts)
 
 
 class Window(NamedTuple):
@@ -353,27 +409,26 @@ class Problem:
         return result if self.late is None else self.late.residuals(result)
 
     def _replayed(self, vectors: np.ndarray) -> np.ndarray:
-        rows, chunks = self.chunks.row.shape
-        num_pairs = len(vectors) * chunks
-        pairs = np.zeros((rows, num_pairs, NUM_AXES, 2))
+        num_rows, num_chunks = self.chunks.row.shape
+        num_pairs = len(vectors) * num_chunks
+        leaves, structure = jax.tree.flatten(self.like)
+        no_state = _no_state(structure, tuple(map(np.shape, leaves)))
+        pairs = np.zeros((num_rows, 2 * NUM_AXES, num_pairs))
         for first in range(0, num_pairs, NUM_PAIRS):
-            pair_numbers = np.minimum(first + np.arange(NUM_PAIRS), num_pairs - 1)
-            residuals = self._replay_pairs(vectors[pair_numbers // chunks], self.batches.at(first))
-            pairs[1:, first : first + NUM_PAIRS] = residuals[:, : num_pairs - first]
-        result = np.swapaxes(pairs.reshape(rows, len(vectors), chunks, NUM_AXES, 2), 0, 1)
-        result *= self.chunks.is_joined[..., None, None]
+            pair = np.minimum(first + np.arange(NUM_PAIRS), num_pairs - 1)
+            of_pairs, state = vectors[pair // num_chunks].T, no_state
+            for number, rows in enumerate(self.batches.at(first)):
+                state, residuals = _replay_rows(of_pairs, self.like, state, rows)
+                # The residuals of a step are those of the row after it.
+                part = pairs[1 + number * NUM_ROWS :][:NUM_ROWS, :, first : first + NUM_PAIRS]
+                part[...] = np.asarray(residuals)[: len(part), :, : part.shape[2]]
+        result = pairs.reshape(num_rows, NUM_AXES, 2, len(vectors), num_chunks)
+        result = result.transpose(3, 0, 4, 1, 2)
+        result[:, ~self.chunks.is_joined] = 0.0
         for name, axes in zip(("w", "f"), AXES, strict=False):
             if name not in self.chunks.measured:
                 result[..., axes, 0] = 0.0
         return result
-
-    def _replay_pairs(self, vectors: np.ndarray, batch: Batch) -> np.ndarray:
-        """Return the residuals of all rows but the first, (rows - 1, NUM_PAIRS, NUM_AXES, 2)."""
-        states, parts = _start_states(vectors, self.like, batch.first), []
-        for rows in batch.parts:
-            states, residuals = _replay_rows(vectors, self.like, states, rows)
-            parts.append(residuals)
-        return np.concatenate(parts)[: len(self.chunks.row) - 1]
 
     def _composed(self, vectors: np.ndarray) -> np.ndarray:
         """Return residuals of models with windows of effects; each row is of one replay."""
@@ -498,15 +553,23 @@ def robust_square(white: np.ndarray) -> float:
     return float(2.0 * special.huber(noises.OUTLIER, white).sum())
 
 
-def blocks_of(values: np.ndarray) -> np.ndarray:
-    """Reshape (..., rows, chunks, axes, 2) to blocks of a second, (blocks, ..., numbers).
+def by_second(values: np.ndarray) -> np.ndarray:
+    """Reshape (..., rows, chunks, axes, 2) to seconds, (CHUNK_S, chunks, ..., numbers).
 
-    The lead-in is left out.
+    The lead-in is left out. Innovations are not copied.
     """
-    rows, chunks = values.shape[-4:-2]
-    kept = values[..., count_lead_in(rows) :, :, :, :]
+    kept = values[..., count_lead_in(values.shape[-4]) :, :, :, :]
     rows_per_s = kept.shape[-4] // CHUNK_S
-    split = kept.reshape(*kept.shape[:-4], CHUNK_S, rows_per_s, chunks, kept.shape[-2] * 2)
-    return np.moveaxis(split, (-4, -2), (0, 1)).reshape(
-        CHUNK_S * chunks, *kept.shape[:-4], rows_per_s * kept.shape[-2] * 2
-    )
+    split = kept.reshape(*kept.shape[:-4], CHUNK_S, rows_per_s, *kept.shape[-3:])
+    split = np.moveaxis(split, (-5, -3), (0, 1))
+    return split.reshape(*split.shape[:-3], -1)
+
+
+def blocks_of(values: np.ndarray) -> np.ndarray:
+    """Reshape (..., rows, chunks, axes, 2) to blocks of a second, (blocks, ..., numbers)."""
+    return in_line(by_second(values))
+
+
+def in_line(values: np.ndarray) -> np.ndarray:
+    """Reshape (CHUNK_S, chunks, ...) to (blocks, ...)."""
+    return values.reshape(-1, *values.shape[2:])

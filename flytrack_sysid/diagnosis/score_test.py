@@ -17,7 +17,8 @@ from flytrack_sysid.diagnosis.problem import (
     SEARCHED,
     Problem,
     Slopes,
-    blocks_of,
+    by_second,
+    in_line,
     robust_square,
     robust_weight,
 )
@@ -201,7 +202,7 @@ class Linearization:
         vector: the model.
         indices: parameters of the first columns.
         probes: of the further columns, whose step is the share of the way to the probe.
-        columns: whitened slopes, (blocks, columns, numbers).
+        columns: whitened slopes, (CHUNK_S, chunks, columns, numbers).
     """
 
     def __init__(self, problem: Problem, slopes: Slopes, probes: Sequence[Probe] = ()):
@@ -210,21 +211,21 @@ class Linearization:
         self.prior = np.concatenate(
             [prior_information(problem)[self.indices], np.full(len(self.probes), PROBE_PRIOR)]
         )
-        white = problem.whiten(np.concatenate([slopes.residuals[None], slopes.columns]))
-        self.vector, self.white = slopes.vector, white[0]
-        blocks = blocks_of(white)
-        self.columns = blocks[:, 1:]
-        weighted = blocks * np.sqrt(robust_weight(blocks[:, :1]))
-        self.by_block = weighted[:, 1:] @ np.swapaxes(weighted[:, 1:], 1, 2)
-        self.score_by_block = -(weighted[:, 1:] @ weighted[:, 0, :, None])[..., 0]
+        self.columns = by_second(problem.whiten(slopes.columns))
+        white = problem.whiten(slopes.residuals[None])[0]
+        weighted = self.columns * np.sqrt(robust_weight(by_second(white)))[:, :, None]
+        self.by_block = in_line(weighted @ np.swapaxes(weighted, 2, 3))
         self.total = self.by_block.sum(axis=0) + np.diag(self.prior)
-        self._sum_scores()
+        self._move(slopes.vector, white)
 
-    def _sum_scores(self) -> None:
-        change = (self.vector - self.problem.start)[self.indices]
+    def _move(self, vector: np.ndarray, white: np.ndarray) -> None:
+        self.vector, self.white = vector, white
+        weighted = by_second(white * robust_weight(white))[..., None]
+        self.score_by_block = -in_line(self.columns @ weighted)[..., 0]
+        change = (vector - self.problem.start)[self.indices]
         prior_score = self.prior * np.append(change, np.zeros(len(self.probes)))
         self.score = self.score_by_block.sum(axis=0) - prior_score
-        self.cost = compute_costs(self.problem, self.vector[None], self.white[None])[0]
+        self.cost = compute_costs(self.problem, vector[None], white[None])[0]
 
     def moved(self, vector: np.ndarray, white: np.ndarray | None = None) -> "Linearization":
         """Return the linearization at a nearby model, with the slopes of this one.
@@ -234,11 +235,9 @@ class Linearization:
             white: its whitened residuals, if they are known.
         """
         shifted = copy.copy(self)
-        shifted.vector = vector
-        shifted.white = self.problem.whitened_residuals(vector)[0] if white is None else white
-        weighted = blocks_of(shifted.white * robust_weight(shifted.white))
-        shifted.score_by_block = -(self.columns @ weighted[..., None])[..., 0]
-        shifted._sum_scores()
+        shifted._move(
+            vector, self.problem.whitened_residuals(vector)[0] if white is None else white
+        )
         return shifted
 
     def distance(self, vector: np.ndarray) -> float:
@@ -259,7 +258,7 @@ class Linearization:
         columns = [self.indices.index(index) for index in indices]
         narrow = copy.copy(self)
         narrow.indices, narrow.probes = list(indices), []
-        narrow.prior, narrow.columns = self.prior[columns], self.columns[:, columns]
+        narrow.prior, narrow.columns = self.prior[columns], self.columns[:, :, columns]
         narrow.by_block = self.by_block[:, columns][:, :, columns]
         narrow.score_by_block = self.score_by_block[:, columns]
         narrow.total, narrow.score = self.total[np.ix_(columns, columns)], self.score[columns]

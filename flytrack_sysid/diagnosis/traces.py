@@ -30,6 +30,7 @@ from flytrack_sysid.diagnosis.result import PLACES
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.parameters import STICKS
 from flytrack_sysid.record import Record
+from flytrack_sysid.trace_cache import fast_jit
 
 UNITS = {"rates": "rad/s", "attitude": "rad/s", "force": "m/s²", "velocity": "m/s²", "battery": "V"}
 _PER_STEP = ("attitude", "velocity", "battery")  # changes since the row before
@@ -119,7 +120,7 @@ REGRESSORS: dict[str, tuple[str, str]] = {
 }
 
 
-@jax.jit
+@fast_jit
 def _lagged(record: Record, tau: np.ndarray) -> Action:
     """Return the applied action at the rows of chunks: commands after lags, (rows, chunks) each."""
 
