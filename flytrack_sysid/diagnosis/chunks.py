@@ -192,13 +192,19 @@ def measured_voltage_range(chunks: Chunks) -> tuple[float, float] | None:
     return (float(measured.min()), float(measured.max())) if len(measured) else None
 
 
-def thinned(chunks: Chunks, max_chunks: int | None = None) -> Chunks:
-    """Return at most ``max_chunks`` chunks, evenly spread over a log; MAX_ROWS rows by default."""
+def spread_chunks(chunks: Chunks, max_chunks: int | None = None) -> np.ndarray:
+    """Return indices of at most ``max_chunks`` chunks, evenly spread; of MAX_ROWS by default."""
     rows, num_chunks = chunks.row.shape
     max_chunks = (
         max_chunks
         or max(MAX_ROWS // (rows - count_lead_in(rows)) // CHUNKS_PADDED_TO, 1) * CHUNKS_PADDED_TO
     )
     if num_chunks <= max_chunks:
-        return chunks
-    return chunks.selected(np.linspace(0, num_chunks - 1, max_chunks).round().astype(int))
+        return np.arange(num_chunks)
+    return np.linspace(0, num_chunks - 1, max_chunks).round().astype(int)
+
+
+def thinned(chunks: Chunks) -> Chunks:
+    """Return chunks of at most MAX_ROWS rows, evenly spread over a log."""
+    indices = spread_chunks(chunks)
+    return chunks if len(indices) == chunks.row.shape[1] else chunks.selected(indices)

@@ -337,8 +337,9 @@ def name_causes(vetted: VettedModel, parts: Split) -> NamedModel:
     model = selection.model
     # Intervals need the slopes of the model itself: with those of a nearby model, intervals of
     # ground_effect were a third too short.
-    state, linearization = selection.state.linearized(model.vector, max_distance=0.0)
-    selection = selection._replace(state=state)
+    state, linearization = selection.state.linearized(model.vector)
+    linearization = linearization.refreshed(model.indices)
+    selection = selection._replace(state=replace(state, linearization=linearization))
     effects = summary.effect_causes(selection, test, linearization)
     in_base, lost_in_base = summary.base_causes(selection, test, linearization, effects)
     contradicted = [

@@ -9,7 +9,6 @@ import numpy as np
 
 from flytrack_env.effects.grammar import Law
 from flytrack_sysid.diagnosis.beyond import Learned
-from flytrack_sysid.diagnosis.chunks import thinned
 from flytrack_sysid.diagnosis.law_search import MIN_EXPECTED_GAIN, FittedLaw, Side, find_law
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import (
@@ -51,7 +50,9 @@ def find_learned(
         base: vector of the refitted model without effects, (num_parameters,).
         flight_test: free flights on held-out rows; None without any.
     """
-    problem, test = thinned_problem(problem), thinned_problem(test)
+    # The search tries hundreds of terms.
+    max_chunks = max(MAX_ROWS // len(problem.chunks.row), 2)
+    problem, test = problem.thinned(max_chunks), test.thinned(max_chunks)
     waves = build_waves(problem, model, find_lines(problem, model))
     dependences = find_dependences(problem, model, base, waves)
     learned: Learned | None = None
@@ -82,17 +83,6 @@ def _with_side(learned: Learned | None, name: str, law: FittedLaw) -> Learned:
         {**learned.held_out_gains, name: law.held_out_gain},
         {**learned.rivals, name: law.rivals},
     )
-
-
-def thinned_problem(problem: Problem) -> Problem:
-    """Return a problem of fewer chunks, evenly spread, if a log is long.
-
-    The search tries hundreds of terms.
-    """
-    chunks = thinned(problem.chunks, max(MAX_ROWS // len(problem.chunks.row), 2))
-    if chunks is problem.chunks or problem.late is not None:
-        return problem
-    return problem.with_chunks(chunks)
 
 
 def _predicts(

@@ -32,7 +32,14 @@ from flytrack_env.effects import BY_NAME, EFFECTS, LEARNED_LAW, Effect, LearnedL
 from flytrack_env.fusion import one_kernel
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.chunks import AXES, CHUNK_S, NUM_AXES, Chunks, count_lead_in
+from flytrack_sysid.diagnosis.chunks import (
+    AXES,
+    CHUNK_S,
+    NUM_AXES,
+    Chunks,
+    count_lead_in,
+    spread_chunks,
+)
 from flytrack_sysid.diagnosis.lateness import Late
 from flytrack_sysid.parameters import TAUS, from_vector, names_of, range_of, to_vector
 from flytrack_sysid.record import Record
@@ -361,6 +368,16 @@ class Problem:
         whitener = noises.Whitener(chunks, self.noise)
         return replace(self, chunks=chunks, batches=Batches(chunks), whitener=whitener)
 
+    def thinned(self, max_chunks: int) -> "Problem":
+        """Return the same problem of at most so many of its chunks, evenly spread."""
+        indices = spread_chunks(self.chunks, max_chunks)
+        if len(indices) == self.chunks.row.shape[1]:
+            return self
+        thinned = self.with_chunks(self.chunks.selected(indices))
+        if self.late is None:
+            return thinned
+        return replace(thinned, late=Late(*(leaf[:, indices] for leaf in self.late)))
+
     def with_law(self, law: LearnedLaw) -> "Problem":
         """Return the problem whose vectors end with the parameters of a law.
 
@@ -413,17 +430,20 @@ class Problem:
         num_pairs = len(vectors) * num_chunks
         leaves, structure = jax.tree.flatten(self.like)
         no_state = _no_state(structure, tuple(map(np.shape, leaves)))
-        pairs = np.zeros((num_rows, 2 * NUM_AXES, num_pairs))
+        # In memory models are last, as blocks of innovations need them.
+        result = np.zeros((num_chunks, num_rows, 2 * NUM_AXES, len(vectors)))
         for first in range(0, num_pairs, NUM_PAIRS):
-            pair = np.minimum(first + np.arange(NUM_PAIRS), num_pairs - 1)
-            of_pairs, state = vectors[pair // num_chunks].T, no_state
+            model, chunk = np.divmod(first + np.arange(NUM_PAIRS), num_chunks)
+            of_pairs, is_one = vectors[np.minimum(model, len(vectors) - 1)].T, model < len(vectors)
+            model, chunk, state = model[is_one], chunk[is_one], no_state
             for number, rows in enumerate(self.batches.at(first)):
                 state, residuals = _replay_rows(of_pairs, self.like, state, rows)
                 # The residuals of a step are those of the row after it.
-                part = pairs[1 + number * NUM_ROWS :][:NUM_ROWS, :, first : first + NUM_PAIRS]
-                part[...] = np.asarray(residuals)[: len(part), :, : part.shape[2]]
-        result = pairs.reshape(num_rows, NUM_AXES, 2, len(vectors), num_chunks)
-        result = result.transpose(3, 0, 4, 1, 2)
+                after = slice(1 + number * NUM_ROWS, 1 + (number + 1) * NUM_ROWS)
+                of_rows = np.asarray(residuals)[: len(range(num_rows)[after]), :, is_one]
+                result[chunk, after, :, model] = of_rows.transpose(2, 0, 1)
+        result = result.reshape(num_chunks, num_rows, NUM_AXES, 2, len(vectors))
+        result = result.transpose(4, 1, 0, 2, 3)
         result[:, ~self.chunks.is_joined] = 0.0
         for name, axes in zip(("w", "f"), AXES, strict=False):
             if name not in self.chunks.measured:

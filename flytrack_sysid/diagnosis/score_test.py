@@ -240,6 +240,16 @@ class Linearization:
         )
         return shifted
 
+    def refreshed(self, indices: Sequence[int]) -> "Linearization":
+        """Return the linearization with the slopes of this very model along some indices."""
+        if np.array_equal(self.vector, self.slopes.vector):
+            return self
+        fresh = self.problem.slopes(self.vector, indices)
+        columns = np.copy(self.slopes.columns)
+        columns[[self.indices.index(index) for index in indices]] = fresh.columns
+        slopes = Slopes(self.vector, fresh.residuals, self.slopes.indices, columns)
+        return Linearization(self.problem, slopes, self.probes)
+
     def distance(self, vector: np.ndarray) -> float:
         """Return the distance of a model from that of the slopes, as a first-order chi2."""
         change = vector - self.slopes.vector

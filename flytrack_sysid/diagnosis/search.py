@@ -162,19 +162,14 @@ class SearchState:
         """
         return replace(self, problem=self.problem.with_noise(noise))
 
-    def linearized(
-        self, vector: np.ndarray, max_distance: float = STALE
-    ) -> tuple["SearchState", Linearization]:
-        """Return the state with a linearization along everything, and the linearization.
+    def linearized(self, vector: np.ndarray) -> tuple["SearchState", Linearization]:
+        """Return the state with a linearization of a model along everything, and this.
 
-        Args:
-            vector: the model.
-            max_distance: the distance (chi2) within which the slopes of the last linearization are
-                used again.
+        The slopes of a model closer than ``STALE`` are used again.
         """
         problem, last = self.problem, self.linearization
         is_same = last is not None and last.indices == self.all_indices
-        if last is not None and is_same and last.distance(vector) <= max_distance:
+        if last is not None and is_same and last.distance(vector) <= STALE:
             if last.noise is not problem.noise:
                 last = Linearization(problem, last.slopes, last.probes)
             linearization = last.moved(vector)
