@@ -15,7 +15,6 @@ without wander, a level counts from the first row to the last; with much wander,
 count.
 """
 
-from collections.abc import Iterator, Mapping
 from functools import cached_property, partial
 from itertools import product
 from typing import Any, NamedTuple
@@ -43,9 +42,9 @@ MAX_ROUNDS = 12
 ENOUGH = 1.0  # of minus twice the log likelihood: the error of one parameter
 OUTLIER = 4.0  # innovations beyond this count by their size, not by its square
 DIFFERENCE = 1e-4  # of logarithms, for slopes
-# Sizes of the compiled programs: rows of chunks at a time, and models: one, or many.
-NUM_ROWS, NUM_CHUNKS, NUM_MODELS = 200, 16, 16
-MIN_FILLED = 8  # models of a batch: fewer are faster one by one
+# Sizes of the compiled programs: rows at a time, chunks at a time, and for many models, chunks and
+# models at a time; fewer models are filtered one by one.
+NUM_ROWS, NUM_CHUNKS, MANY_MODELS, MIN_MANY = 200, 16, (2, 32), 8
 
 
 class Noise(NamedTuple):
@@ -235,10 +234,10 @@ class Filter(NamedTuple):
     """The filters of chunks, each of a noise: linear maps for residuals and their slopes.
 
     Attributes:
-        gains: of some axes, by the first chunk and the first row of each part.
+        gains: of some axes; rows and chunks are padded to whole parts.
     """
 
-    gains: Mapping[int, Mapping[int, Gains]]
+    gains: Gains
 
     @classmethod
     def of(cls, conditions: Conditions, log_noise: np.ndarray) -> "Filter":
@@ -249,28 +248,26 @@ class Filter(NamedTuple):
             log_noise: the noise of each chunk, (6, NUM_AXES, chunks).
         """
         num_rows, _, num_chunks, _ = conditions.step_s.shape
-        gains: dict[int, dict[int, Gains]] = {}
+        size = num_rows + -num_rows % NUM_ROWS, NUM_AXES, num_chunks + -num_chunks % NUM_CHUNKS, 1
+        gains = Gains(*(np.empty(size) for _ in Gains._fields))
         for chunk in range(0, num_chunks, NUM_CHUNKS):
             noise = _cut(log_noise[..., None], (6, NUM_AXES, NUM_CHUNKS, 1), chunk=chunk)
-            state = Covariance(*[jnp.zeros((NUM_AXES, NUM_CHUNKS, 1))] * 3)
-            gains[chunk] = {}
+            state = Covariance(*[np.zeros((NUM_AXES, NUM_CHUNKS, 1))] * 3)
             for row in range(0, num_rows, NUM_ROWS):
-                part = Conditions(
+                rows = Conditions(
                     *(
                         _cut(leaf, (NUM_ROWS, *leaf.shape[1:-2], NUM_CHUNKS, 1), row, chunk)
                         for leaf in conditions
                     )
                 )
-                state, gains[chunk][row] = _gains_of_rows(noise, state, part)
+                state, of_rows = _gains_of_rows(noise, state, rows)
+                for gain, part in zip(gains, of_rows, strict=True):
+                    gain[row : row + NUM_ROWS, :, chunk : chunk + NUM_CHUNKS] = part
         return cls(gains)
 
     def of_axes(self, axes: slice) -> "Filter":
         """Return the filter of some axes, of ``NUM_AXES``."""
-        gains = {
-            chunk: {row: Gains(*(gain[:, axes] for gain in part)) for row, part in parts.items()}
-            for chunk, parts in self.gains.items()
-        }
-        return Filter(gains)
+        return Filter(Gains(*(gain[:, axes] for gain in self.gains)))
 
     def whiten(self, residuals: np.ndarray, white: np.ndarray) -> None:
         """Fill an array with the innovations of residuals, of variance 1; 0 where nothing counts.
@@ -279,46 +276,28 @@ class Filter(NamedTuple):
             residuals: (rows, axes, 2, chunks, models).
             white: of the same shape.
         """
-        batches = list(_batches_of_models(residuals.shape[-1]))
-        for (chunk, parts), (model, size) in product(self.gains.items(), batches):
-            shape = NUM_ROWS, *residuals.shape[1:3], NUM_CHUNKS, size
-            state = Filtered(*[np.zeros((shape[1], NUM_CHUNKS, size))] * 3)
-            for row, gains in parts.items():
+        num_rows, num_axes, _, num_chunks, num_models = residuals.shape
+        is_many = num_models >= MIN_MANY
+        chunks_at_once, models_at_once = MANY_MODELS if is_many else (NUM_CHUNKS, 1)
+        shape = NUM_ROWS, num_axes, 2, chunks_at_once, models_at_once
+        starts = range(0, num_chunks, chunks_at_once), range(0, num_models, models_at_once)
+        for chunk, model in product(*starts):
+            state = Filtered(*[np.zeros((num_axes, *shape[3:]))] * 3)
+            for row in range(0, num_rows, NUM_ROWS):
+                part = slice(row, row + NUM_ROWS), slice(None), slice(chunk, chunk + shape[3])
+                gains = Gains(*(gain[part] for gain in self.gains))
                 state, result = _whiten_rows(
                     state, gains, _cut(residuals, shape, row, chunk, model)
                 )
-                part = white[row:, ..., chunk:, model : model + size][:NUM_ROWS, :, :, :NUM_CHUNKS]
-                part[...] = np.asarray(result)[tuple(map(slice, part.shape))]
-
-    def scale(self, num_rows: int, num_chunks: int) -> np.ndarray:
-        """Return one over the standard deviation of innovations, (rows, NUM_AXES, 2, chunks).
-
-        It is 0 where a residual does not count.
-        """
-        by_chunk = [
-            np.concatenate(
-                [np.stack([part.direct_scale, part.level_scale], axis=2) for part in parts.values()]
-            )
-            for parts in self.gains.values()
-        ]
-        return np.concatenate(by_chunk, axis=3)[:num_rows, ..., :num_chunks, 0]
-
-
-def _batches_of_models(num_models: int) -> Iterator[tuple[int, int]]:
-    """Yield the first model and the size of each batch."""
-    num_batches, rest = divmod(num_models, NUM_MODELS)
-    num_batches += rest >= MIN_FILLED
-    first_single = num_batches * NUM_MODELS
-    yield from ((model, NUM_MODELS) for model in range(0, first_single, NUM_MODELS))
-    yield from ((model, 1) for model in range(first_single, num_models))
+                target = white[row:, :, :, chunk:, model:][tuple(map(slice, shape))]
+                target[...] = np.asarray(result)[tuple(map(slice, target.shape))]
 
 
 def _cut(
     values: np.ndarray, shape: tuple[int, ...], row: int = 0, chunk: int = 0, model: int = 0
 ) -> np.ndarray:
     """Return a part of values (..., chunks, models) from an index on, padded with 0 to a shape."""
-    part = values[row:, ..., chunk:, model:]
-    part = part[tuple(map(slice, shape))]
+    part = values[row:, ..., chunk:, model:][tuple(map(slice, shape))]
     padded = np.zeros(shape)
     padded[tuple(map(slice, part.shape))] = part
     return padded
@@ -399,7 +378,8 @@ class Likelihood:
         by_chunk = np.repeat(log_noise[:, :, None] + shifts[:, None], num_chunks, axis=2)
         white_filter, white = Filter.of(self._conditions, by_chunk), np.empty_like(self._residuals)
         white_filter.whiten(self._residuals, white)
-        scale = white_filter.scale(len(white), white.shape[3])
+        scale = np.stack([white_filter.gains.direct_scale, white_filter.gains.level_scale], axis=2)
+        scale = scale[: len(white), ..., : white.shape[3], 0]
         white, scale = (
             np.moveaxis(values.reshape(*values.shape[:3], 7, num_chunks), 3, 0)
             for values in (white[..., 0], np.where(scale > 0.0, scale, 1.0))

@@ -428,16 +428,18 @@ class Problem:
     def _replayed(self, vectors: np.ndarray) -> np.ndarray:
         num_rows, num_chunks = self.chunks.row.shape
         num_pairs = len(vectors) * num_chunks
-        leaves, structure = jax.tree.flatten(self.like)
+        like = jax.tree.map(jnp.asarray, self.like)  # once, not in every call
+        leaves, structure = jax.tree.flatten(like)
         no_state = _no_state(structure, tuple(map(np.shape, leaves)))
         # In memory models are last, as blocks of innovations need them.
         result = np.zeros((num_chunks, num_rows, 2 * NUM_AXES, len(vectors)))
         for first in range(0, num_pairs, NUM_PAIRS):
             model, chunk = np.divmod(first + np.arange(NUM_PAIRS), num_chunks)
-            of_pairs, is_one = vectors[np.minimum(model, len(vectors) - 1)].T, model < len(vectors)
+            of_pairs = jnp.asarray(vectors[np.minimum(model, len(vectors) - 1)].T)
+            is_one = model < len(vectors)
             model, chunk, state = model[is_one], chunk[is_one], no_state
             for number, rows in enumerate(self.batches.at(first)):
-                state, residuals = _replay_rows(of_pairs, self.like, state, rows)
+                state, residuals = _replay_rows(of_pairs, like, state, rows)
                 # The residuals of a step are those of the row after it.
                 after = slice(1 + number * NUM_ROWS, 1 + (number + 1) * NUM_ROWS)
                 of_rows = np.asarray(residuals)[: len(range(num_rows)[after]), :, is_one]
@@ -521,7 +523,8 @@ class Problem:
         moved, step = self.nudged(vector, indices)
         others = np.zeros((0, len(vector))) if others is None else others
         residuals = self.residuals(np.concatenate([vector[None], moved, others]))
-        columns = residuals[1:] - residuals[0]
+        columns = residuals[1:]
+        columns -= residuals[0]
         columns[: len(step)] /= step[:, None, None, None, None]
         return Slopes(vector, residuals[0], tuple(indices), columns)
 

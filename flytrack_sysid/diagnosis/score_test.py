@@ -213,8 +213,10 @@ class Linearization:
         )
         self.columns = by_second(problem.whiten(slopes.columns))
         white = problem.whiten(slopes.residuals[None])[0]
-        weighted = self.columns * np.sqrt(robust_weight(by_second(white)))[:, :, None]
-        self.by_block = in_line(weighted @ np.swapaxes(weighted, 2, 3))
+        root = np.sqrt(robust_weight(by_second(white)))[:, :, None]
+        # Second by second: a copy of all columns is the most memory that a diagnosis takes.
+        weighted = (columns * by_row for columns, by_row in zip(self.columns, root, strict=True))
+        self.by_block = np.concatenate([part @ np.swapaxes(part, 1, 2) for part in weighted])
         self.total = self.by_block.sum(axis=0) + np.diag(self.prior)
         self._move(slopes.vector, white)
 
