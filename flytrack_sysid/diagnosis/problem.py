@@ -19,7 +19,7 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import Any, NamedTuple, Self
 
 import jax
@@ -425,32 +425,44 @@ class Problem:
         result = self._composed(vectors) if self.windows else self._replayed(vectors)
         return result if self.late is None else self.late.residuals(result)
 
+    @cached_property
+    def _like(self) -> ModelParameters:
+        """``like`` as JAX's arrays: a program takes longer to convert NumPy's than to run."""
+        return jax.tree.map(jnp.asarray, self.like)
+
     def _replayed(self, vectors: np.ndarray) -> np.ndarray:
         num_rows, num_chunks = self.chunks.row.shape
-        num_pairs = len(vectors) * num_chunks
-        like = jax.tree.map(jnp.asarray, self.like)  # once, not in every call
-        leaves, structure = jax.tree.flatten(like)
-        no_state = _no_state(structure, tuple(map(np.shape, leaves)))
         # In memory models are last, as blocks of innovations need them.
-        result = np.zeros((num_chunks, num_rows, 2 * NUM_AXES, len(vectors)))
-        for first in range(0, num_pairs, NUM_PAIRS):
-            model, chunk = np.divmod(first + np.arange(NUM_PAIRS), num_chunks)
-            of_pairs = jnp.asarray(vectors[np.minimum(model, len(vectors) - 1)].T)
-            is_one = model < len(vectors)
-            model, chunk, state = model[is_one], chunk[is_one], no_state
-            for number, rows in enumerate(self.batches.at(first)):
-                state, residuals = _replay_rows(of_pairs, like, state, rows)
-                # The residuals of a step are those of the row after it.
-                after = slice(1 + number * NUM_ROWS, 1 + (number + 1) * NUM_ROWS)
-                of_rows = np.asarray(residuals)[: len(range(num_rows)[after]), :, is_one]
-                result[chunk, after, :, model] = of_rows.transpose(2, 0, 1)
-        result = result.reshape(num_chunks, num_rows, NUM_AXES, 2, len(vectors))
+        by_chunk = np.empty((num_chunks, num_rows, 2 * NUM_AXES, len(vectors)))
+        for first in range(0, len(vectors), NUM_PAIRS):
+            models = slice(first, first + NUM_PAIRS)
+            residuals = self._replayed_pairs(vectors[models])
+            for row in range(num_rows):  # one by one, so that they stay in the processor's cache
+                by_chunk[:, row, :, models] = residuals[row].transpose(2, 0, 1)
+        result = by_chunk.reshape(num_chunks, num_rows, NUM_AXES, 2, len(vectors))
         result = result.transpose(4, 1, 0, 2, 3)
         result[:, ~self.chunks.is_joined] = 0.0
         for name, axes in zip(("w", "f"), AXES, strict=False):
             if name not in self.chunks.measured:
                 result[..., axes, 0] = 0.0
         return result
+
+    def _replayed_pairs(self, vectors: np.ndarray) -> np.ndarray:
+        """Return residuals as they are replayed, (rows, 2 * NUM_AXES, models, chunks)."""
+        num_rows, num_chunks = self.chunks.row.shape
+        num_pairs = len(vectors) * num_chunks
+        leaves, structure = jax.tree.flatten(self._like)
+        no_state = _no_state(structure, tuple(map(np.shape, leaves)))
+        pairs = np.zeros((num_rows, 2 * NUM_AXES, num_pairs))
+        for first in range(0, num_pairs, NUM_PAIRS):
+            pair, state = np.minimum(first + np.arange(NUM_PAIRS), num_pairs - 1), no_state
+            of_pairs = jnp.asarray(vectors[pair // num_chunks].T)
+            for number, rows in enumerate(self.batches.at(first)):
+                state, residuals = _replay_rows(of_pairs, self._like, state, rows)
+                # The residuals of a step are those of the row after it.
+                part = pairs[1 + number * NUM_ROWS :, :, first:][:NUM_ROWS, :, :NUM_PAIRS]
+                part[...] = np.asarray(residuals)[: len(part), :, : part.shape[2]]
+        return pairs.reshape(num_rows, 2 * NUM_AXES, len(vectors), num_chunks)
 
     def _composed(self, vectors: np.ndarray) -> np.ndarray:
         """Return residuals of models with windows of effects; each row is of one replay."""
