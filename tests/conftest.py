@@ -11,14 +11,12 @@ MEMORY_MAPS, MOST_MEMORY_MAPS = Path("/proc/self/maps"), 25_000
 
 
 def pytest_configure(config):
-    """Have programs compiled without LLVM's optimisation where slow tests are left out.
+    """Have programs compiled by LLVM's first level, which takes less time for the same bits.
 
-    Fast tests run most programs once: compiling them takes longer than running them. The slow tests
-    and those of a single file (``-m ""``) run optimised programs. XLA reads its flags once, so that
-    this file imports nothing that computes before this function is called.
+    XLA reads its flags once, so that this file imports nothing that computes before this function
+    is called.
     """
-    if config.getoption("markexpr") == "not slow":
-        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+    os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1")
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -31,9 +31,9 @@ from flytrack_sysid.diagnosis.model_selection import EQUIVALENT, Marginal, ablat
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import DRIFT, Cause, Diagnosis, Estimated, Unexplained
 from flytrack_sysid.diagnosis.score_test import (
-    BASE_CAUSES,
     Candidate,
     Linearization,
+    base_fields,
     candidates_for,
     solve,
     threshold,
@@ -63,13 +63,21 @@ class Change(NamedTuple):
 
     Attributes:
         size: of each change.
-        half: half of the 95 % interval of each change.
-        chi2: of all changes.
+        marginals: the information of each log about the parameters.
     """
 
     size: np.ndarray
-    half: np.ndarray
-    chi2: float
+    marginals: tuple[Marginal, Marginal]
+
+    @property
+    def chi2(self) -> float:
+        """Of all changes."""
+        covariance = np.sum([one.covariance() for one in self.marginals], axis=0)
+        return float(self.size @ solve(covariance, self.size))
+
+    def half_widths(self, weights: np.ndarray | None = None) -> np.ndarray:
+        """Return half of the 95 % interval of each change, or of weighted sums of changes."""
+        return np.hypot(*(one.half_widths(weights) for one in self.marginals))
 
 
 class Estimate(NamedTuple):
@@ -363,10 +371,10 @@ def change_between(later: Estimate, earlier: Estimate, fields: Sequence[str]) ->
     """Return the change of parameters between both models."""
     indices = later.state.problem.parameter_indices(fields)
     size = later.model.vector[indices] - earlier.model.vector[indices]
-    margins = [Marginal(one.linearization, one.model, fields) for one in (later, earlier)]
-    half = np.hypot(*(one.half_widths() for one in margins))
-    covariance = margins[0].covariance() + margins[1].covariance()
-    return Change(size, half, float(size @ solve(covariance, size)))
+    of_later, of_earlier = (
+        Marginal(one.linearization, one.model, fields) for one in (later, earlier)
+    )
+    return Change(size, (of_later, of_earlier))
 
 
 def changed_cause(cause: Cause, later: Estimate, earlier: Estimate) -> list[Cause]:
@@ -377,7 +385,7 @@ def changed_cause(cause: Cause, later: Estimate, earlier: Estimate) -> list[Caus
     candidates = [
         candidate for candidate in later.model.candidates if candidate.effect == cause.effect
     ]
-    base = THRUST_COEFFS if cause.effect == "thrust_scale" else BASE_CAUSES.get(cause.effect, ())
+    base = base_fields(cause.effect)
     values: dict[str, Estimated] = {}
     for fields in candidates[0].groups if candidates else [base]:
         values |= changed_values(cause, fields, later, earlier)
@@ -394,16 +402,15 @@ def changed_values(
     vector[indices] += change.size
     factor: dict[str, Estimated] = {}  # by which the mean thrust changed
     if tuple(fields) == THRUST_COEFFS:
-        weights = mean_thrust(problem)[None]
-        margins = [Marginal(one.linearization, one.model, fields) for one in (later, earlier)]
-        half_n = float(np.hypot(*(one.half_widths(weights)[0] for one in margins)))
+        half_n = float(change.half_widths(mean_thrust(problem)[None])[0])
         factor = mean_factor(problem, vector, half_n)
-    is_clear = np.any(np.abs(change.size) > change.half) and change.chi2 > threshold(len(fields))
+    halves = change.half_widths()
+    is_clear = np.any(np.abs(change.size) > halves) and change.chi2 > threshold(len(fields))
     is_clear |= any(not one.ci95[0] <= 1.0 <= one.ci95[1] for one in factor.values())
     if not is_clear or not is_notable(name, problem, vector):
         return {}
     values = {}
-    for field, index, half in zip(fields, indices, change.half, strict=True):
+    for field, index, half in zip(fields, indices, halves, strict=True):
         key, value = field.split(".")[-1], float(vector[index])
         if key in cause.parameters:
             values[key] = Estimated.around(value, float(half), cause.parameters[key].unit)

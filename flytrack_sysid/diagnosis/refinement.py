@@ -29,8 +29,8 @@ from flytrack_sysid.diagnosis.model_selection import ablate_all
 from flytrack_sysid.diagnosis.onset import ended
 from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.score_test import (
-    BASE_CAUSES,
     Candidate,
+    base_fields,
     prior_information,
     solve,
     step_inside,
@@ -434,12 +434,8 @@ class Refined(NamedTuple):
         assert self.fit is not None
         if effect in self.without:
             return self.without[effect]
-        sensor_fields = [
-            name for name in self.problem.names if name.startswith(f"{effect}.")
-        ]  # of a sensor
-        cause = "thrust_curve" if effect == "thrust_scale" else effect
-        fields = BASE_CAUSES.get(cause, sensor_fields)
-        return self.problem.at_start(self.fit.vector, fields)
+        of_sensor = [name for name in self.problem.names if name.startswith(f"{effect}.")]
+        return self.problem.at_start(self.fit.vector, base_fields(effect) or of_sensor)
 
     def flight_errors(self, vector: np.ndarray) -> dict[str, float]:
         """Return the held-out errors of free flight by horizon in seconds; empty without a test.

@@ -39,6 +39,14 @@ BASE_CAUSES = {
 }
 
 
+def base_fields(cause: str) -> tuple[str, ...]:
+    """Return the base parameters of a cause; none if it is an effect of its own.
+
+    Those of a scale of thrust, which is one factor between two curves, are the curve's.
+    """
+    return BASE_CAUSES.get("thrust_curve" if cause == "thrust_scale" else cause, ())
+
+
 class Probe(NamedTuple):
     """A value of a parameter at which the search looks for an effect.
 

@@ -37,7 +37,13 @@ from flytrack_sysid.diagnosis.result import (
     Prediction,
     Unexplained,
 )
-from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, Linearization, solve, threshold
+from flytrack_sysid.diagnosis.score_test import (
+    BASE_CAUSES,
+    Linearization,
+    base_fields,
+    solve,
+    threshold,
+)
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.diagnosis.unexplained import is_like_drift
 from flytrack_sysid.parameters import (
@@ -254,8 +260,7 @@ def vector_without(
     """Return the extended model without one of its causes, all other parameters refitted."""
     if cause.effect in selection.ablations:
         return selection.ablations[cause.effect].without.vector
-    name = "thrust_curve" if cause.effect == "thrust_scale" else cause.effect
-    return _refitted_to_first_order(linearization, selection.model, BASE_CAUSES[name])
+    return _refitted_to_first_order(linearization, selection.model, base_fields(cause.effect))
 
 
 def _refitted_to_first_order(
