@@ -29,19 +29,21 @@ UNKEPT = "LearnedLaw"  # an effect whose structure the text of a tree does not d
 
 
 def keep_trace(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return ``jax.jit`` of a function of trees of arrays, with traces stored on the disk.
+    """Return ``fast_jit`` of a function of trees of arrays, with traces stored on the disk.
 
     Traces are stored only where compiled programs are stored, too (``flytrack_env.compile_cache``),
     and only for calls that are not traced themselves.
     """
-    program = jax.jit(function)
+    program = fast_jit(function)
     programs: dict[Any, Callable[..., Any]] = {}
 
     @functools.wraps(function)
     def call(*args: Any) -> Any:
         leaves, structure = jax.tree.flatten(args)
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            return function(*args)
         folder = getattr(jax.config, FOLDER)
-        if folder is None or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        if folder is None:
             return program(*args)
         kinds = tuple(map(_kind, leaves))
         key = structure, kinds, jax.config.read("jax_enable_x64")
