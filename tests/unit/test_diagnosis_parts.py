@@ -23,6 +23,7 @@ from flytrack_sysid.diagnosis.chunks import (
     at_usual_rate,
     cut_chunks,
     make_chunks,
+    spread_chunks,
     thinned,
 )
 from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
@@ -178,6 +179,23 @@ def test_chunks_agree_with_one_long_replay(flown, chunks):
         # full stick.
         error = (left[..., axes, channel] - one[chunks.row]) / (DIRECT, LEVEL)[channel][axes]
         assert counts[LEAD_IN_S * RATE].any() and np.abs(error[counts]).max() < 1e-3
+
+
+def test_many_models_on_few_chunks_are_as_each_alone_on_all(state):
+    with jax.enable_x64(True):
+        problem, few = state.problem, state.problem.thinned(3)
+        vectors = np.repeat(problem.start[None], 39, axis=0)
+        vectors[:, 0] *= np.linspace(0.5, 2.0, len(vectors))
+        many = few.residuals(vectors)
+        white, on_side = few.whiten(many), few.whiten(many[..., 3:6, :], slice(3, 6))
+        kept = spread_chunks(problem.chunks, 3)
+        assert 1 < len(kept) < problem.chunks.row.shape[1]
+        for index in (0, 31, 38):
+            alone = problem.residuals(vectors[index][None])
+            np.testing.assert_array_equal(many[index], alone[0][:, kept])
+            alone = problem.whiten(alone)[0][:, kept]
+            np.testing.assert_allclose(white[index], alone, atol=1e-9)
+            np.testing.assert_allclose(on_side[index], alone[..., 3:6, :], atol=1e-9)
 
 
 def evaluate(log, model):
