@@ -15,7 +15,7 @@ from flytrack_env.state import ACTION_SIZE
 from flytrack_sysid.log import GAP_STEPS, FlightLog, time_in_line, usual_step
 from flytrack_sysid.log_voltage import assumed_voltage
 from flytrack_sysid.resample import interpolate, interpolate_quaternions
-from flytrack_sysid.split import blocks_of, cut_evenly
+from flytrack_sysid.split import block_numbers, cut_evenly
 
 MAX_FILLED_S = 0.1  # after a longer gap a new flight begins
 # Without a voltage, thrust has another relative error in each flight, and so the velocity drifts.
@@ -188,7 +188,7 @@ def make_record(log: FlightLog) -> Record:
     filled = fill_gaps(log)
     record = build_record(filled)
     longest_s = WINDOW_S if "v_bat" in log else WINDOW_WITHOUT_VOLTAGE_S
-    is_first = record.begins | np.append(True, np.diff(blocks_of(log)[filled.behind]) != 0)
+    is_first = record.begins | np.append(True, np.diff(block_numbers(log)[filled.behind]) != 0)
     return _padded(record._replace(piece=cut_evenly(filled.log.time, is_first, longest_s)))
 
 

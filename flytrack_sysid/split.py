@@ -9,7 +9,7 @@ MAX_BLOCK_S = 5.0
 MIN_BLOCKS = 8
 
 
-def blocks_of(log: FlightLog) -> np.ndarray:
+def block_numbers(log: FlightLog) -> np.ndarray:
     """Return the number of each row's block, (num_rows,) int from 0.
 
     A block is a segment, or a piece of a long one. Segments are cut evenly into pieces of at most 5
@@ -51,4 +51,4 @@ def held_out_rows(log: FlightLog, every: int = HELD_OUT_EVERY) -> np.ndarray:
         raise ValueError(f"every: found {every}, expected 0, 2, 3, ...")
     if every == 0:
         return np.zeros(len(log), bool)
-    return blocks_of(log) % every == every - 1
+    return block_numbers(log) % every == every - 1

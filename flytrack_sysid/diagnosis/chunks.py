@@ -193,7 +193,12 @@ def measured_voltage_range(chunks: Chunks) -> tuple[float, float] | None:
 
 
 def spread_chunks(chunks: Chunks, max_chunks: int | None = None) -> np.ndarray:
-    """Return indices of at most ``max_chunks`` chunks, evenly spread; of MAX_ROWS by default."""
+    """Return the indices of evenly spread chunks.
+
+    Args:
+        chunks: of a log.
+        max_chunks: the most; if None, as many as have MAX_ROWS rows.
+    """
     rows, num_chunks = chunks.row.shape
     max_chunks = (
         max_chunks

@@ -21,7 +21,7 @@ from flytrack_env.effects.grammar import QUANTITIES, SHAPES, XYZ, Factor, Moment
 from flytrack_env.quaternion import Vec3
 from flytrack_env.state import Action
 from flytrack_sysid.diagnosis.chunks import CHUNK_S
-from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_square
+from flytrack_sysid.diagnosis.problem import Problem, robust_square, split_blocks
 from flytrack_sysid.diagnosis.search import FittedModel
 from flytrack_sysid.diagnosis.unexplained import (
     BUMP_PLACES,
@@ -149,7 +149,7 @@ class Side(NamedTuple):
 
     def columns(self, term: Term) -> np.ndarray:
         """Return a term's unit coefficients, weighted, by blocks of a second."""
-        return blocks_of(self.white(term) * self.test.root)
+        return split_blocks(self.white(term) * self.test.root)
 
     def spread(self, quantity: str) -> np.ndarray:
         """Return the values of a quantity in the rows that are scored."""

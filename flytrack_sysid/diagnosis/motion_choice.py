@@ -32,10 +32,10 @@ from flytrack_sysid.diagnosis.lateness import read_poses, scored_as_logged
 from flytrack_sysid.diagnosis.motion_of_sensors import apparent_lateness, motion_of_sensors
 from flytrack_sysid.diagnosis.problem import (
     Problem,
-    blocks_of,
-    by_second,
-    in_line,
+    merge_seconds,
     robust_weight,
+    split_blocks,
+    split_seconds,
 )
 from flytrack_sysid.diagnosis.score_test import Linearization, solve
 from flytrack_sysid.diagnosis.search import refine
@@ -189,12 +189,12 @@ def _with_later_poses(log_part: LogPart, trial: Trial) -> MotionEstimate:
     )
     root = np.sqrt(robust_weight(linearization.white))
     column = problem.whiten(np.where(problem.counts & later.counts, change, 0.0))
-    late = blocks_of(column * root)[:, 0]
-    given = in_line(linearization.columns * by_second(root)[:, :, None])
+    late = split_blocks(column * root)[:, 0]
+    given = merge_seconds(linearization.columns * split_seconds(root)[:, :, None])
     across = np.einsum("bpn,bn->p", given, late)
     share = solve(linearization.total, across)
     information = float(np.sum(late**2) - across @ share)
-    score = -float(np.sum(late * blocks_of(linearization.white * root))) - float(
+    score = -float(np.sum(late * split_blocks(linearization.white * root))) - float(
         share @ linearization.score
     )
     step_s = np.clip(score / information, -MAX_STEP_S, MAX_STEP_S)

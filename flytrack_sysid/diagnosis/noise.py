@@ -42,6 +42,7 @@ MAX_ROUNDS = 12
 ENOUGH = 1.0  # of minus twice the log likelihood: the error of one parameter
 OUTLIER = 4.0  # innovations beyond this count by their size, not by its square
 DIFFERENCE = 1e-4  # of logarithms, for slopes
+NUM_COMPARED = 7  # noises: one, and one with each of its six parameters moved
 # Sizes of the compiled programs: rows at a time, chunks at a time, and for many models, chunks and
 # models at a time; fewer models are filtered one by one.
 NUM_ROWS, NUM_CHUNKS, MANY_MODELS, MIN_MANY = 200, 16, (2, 32), 8
@@ -265,7 +266,7 @@ class Filter(NamedTuple):
                     gain[row : row + NUM_ROWS, :, chunk : chunk + NUM_CHUNKS] = part
         return cls(gains)
 
-    def of_axes(self, axes: slice) -> "Filter":
+    def select_axes(self, axes: slice) -> "Filter":
         """Return the filter of some axes, of ``NUM_AXES``."""
         return Filter(Gains(*(gain[:, axes] for gain in self.gains)))
 
@@ -308,21 +309,12 @@ class Whitener:
 
     def __init__(self, chunks: Chunks, log_noise: np.ndarray):
         self._chunks, self._log_noise = chunks, log_noise
-        self._of_axes: dict[tuple[int, ...], Filter] = {}
 
     @cached_property
     def _filter(self) -> Filter:
         num_chunks = self._chunks.row.shape[1]
         by_chunk = np.repeat(self._log_noise[..., None], num_chunks, axis=2)
         return Filter.of(build_conditions(self._chunks), by_chunk)
-
-    def _filter_of(self, axes: slice) -> Filter:
-        key = axes.indices(NUM_AXES)
-        if key == (0, NUM_AXES, 1):
-            return self._filter
-        if key not in self._of_axes:
-            self._of_axes[key] = self._filter.of_axes(axes)
-        return self._of_axes[key]
 
     def __call__(self, residuals: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
         """Return residuals as innovations of variance 1; they are 0 where nothing counts.
@@ -335,7 +327,7 @@ class Whitener:
         """
         num_models, num_rows, num_chunks = residuals.shape[:3]
         white = np.empty((num_chunks, num_rows, *residuals.shape[3:], num_models))
-        self._filter_of(axes).whiten(
+        self._filter.select_axes(axes).whiten(
             residuals.transpose(1, 3, 4, 2, 0), white.transpose(1, 2, 3, 0, 4)
         )
         return white.transpose(4, 1, 0, 2, 3)
@@ -360,11 +352,13 @@ class Likelihood:
     """The likelihood of noises, given residuals of chunks (rows, chunks, NUM_AXES, 2)."""
 
     def __init__(self, chunks: Chunks, residuals: np.ndarray):
-        # A noise and six like it are compared on copies of the chunks.
+        # The compared noises act on copies of the chunks.
         conditions = build_conditions(chunks)
-        self._conditions = Conditions(*(np.concatenate([leaf] * 7, axis=-2) for leaf in conditions))
+        self._conditions = Conditions(
+            *(np.concatenate([leaf] * NUM_COMPARED, axis=-2) for leaf in conditions)
+        )
         of_chunks = residuals.transpose(0, 2, 3, 1)[..., None]
-        self._residuals = np.concatenate([of_chunks] * 7, axis=3)
+        self._residuals = np.concatenate([of_chunks] * NUM_COMPARED, axis=3)
 
     def misfit(self, log_noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return each axis's misfit of a noise, (NUM_AXES,), its slopes and expected curvature.
@@ -374,14 +368,14 @@ class Likelihood:
         curvature is (NUM_AXES, 6, 6).
         """
         shifts = DIFFERENCE * np.concatenate([np.zeros((1, 6)), np.eye(6)]).T
-        num_chunks = self._residuals.shape[3] // 7
+        num_chunks = self._residuals.shape[3] // NUM_COMPARED
         by_chunk = np.repeat(log_noise[:, :, None] + shifts[:, None], num_chunks, axis=2)
-        white_filter, white = Filter.of(self._conditions, by_chunk), np.empty_like(self._residuals)
-        white_filter.whiten(self._residuals, white)
-        scale = np.stack([white_filter.gains.direct_scale, white_filter.gains.level_scale], axis=2)
+        filters, white = Filter.of(self._conditions, by_chunk), np.empty_like(self._residuals)
+        filters.whiten(self._residuals, white)
+        scale = np.stack([filters.gains.direct_scale, filters.gains.level_scale], axis=2)
         scale = scale[: len(white), ..., : white.shape[3], 0]
         white, scale = (
-            np.moveaxis(values.reshape(*values.shape[:3], 7, num_chunks), 3, 0)
+            np.moveaxis(values.reshape(*values.shape[:3], NUM_COMPARED, num_chunks), 3, 0)
             for values in (white[..., 0], np.where(scale > 0.0, scale, 1.0))
         )
         size, logs = np.abs(white), -2.0 * np.log(scale)

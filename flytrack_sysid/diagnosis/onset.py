@@ -141,7 +141,7 @@ class Hypothesis(NamedTuple):
 def split_seconds(chunks: Chunks) -> tuple[np.ndarray, np.ndarray]:
     """Return the first row of each second, and the rows at which an effect may begin or end.
 
-    Seconds are in the order of ``problem.blocks_of``.
+    Seconds are in the order of ``problem.split_blocks``.
     """
     rows = chunks.row[count_lead_in(len(chunks.row)) :]
     start = rows[:: len(rows) // CHUNK_S].ravel()

@@ -369,7 +369,7 @@ class Problem:
         return replace(self, chunks=chunks, batches=Batches(chunks), whitener=whitener)
 
     def thinned(self, max_chunks: int) -> "Problem":
-        """Return the same problem of at most so many of its chunks, evenly spread."""
+        """Return the problem with at most ``max_chunks`` chunks, evenly spread over the log."""
         indices = spread_chunks(self.chunks, max_chunks)
         if len(indices) == self.chunks.row.shape[1]:
             return self
@@ -588,7 +588,7 @@ def robust_square(white: np.ndarray) -> float:
     return float(2.0 * special.huber(noises.OUTLIER, white).sum())
 
 
-def by_second(values: np.ndarray) -> np.ndarray:
+def split_seconds(values: np.ndarray) -> np.ndarray:
     """Reshape (..., rows, chunks, axes, 2) to seconds, (CHUNK_S, chunks, ..., numbers).
 
     The lead-in is left out. Innovations are not copied.
@@ -600,11 +600,11 @@ def by_second(values: np.ndarray) -> np.ndarray:
     return split.reshape(*split.shape[:-3], -1)
 
 
-def blocks_of(values: np.ndarray) -> np.ndarray:
+def split_blocks(values: np.ndarray) -> np.ndarray:
     """Reshape (..., rows, chunks, axes, 2) to blocks of a second, (blocks, ..., numbers)."""
-    return in_line(by_second(values))
+    return merge_seconds(split_seconds(values))
 
 
-def in_line(values: np.ndarray) -> np.ndarray:
+def merge_seconds(values: np.ndarray) -> np.ndarray:
     """Reshape (CHUNK_S, chunks, ...) to (blocks, ...)."""
     return values.reshape(-1, *values.shape[2:])

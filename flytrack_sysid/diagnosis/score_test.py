@@ -17,10 +17,10 @@ from flytrack_sysid.diagnosis.problem import (
     SEARCHED,
     Problem,
     Slopes,
-    by_second,
-    in_line,
+    merge_seconds,
     robust_square,
     robust_weight,
+    split_seconds,
 )
 from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS, neutral_value, range_of
 
@@ -219,9 +219,9 @@ class Linearization:
         self.prior = np.concatenate(
             [prior_information(problem)[self.indices], np.full(len(self.probes), PROBE_PRIOR)]
         )
-        self.columns = by_second(problem.whiten(slopes.columns))
+        self.columns = split_seconds(problem.whiten(slopes.columns))
         white = problem.whiten(slopes.residuals[None])[0]
-        root = np.sqrt(robust_weight(by_second(white)))[:, :, None]
+        root = np.sqrt(robust_weight(split_seconds(white)))[:, :, None]
         # Second by second: a copy of all columns is the most memory that a diagnosis takes.
         weighted = (columns * by_row for columns, by_row in zip(self.columns, root, strict=True))
         self.by_block = np.concatenate([part @ np.swapaxes(part, 1, 2) for part in weighted])
@@ -230,8 +230,8 @@ class Linearization:
 
     def _move(self, vector: np.ndarray, white: np.ndarray) -> None:
         self.vector, self.white = vector, white
-        weighted = by_second(white * robust_weight(white))[..., None]
-        self.score_by_block = -in_line(self.columns @ weighted)[..., 0]
+        weighted = split_seconds(white * robust_weight(white))[..., None]
+        self.score_by_block = -merge_seconds(self.columns @ weighted)[..., 0]
         change = (vector - self.problem.start)[self.indices]
         prior_score = self.prior * np.append(change, np.zeros(len(self.probes)))
         self.score = self.score_by_block.sum(axis=0) - prior_score

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.state import ACTION_SIZE
 from flytrack_sysid.diagnosis import noise as noises
 from flytrack_sysid.diagnosis.chunks import AXES, count_lead_in
-from flytrack_sysid.diagnosis.problem import Problem, blocks_of, robust_weight
+from flytrack_sysid.diagnosis.problem import Problem, robust_weight, split_blocks
 from flytrack_sysid.diagnosis.result import Unexplained
 from flytrack_sysid.diagnosis.score_test import estimate_inflation, solve, threshold
 from flytrack_sysid.diagnosis.search import FittedModel
@@ -301,7 +301,7 @@ class SideTest(NamedTuple):
         root = np.sqrt(robust_weight(side_white))
         given = slopes[..., axes, :]
         acting = np.abs(given).reshape(len(given), -1).max(axis=1) > 0.0
-        return cls(root, blocks_of(side_white * root), blocks_of(given[acting] * root))
+        return cls(root, split_blocks(side_white * root), split_blocks(given[acting] * root))
 
     def given_also(self, *columns: np.ndarray) -> "SideTest":
         """Return the test with more columns that are free already."""
@@ -450,7 +450,7 @@ def find_dependences(
             name: str, candidate: np.ndarray, side: str = side, test: SideTest = test
         ) -> Feature:
             return Feature(
-                name, candidate, blocks_of(whitened(problem, candidate, side) * test.root)
+                name, candidate, split_blocks(whitened(problem, candidate, side) * test.root)
             )
 
         if side in waves:
@@ -480,13 +480,14 @@ def is_like_drift(problem: Problem, model: FittedModel, fields: Sequence[str]) -
     rows = [model.indices.index(index) for index in indices]
     test = SideTest.of("force", residuals, np.delete(slopes, rows, axis=0))
     columns, size = (
-        blocks_of(slopes[rows][..., axes, :] * test.root),
+        split_blocks(slopes[rows][..., axes, :] * test.root),
         (model.vector - problem.start)[indices],
     )
 
     def noncentrality_beside(*features_w: np.ndarray) -> float:
         given = [
-            blocks_of(whitened(problem, features, "force") * test.root) for features in features_w
+            split_blocks(whitened(problem, features, "force") * test.root)
+            for features in features_w
         ]
         return test.given_also(*given).noncentrality(columns, size)
 

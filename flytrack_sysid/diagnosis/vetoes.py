@@ -15,7 +15,7 @@ from flytrack_env.effects import BY_NAME
 from flytrack_sysid.diagnosis import model_selection
 from flytrack_sysid.diagnosis import unexplained as unknown
 from flytrack_sysid.diagnosis.chunks import AXES
-from flytrack_sysid.diagnosis.problem import Problem, blocks_of
+from flytrack_sysid.diagnosis.problem import Problem, split_blocks
 from flytrack_sysid.diagnosis.result import Unexplained
 from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, threshold
 from flytrack_sysid.diagnosis.search import FittedModel, SearchState
@@ -173,7 +173,7 @@ def find_stand_ins(
         if not (problem.counts[..., axes, :].any() and np.abs(acting).max() > 0.0):
             return 0.0, 0.0
         test = unknown.SideTest.of(side, residuals, np.delete(slopes, own_columns, axis=0))
-        columns = blocks_of(acting * test.root)
+        columns = split_blocks(acting * test.root)
         size = (model.vector - problem.start)[problem.parameter_indices(suspect.fields)]
         before = test.noncentrality(columns, size)
         smooth_columns = [
@@ -181,7 +181,7 @@ def find_stand_ins(
         ]
         if smooth_columns:
             constants = unknown.whitened(problem, unknown.constants(flight, side), side)
-            smooth_columns.append(blocks_of(constants * test.root))
+            smooth_columns.append(split_blocks(constants * test.root))
         return before, test.given_also(*smooth_columns).noncentrality(columns, size)
 
     result = []

@@ -10,7 +10,7 @@ from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.plants import Simulator
 from flytrack_sysid import CollectError, collect, sensors
 from flytrack_sysid.excitation import HEIGHTS, KINDS, MAX_SPEED
-from flytrack_sysid.split import blocks_of, held_out_rows
+from flytrack_sysid.split import block_numbers, held_out_rows
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 
 NOMINAL = nominal_parameters()
@@ -82,8 +82,8 @@ def test_plants_that_do_not_fly_are_refused(step, arguments, message):
 def test_held_out_part_has_every_kind_a_clear_step_of_each_axis_and_all_voltages():
     log = collect(HandoutPlant(), minutes=1.0, seed=1)
     out = held_out_rows(log)
-    np.testing.assert_array_equal(out, blocks_of(log) % 4 == 3)
-    np.testing.assert_array_equal(held_out_rows(log, 2), blocks_of(log) % 2 == 1)
+    np.testing.assert_array_equal(out, block_numbers(log) % 4 == 3)
+    np.testing.assert_array_equal(held_out_rows(log, 2), block_numbers(log) % 2 == 1)
     assert not held_out_rows(log, 0).any()
     for every in (1, -4):
         with pytest.raises(ValueError, match=f"every: found {every}"):
