@@ -26,8 +26,8 @@ from flytrack_env.state import POSITION
 from flytrack_loop.stages import measure_gap
 from flytrack_sysid import Diagnosis, FlightLog, collect, diagnose, diagnose_change
 from flytrack_sysid.diagnosis import Cause
-from flytrack_sysid.diagnosis.score_test import Candidate
 from flytrack_sysid.excitation import script as excitation_script
+from flytrack_sysid.inference.score_test import Candidate
 from flytrack_sysid.manoeuvres import flights_of, hover_action
 from flytrack_sysid.script_file import build_script
 

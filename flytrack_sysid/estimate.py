@@ -28,13 +28,13 @@ from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid import parameters
-from flytrack_sysid.diagnosis.chunks import AXES, DIRECT, Chunks, count_lead_in, make_chunks
-from flytrack_sysid.diagnosis.problem import Problem, robust_weight
-from flytrack_sysid.diagnosis.score_test import Linearization, solve
-from flytrack_sysid.diagnosis.search import refine
+from flytrack_sysid.inference import parameters
+from flytrack_sysid.inference.chunks import AXES, DIRECT, Chunks, count_lead_in, make_chunks
+from flytrack_sysid.inference.problem import Problem, robust_weight
+from flytrack_sysid.inference.record import is_applied_certain, make_record
+from flytrack_sysid.inference.score_test import Linearization, solve
+from flytrack_sysid.inference.search import refine
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.record import is_applied_certain, make_record
 
 TURNS, FORCES, BATTERY = AXES
 # Noise that the first round assumes, (NUM_AXES, 2), in the channels' units: that of common sensors.

@@ -14,16 +14,7 @@ from flytrack_env.effects import BY_NAME
 from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis.result import TWO_SIDED_95
 from flytrack_sysid.estimate import Estimate, FitError, estimate
-from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
-from flytrack_sysid.log_motion import motion_notes, required_motion
-from flytrack_sysid.log_voltage import (
-    fitted_battery,
-    flown_voltages,
-    is_within,
-    voltage_notes,
-    with_voltage,
-)
-from flytrack_sysid.parameters import (
+from flytrack_sysid.inference.parameters import (
     DRAIN,
     TAU_RANGE,
     TAUS,
@@ -36,6 +27,15 @@ from flytrack_sysid.parameters import (
     to_vector,
     with_neutral_effects,
     with_values,
+)
+from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
+from flytrack_sysid.log_motion import motion_notes, required_motion
+from flytrack_sysid.log_voltage import (
+    fitted_battery,
+    flown_voltages,
+    is_within,
+    voltage_notes,
+    with_voltage,
 )
 from flytrack_sysid.plausibility import check_plausible
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows

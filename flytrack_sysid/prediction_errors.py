@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binned_statistic_2d
 
 from flytrack_env.battery import Battery
-from flytrack_sysid.log import CHANNELS
-from flytrack_sysid.prediction import (
+from flytrack_sysid.inference.prediction import (
     MAX_S,
     Prediction,
     columns,
@@ -16,6 +15,7 @@ from flytrack_sysid.prediction import (
     free_flights,
     scored_steps,
 )
+from flytrack_sysid.log import CHANNELS
 from flytrack_sysid.sensors import specific_force_b
 
 UNITS = {"p": "m", "v": "m/s", "q": "1", "w": "rad/s", "a": "m/s^2", "f": "m/s^2"}

@@ -12,8 +12,8 @@ from flytrack_env.effects.command_delay import dead_times
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import ACTION_SIZE, Action, Drone
-from flytrack_sysid.parameters import from_vector, in_batches, to_vector
-from flytrack_sysid.trace_cache import keep_trace
+from flytrack_sysid.inference.parameters import from_vector, in_batches, to_vector
+from flytrack_sysid.inference.trace_cache import keep_trace
 
 SMALL_STEP, FULL_STEP = 1e-3, 1.0  # of a stick, from its centre; no limit acts on the small one
 STEP_S, WATCHED_S = 1e-3, 1.5

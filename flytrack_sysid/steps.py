@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_sysid.prediction import Prediction, find_runs, free_flights
+from flytrack_sysid.inference.prediction import Prediction, find_runs, free_flights
 
 AXES = ("roll", "pitch", "yaw")
 MIN_JUMP = 0.2

@@ -17,9 +17,8 @@ from flytrack_env.effects import BY_NAME
 from flytrack_env.state import ACTION_SIZE, POSITION, QUATERNION, STATE_SIZE
 from flytrack_env.viz_rerun import Trajectory
 from flytrack_sysid.diagnosis.traces import Traces, traces
-from flytrack_sysid.log import IN_STATE, FlightLog, time_in_line
-from flytrack_sysid.parameters import with_neutral_effects
-from flytrack_sysid.prediction import (
+from flytrack_sysid.inference.parameters import with_neutral_effects
+from flytrack_sysid.inference.prediction import (
     FLOWN,
     MAX_S,
     Prediction,
@@ -27,7 +26,8 @@ from flytrack_sysid.prediction import (
     inputs_that_lack,
     predict,
 )
-from flytrack_sysid.record import fill_gaps
+from flytrack_sysid.inference.record import fill_gaps
+from flytrack_sysid.log import IN_STATE, FlightLog, time_in_line
 
 WINDOW_S = 0.1  # of means: long enough to average out noise, short against a manoeuvre
 RESTART_S = 1.0  # of free flight: the horizon of the report's first sentence

@@ -6,11 +6,11 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid import prediction_errors
+from flytrack_sysid.inference.prediction import Prediction, predict
+from flytrack_sysid.inference.record import fill_gaps
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_motion import motion_notes, required_motion
 from flytrack_sysid.log_voltage import voltage_notes
-from flytrack_sysid.prediction import Prediction, predict
-from flytrack_sysid.record import fill_gaps
 from flytrack_sysid.steps import (
     HELD_AFTER_S,
     HELD_BEFORE_S,

@@ -17,12 +17,13 @@ from benchmarks.hidden.noise import DIGIT, STD
 from flytrack_bench.hidden import Truth
 from flytrack_bench.hidden.drone import SECONDS_PER_MINUTE
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.diagnosis.chunks import NUM_AXES, cut_chunks
 from flytrack_sysid.diagnosis.model_selection import MAX_RIVALS, ablate_all
-from flytrack_sysid.diagnosis.noise import fit_noise
-from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.score_test import CANDIDATES
-from flytrack_sysid.diagnosis.search import (
+from flytrack_sysid.inference.chunks import NUM_AXES, cut_chunks
+from flytrack_sysid.inference.noise import fit_noise
+from flytrack_sysid.inference.parameters import THRUST_COEFFS
+from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.score_test import CANDIDATES
+from flytrack_sysid.inference.search import (
     FittedModel,
     HeldParameter,
     SearchState,
@@ -30,7 +31,6 @@ from flytrack_sysid.diagnosis.search import (
     score_candidates,
 )
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.parameters import THRUST_COEFFS
 
 TURNED_MS2 = 10.0  # about the thrust that attitude noise turns
 NO_DISTURBANCE, ANY_TAU, COUPLED = np.log(1e-3), np.log(0.3), 0.0

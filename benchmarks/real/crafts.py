@@ -29,8 +29,8 @@ from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_sysid import FlightLog, import_log
 from flytrack_sysid.diagnosis import joined
 from flytrack_sysid.diagnosis.refinement import sample_windows
+from flytrack_sysid.inference.prediction_windows import HORIZONS_S, QUANTITIES, make_windows
 from flytrack_sysid.log import usual_step
-from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES, make_windows
 
 BETAFLIGHT = "betaflight_acro_log"
 # Every third policy, by its number, is for judging.

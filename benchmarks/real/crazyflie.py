@@ -33,14 +33,14 @@ from benchmarks.report import ROOT, table
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid import FlightLog, import_log
 from flytrack_sysid.diagnosis import joined, refinement
-from flytrack_sysid.diagnosis.chunks import cut_chunks, thinned
 from flytrack_sysid.diagnosis.diagnose import split
-from flytrack_sysid.diagnosis.noise import fit_noise
-from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.score_test import CANDIDATES
-from flytrack_sysid.diagnosis.search import SearchState
-from flytrack_sysid.parameters import STICKS, TAUS, THRUST_COEFFS, from_vector
-from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES, make_windows
+from flytrack_sysid.inference.chunks import cut_chunks, thinned
+from flytrack_sysid.inference.noise import fit_noise
+from flytrack_sysid.inference.parameters import STICKS, TAUS, THRUST_COEFFS, from_vector
+from flytrack_sysid.inference.prediction_windows import HORIZONS_S, QUANTITIES, make_windows
+from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.score_test import CANDIDATES
+from flytrack_sysid.inference.search import SearchState
 from flytrack_sysid.response import SMALL_STEP, half_responses
 
 VARIABLE, FOLDER = "FLYTRACK_SHARED_DATA", "crazyflie_rate_flights"

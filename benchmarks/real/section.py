@@ -24,7 +24,12 @@ from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.evidence import words_of
 from flytrack_sysid.diagnosis.refinement import FlightErrors
 from flytrack_sysid.diagnosis.report import describe_verdict
-from flytrack_sysid.prediction_windows import QUANTITIES, Windows, cut_batches, prediction_errors
+from flytrack_sysid.inference.prediction_windows import (
+    QUANTITIES,
+    Windows,
+    cut_batches,
+    prediction_errors,
+)
 
 Record = dict[str, Any]
 STYLES: dict[str, dict[str, Any]] = {

@@ -18,8 +18,6 @@ from scipy import signal
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.effects import BY_NAME, acts
 from flytrack_env.motion import Motion
-from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis import search
 from flytrack_sysid.diagnosis.diagnose import (
     Split,
     held_out_under,
@@ -28,9 +26,16 @@ from flytrack_sysid.diagnosis.diagnose import (
     summarize,
 )
 from flytrack_sysid.diagnosis.model_selection import EQUIVALENT, Marginal, ablate_all
-from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import DRIFT, Cause, Diagnosis, Estimated, Unexplained
-from flytrack_sysid.diagnosis.score_test import (
+from flytrack_sysid.diagnosis.size import is_notable
+from flytrack_sysid.diagnosis.summary import classify, effect_causes, mean_factor, mean_thrust
+from flytrack_sysid.diagnosis.unexplained import find_unexplained
+from flytrack_sysid.diagnosis.vetoes import Selection
+from flytrack_sysid.inference import noise as noises
+from flytrack_sysid.inference import search
+from flytrack_sysid.inference.parameters import THRUST_COEFFS
+from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.score_test import (
     Candidate,
     Linearization,
     base_fields,
@@ -38,13 +43,8 @@ from flytrack_sysid.diagnosis.score_test import (
     solve,
     threshold,
 )
-from flytrack_sysid.diagnosis.size import is_notable
-from flytrack_sysid.diagnosis.summary import classify, effect_causes, mean_factor, mean_thrust
-from flytrack_sysid.diagnosis.unexplained import find_unexplained
-from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_motion import check_same_origin
-from flytrack_sysid.parameters import THRUST_COEFFS
 
 MAX_EFFECTS = 4
 # Sticks jump if the sum of their distances from their low-pass exceeds JUMP. JUMP_S is the time

@@ -15,16 +15,8 @@ from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis import summary
 from flytrack_sysid.diagnosis.beyond import Learned, with_and_without, with_learned
-from flytrack_sysid.diagnosis.chunks import (
-    Chunks,
-    at_usual_rate,
-    cut_chunks,
-    measured_voltage_range,
-    thinned,
-)
 from flytrack_sysid.diagnosis.first_look import FirstLook
 from flytrack_sysid.diagnosis.late_poses import with_late_poses
-from flytrack_sysid.diagnosis.lateness import read_poses
 from flytrack_sysid.diagnosis.learned import find_learned
 from flytrack_sysid.diagnosis.motion_choice import (
     MotionEstimate,
@@ -41,16 +33,8 @@ from flytrack_sysid.diagnosis.onset import (
     with_changes,
 )
 from flytrack_sysid.diagnosis.outliers import find_outliers, outlier_notes
-from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Refined, reduced, refine
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis
-from flytrack_sysid.diagnosis.score_test import Linearization
-from flytrack_sysid.diagnosis.search import (
-    FittedModel,
-    SearchState,
-    extended,
-    with_refitted_noise,
-)
 from flytrack_sysid.diagnosis.size import split_by_size
 from flytrack_sysid.diagnosis.vetoes import (
     Selection,
@@ -59,6 +43,22 @@ from flytrack_sysid.diagnosis.vetoes import (
     contradicted_on_held_out,
     reject,
     select,
+)
+from flytrack_sysid.inference.chunks import (
+    Chunks,
+    at_usual_rate,
+    cut_chunks,
+    measured_voltage_range,
+    thinned,
+)
+from flytrack_sysid.inference.lateness import read_poses
+from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.score_test import Linearization
+from flytrack_sysid.inference.search import (
+    FittedModel,
+    SearchState,
+    extended,
+    with_refitted_noise,
 )
 from flytrack_sysid.log import STATED_VOLTAGES, FlightLog, LogError
 from flytrack_sysid.log_motion import check_same_origin, motion_notes, required_motion

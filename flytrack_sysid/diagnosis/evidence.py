@@ -12,9 +12,9 @@ from flytrack_env.effects import ThrustScale
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.toml_file import parse_toml, read_text
 from flytrack_sysid.diagnosis.result import DRIFT, TWO_SIDED_95
-from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
 from flytrack_sysid.diagnosis.traces import REGRESSORS, UNITS, Traces
-from flytrack_sysid.parameters import names_of, to_vector, with_values
+from flytrack_sysid.inference.parameters import names_of, to_vector, with_values
+from flytrack_sysid.inference.score_test import BASE_CAUSES
 from flytrack_sysid.plots import BLUE, GREY, ORANGE, say
 
 WIDTH_IN, ROW_IN, LEGEND_IN = 8.0, 2.5, 0.9

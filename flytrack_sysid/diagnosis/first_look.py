@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 from flytrack_sysid.diagnosis.model_selection import base_changes
 from flytrack_sysid.diagnosis.result import Estimated
-from flytrack_sysid.diagnosis.score_test import threshold
-from flytrack_sysid.diagnosis.search import FittedModel, SearchState, score_candidates
 from flytrack_sysid.diagnosis.summary import estimates
+from flytrack_sysid.inference.score_test import threshold
+from flytrack_sysid.inference.search import FittedModel, SearchState, score_candidates
 
 MAX_LISTED = 6  # effects
 NOT_CHECKED = (

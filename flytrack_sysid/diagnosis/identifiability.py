@@ -18,12 +18,15 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, MAX_DELAY_STEPS
 from flytrack_env.plants import Simulator
 from flytrack_sysid.collect import states_flown
-from flytrack_sysid.diagnosis.chunks import CHUNK_S, Chunks, make_chunks, measured_voltage_range
-from flytrack_sysid.diagnosis.problem import SEARCHED, Problem
 from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG, NotIdentifiable
-from flytrack_sysid.diagnosis.score_test import Candidate, Linearization, list_candidates
-from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.excitation import ANY_VOLTAGE, DT_S, FLIGHT_STEPS, SCRIPT_HEIGHTS, is_inside
+from flytrack_sysid.inference.chunks import CHUNK_S, Chunks, make_chunks, measured_voltage_range
+from flytrack_sysid.inference.parameters import TAUS, THRUST_COEFFS, from_vector
+from flytrack_sysid.inference.problem import SEARCHED, Problem
+from flytrack_sysid.inference.record import UPRIGHT
+from flytrack_sysid.inference.score_test import Candidate, Linearization, list_candidates
+from flytrack_sysid.inference.search import FittedModel, SearchState
+from flytrack_sysid.inference.trace_cache import fast_jit
 from flytrack_sysid.log import FlightLog, log_of_states
 from flytrack_sysid.manoeuvres import (
     FLIGHTS_PER_MANOEUVRE,
@@ -32,10 +35,7 @@ from flytrack_sysid.manoeuvres import (
     flights_of,
     hover_action,
 )
-from flytrack_sysid.parameters import TAUS, THRUST_COEFFS, from_vector
-from flytrack_sysid.record import UPRIGHT
 from flytrack_sysid.script_file import Script, ScriptError, build_script
-from flytrack_sysid.trace_cache import fast_jit
 
 DETECTED = 30.0  # noncentrality from which a log shows an effect nearly always
 SEPARATE = 20.0  # noncentrality beside a rival from which a log tells the two apart

@@ -6,10 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from flytrack_env.effects import BY_NAME, MocapLatency
-from flytrack_sysid.diagnosis.chunks import Chunks
-from flytrack_sysid.diagnosis.lateness import get_latency
 from flytrack_sysid.diagnosis.motion_choice import STANDARD_ERRORS, MotionEstimate
-from flytrack_sysid.diagnosis.problem import Problem, robust_square, vector_of
 from flytrack_sysid.diagnosis.result import (
     TWO_SIDED_95,
     Cause,
@@ -18,6 +15,9 @@ from flytrack_sysid.diagnosis.result import (
     Estimated,
 )
 from flytrack_sysid.diagnosis.summary import classify
+from flytrack_sysid.inference.chunks import Chunks
+from flytrack_sysid.inference.lateness import get_latency
+from flytrack_sysid.inference.problem import Problem, robust_square, vector_of
 
 EFFECT = BY_NAME["mocap_latency"]
 BOUNDS = EFFECT.ranges["latency_s"]

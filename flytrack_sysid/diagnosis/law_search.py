@@ -20,9 +20,6 @@ from flytrack_env.dynamics import collective_thrust
 from flytrack_env.effects.grammar import QUANTITIES, SHAPES, XYZ, Factor, Moment, Term
 from flytrack_env.quaternion import Vec3
 from flytrack_env.state import Action
-from flytrack_sysid.diagnosis.chunks import CHUNK_S
-from flytrack_sysid.diagnosis.problem import Problem, robust_square, split_blocks
-from flytrack_sysid.diagnosis.search import FittedModel
 from flytrack_sysid.diagnosis.unexplained import (
     BUMP_PLACES,
     BUMP_WIDTHS_M,
@@ -34,7 +31,10 @@ from flytrack_sysid.diagnosis.unexplained import (
     linearized_residuals,
     whitened,
 )
-from flytrack_sysid.parameters import MAX_RATES, from_vector
+from flytrack_sysid.inference.chunks import CHUNK_S
+from flytrack_sysid.inference.parameters import MAX_RATES, from_vector
+from flytrack_sysid.inference.problem import Problem, robust_square, split_blocks
+from flytrack_sysid.inference.search import FittedModel
 
 FALSE_POSITIVE_RATE = 1e-7  # of a term if the residuals are noise
 FURTHER_FALSE_POSITIVE_RATE = 1e-4  # of a second and third term

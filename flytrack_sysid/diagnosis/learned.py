@@ -10,7 +10,6 @@ import numpy as np
 from flytrack_env.effects.grammar import Law
 from flytrack_sysid.diagnosis.beyond import Learned
 from flytrack_sysid.diagnosis.law_search import MIN_EXPECTED_GAIN, FittedLaw, Side, find_law
-from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import (
     LIKELY,
     LIKELY_WORSE,
@@ -19,13 +18,14 @@ from flytrack_sysid.diagnosis.refinement import (
     FlightTest,
     errors_at,
 )
-from flytrack_sysid.diagnosis.search import FittedModel
 from flytrack_sysid.diagnosis.unexplained import (
     build_waves,
     find_dependences,
     find_lines,
     stochastic_shares,
 )
+from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.search import FittedModel
 
 MAX_ROWS = 12_000  # with their lead-ins: two minutes at 100 Hz
 MIN_RMS_RATIO = 0.08  # of the sensor's noise, RMS: no law is learnt for smaller residuals

@@ -9,8 +9,9 @@ from scipy import stats
 
 from flytrack_env.dynamics import collective_thrust
 from flytrack_env.effects import BY_NAME
-from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.score_test import (
+from flytrack_sysid.inference.parameters import TAUS, THRUST_COEFFS
+from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.score_test import (
     BASE_CAUSES,
     Candidate,
     Linearization,
@@ -20,7 +21,7 @@ from flytrack_sysid.diagnosis.score_test import (
     solve,
     threshold,
 )
-from flytrack_sysid.diagnosis.search import (
+from flytrack_sysid.inference.search import (
     MAX_REFITTED,
     PER_PARAMETER,
     FittedModel,
@@ -29,7 +30,6 @@ from flytrack_sysid.diagnosis.search import (
     add_effect,
     score_candidates,
 )
-from flytrack_sysid.parameters import TAUS, THRUST_COEFFS
 
 EQUIVALENT = 10.0  # of chi2: a rival that explains less by no more than this cannot be told apart
 # Of chi2: where a difference below EQUIVALENT is expected, chance hardly ever makes it this large.

@@ -26,22 +26,22 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, Effect
 from flytrack_env.motion import Motion
-from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.chunks import Chunks, cut_chunks
-from flytrack_sysid.diagnosis.lateness import read_poses, scored_as_logged
 from flytrack_sysid.diagnosis.motion_of_sensors import apparent_lateness, motion_of_sensors
-from flytrack_sysid.diagnosis.problem import (
+from flytrack_sysid.inference import noise as noises
+from flytrack_sysid.inference.chunks import Chunks, cut_chunks
+from flytrack_sysid.inference.lateness import read_poses, scored_as_logged
+from flytrack_sysid.inference.parameters import base_of
+from flytrack_sysid.inference.problem import (
     Problem,
     merge_seconds,
     robust_weight,
     split_blocks,
     split_seconds,
 )
-from flytrack_sysid.diagnosis.score_test import Linearization, solve
-from flytrack_sysid.diagnosis.search import refine
+from flytrack_sysid.inference.score_test import Linearization, solve
+from flytrack_sysid.inference.search import refine
 from flytrack_sysid.log import FlightLog, usual_step
 from flytrack_sysid.log_motion import required_motion
-from flytrack_sysid.parameters import base_of
 
 CLEAR = 10.0  # of minus twice the log likelihood: a simulator's step has to be better by this
 # Of the same: the gain that late poses need. Effects that are not fitted here change it by as much.

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import PAIRS, offset_between
-from flytrack_sysid.diagnosis.score_test import solve
+from flytrack_sysid.inference.score_test import solve
 from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
 from flytrack_sysid.plausibility import GRAVITY
 

@@ -18,25 +18,25 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import optimize, stats
 
-from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.chunks import CHUNK_S, Chunks, count_lead_in
-from flytrack_sysid.diagnosis.problem import Problem, Window, robust_square
 from flytrack_sysid.diagnosis.result import Estimated
-from flytrack_sysid.diagnosis.score_test import (
+from flytrack_sysid.diagnosis.vetoes import Selection, select
+from flytrack_sysid.inference import noise as noises
+from flytrack_sysid.inference.chunks import CHUNK_S, Chunks, count_lead_in
+from flytrack_sysid.inference.problem import Problem, Window, robust_square
+from flytrack_sysid.inference.score_test import (
     Candidate,
     Linearization,
     candidates_for,
     estimate_inflation,
     solve,
 )
-from flytrack_sysid.diagnosis.search import (
+from flytrack_sysid.inference.search import (
     PER_PARAMETER,
     FittedModel,
     SearchState,
     extended,
     with_refitted_noise,
 )
-from flytrack_sysid.diagnosis.vetoes import Selection, select
 from flytrack_sysid.log import FlightLog
 
 FALSE_POSITIVE_RATE = 1e-5  # of a change of each effect, if nothing changes

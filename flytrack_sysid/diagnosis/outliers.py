@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import stats
 
-from flytrack_sysid.diagnosis.chunks import AXES
-from flytrack_sysid.diagnosis.noise import OUTLIER
-from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import CHANNELS, Outliers
+from flytrack_sysid.inference.chunks import AXES
+from flytrack_sysid.inference.noise import OUTLIER
+from flytrack_sysid.inference.problem import Problem
 
 MAX_RUN_LENGTH = 3  # rows: the whitening filter absorbs a part of an outlier and returns it later
 FALSE_POSITIVE_RATE = 1e-6  # of this many outliers, if the noise is normal

@@ -27,19 +27,9 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, LearnedLaw
 from flytrack_sysid.diagnosis.model_selection import ablate_all
 from flytrack_sysid.diagnosis.onset import ended
-from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.score_test import (
-    Candidate,
-    base_fields,
-    prior_information,
-    solve,
-    step_inside,
-)
-from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.diagnosis.vetoes import Selection
-from flytrack_sysid.log import FlightLog
-from flytrack_sysid.parameters import DRAIN, from_vector, in_batches
-from flytrack_sysid.prediction_windows import (
+from flytrack_sysid.inference.parameters import DRAIN, from_vector, in_batches
+from flytrack_sysid.inference.prediction_windows import (
     HORIZONS_S,
     QUANTITIES,
     UNITS,
@@ -49,7 +39,17 @@ from flytrack_sysid.prediction_windows import (
     make_windows,
     prediction_errors,
 )
-from flytrack_sysid.trace_cache import keep_trace
+from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.score_test import (
+    Candidate,
+    base_fields,
+    prior_information,
+    solve,
+    step_inside,
+)
+from flytrack_sysid.inference.search import FittedModel, SearchState
+from flytrack_sysid.inference.trace_cache import keep_trace
+from flytrack_sysid.log import FlightLog
 
 BATCH = 8  # models that are evaluated at once
 SPACING_S, SHORT_SPACING_S = 0.25, 0.05

@@ -8,7 +8,7 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis.beyond import Learned
-from flytrack_sysid.diagnosis.chunks import AXES
+from flytrack_sysid.inference.chunks import AXES
 
 TWO_SIDED_95 = 1.959964  # standard deviations of a normal distribution: half of its 95 % interval
 SCHEMA = 1
@@ -143,7 +143,7 @@ class Changed:
     """A parameter whose value in the extended model is not the nominal one.
 
     Attributes:
-        name: name in ``flytrack_sysid.parameters``.
+        name: name in ``flytrack_sysid.inference.parameters``.
         nominal: value in the nominal model.
         value: value in the extended model.
         ci95: 95 % interval; not finite if the log does not determine the parameter.
@@ -180,7 +180,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class HalfResponse:
-    """Time from a step of a stick to half of the response (s), as in ``flytrack_sysid.response``.
+    """Time from a step of a stick to half of the response (s), as ``response`` measures it.
 
     Times are NaN where there is no response.
 

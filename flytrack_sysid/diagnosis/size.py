@@ -12,10 +12,10 @@ import numpy as np
 from flytrack_env.effects import BY_NAME
 from flytrack_env.state import BATTERY_FULL_V
 from flytrack_sysid.diagnosis.model_selection import thrust_over_weight
-from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import Cause
-from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
-from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS
+from flytrack_sysid.inference.parameters import DRAIN, TAUS, THRUST_COEFFS
+from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.score_test import BASE_CAUSES
 
 MIN_ERROR_FRACTION = 0.02  # of the error of free flight, held out
 NOTABLE_LAG_S = 0.005  # as of the effects that delay

@@ -8,7 +8,6 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_env.effects import BY_NAME, effect_of
 from flytrack_sysid.diagnosis import vetoes
-from flytrack_sysid.diagnosis.chunks import measured_voltage_range
 from flytrack_sysid.diagnosis.identifiability import advise, unit_of, unseen_effects
 from flytrack_sysid.diagnosis.model_selection import (
     BaseChange,
@@ -17,7 +16,6 @@ from flytrack_sysid.diagnosis.model_selection import (
     equivalents,
     separation,
 )
-from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import Refined, at_bounds, errors_at, tabulate_errors
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
@@ -37,16 +35,9 @@ from flytrack_sysid.diagnosis.result import (
     Prediction,
     Unexplained,
 )
-from flytrack_sysid.diagnosis.score_test import (
-    BASE_CAUSES,
-    Linearization,
-    base_fields,
-    solve,
-    threshold,
-)
-from flytrack_sysid.diagnosis.search import FittedModel, SearchState
 from flytrack_sysid.diagnosis.unexplained import is_like_drift
-from flytrack_sysid.parameters import (
+from flytrack_sysid.inference.chunks import measured_voltage_range
+from flytrack_sysid.inference.parameters import (
     DRAIN,
     MAX_RATES,
     STICKS,
@@ -55,7 +46,16 @@ from flytrack_sysid.parameters import (
     from_vector,
     range_of,
 )
-from flytrack_sysid.prediction_windows import HORIZONS_S, QUANTITIES
+from flytrack_sysid.inference.prediction_windows import HORIZONS_S, QUANTITIES
+from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.score_test import (
+    BASE_CAUSES,
+    Linearization,
+    base_fields,
+    solve,
+    threshold,
+)
+from flytrack_sysid.inference.search import FittedModel, SearchState
 from flytrack_sysid.response import FULL_STEP, SMALL_STEP, half_responses
 
 LOOSE = 0.5  # of the prior's width: a parameter with a wider interval is not determined

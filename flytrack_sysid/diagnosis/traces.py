@@ -23,14 +23,14 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters, lag
 from flytrack_env.state import Action
-from flytrack_sysid.diagnosis.chunks import Chunks, count_lead_in, cut_chunks
-from flytrack_sysid.diagnosis.lateness import get_latency, read_poses
-from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.result import PLACES
+from flytrack_sysid.inference.chunks import Chunks, count_lead_in, cut_chunks
+from flytrack_sysid.inference.lateness import get_latency, read_poses
+from flytrack_sysid.inference.parameters import STICKS
+from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.record import Record
+from flytrack_sysid.inference.trace_cache import fast_jit
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.parameters import STICKS
-from flytrack_sysid.record import Record
-from flytrack_sysid.trace_cache import fast_jit
 
 UNITS = {"rates": "rad/s", "attitude": "rad/s", "force": "m/s²", "velocity": "m/s²", "battery": "V"}
 _PER_STEP = ("attitude", "velocity", "battery")  # changes since the row before

@@ -8,13 +8,13 @@ from scipy import ndimage, stats
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.state import ACTION_SIZE
-from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.chunks import AXES, count_lead_in
-from flytrack_sysid.diagnosis.problem import Problem, robust_weight, split_blocks
 from flytrack_sysid.diagnosis.result import Unexplained
-from flytrack_sysid.diagnosis.score_test import estimate_inflation, solve, threshold
-from flytrack_sysid.diagnosis.search import FittedModel
-from flytrack_sysid.parameters import TAUS
+from flytrack_sysid.inference import noise as noises
+from flytrack_sysid.inference.chunks import AXES, count_lead_in
+from flytrack_sysid.inference.parameters import TAUS
+from flytrack_sysid.inference.problem import Problem, robust_weight, split_blocks
+from flytrack_sysid.inference.score_test import estimate_inflation, solve, threshold
+from flytrack_sysid.inference.search import FittedModel
 
 SIDES = {"rate": AXES[0], "force": AXES[1]}  # axes of a residual
 RIDGE = 1e-6  # of each column's diagonal: features are nearly collinear if the flight covers little

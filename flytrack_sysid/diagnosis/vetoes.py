@@ -14,12 +14,12 @@ import numpy as np
 from flytrack_env.effects import BY_NAME
 from flytrack_sysid.diagnosis import model_selection
 from flytrack_sysid.diagnosis import unexplained as unknown
-from flytrack_sysid.diagnosis.chunks import AXES
-from flytrack_sysid.diagnosis.problem import Problem, split_blocks
 from flytrack_sysid.diagnosis.result import Unexplained
-from flytrack_sysid.diagnosis.score_test import BASE_CAUSES, threshold
-from flytrack_sysid.diagnosis.search import FittedModel, SearchState
-from flytrack_sysid.record import Record
+from flytrack_sysid.inference.chunks import AXES
+from flytrack_sysid.inference.problem import Problem, split_blocks
+from flytrack_sysid.inference.record import Record
+from flytrack_sysid.inference.score_test import BASE_CAUSES, threshold
+from flytrack_sysid.inference.search import FittedModel, SearchState
 
 # Held-out rows contradict a cause if two conditions hold. Its gain is HELD_OUT_SIGMAS standard
 # deviations below the expected gain, and less than HELD_OUT_SHARE of its size shows. The second one

@@ -90,6 +90,13 @@ def test_no_modules_import_each_other_in_a_circle():
         pytest.fail(" -> ".join(reversed(error.args[1])))
 
 
+def test_inference_imports_neither_fit_nor_diagnosis():
+    above = ("diagnosis", "fit", "estimate", "validate", "prediction_errors")
+    for module, targets in import_graph().items():
+        if module.startswith("flytrack_sysid.inference"):
+            assert not {name for name in targets if name.removeprefix("flytrack_sysid.").split(".")[0] in above}, module
+
+
 def test_the_black_boxs_plant_is_reached_only_through_its_artifact():
     for name in (*REPOSITORY, "docs", "noxfile"):
         for path in files_of(name):

@@ -10,9 +10,9 @@ from numpy.testing import assert_array_equal
 from flytrack.cli import main
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid import collect, load_log
-from flytrack_sysid.diagnosis.chunks import CHUNK_S
 from flytrack_sysid.diagnosis.identifiability import CHUNKS_PER_MANOEUVRE, next_flight
 from flytrack_sysid.excitation import DT_S, FLIGHT_STEPS, HEIGHTS
+from flytrack_sysid.inference.chunks import CHUNK_S
 from flytrack_sysid.manoeuvres import FLIGHTS_PER_MANOEUVRE, MANOEUVRES, flights_of, hover_action
 from flytrack_sysid.script_file import (
     ScriptError,

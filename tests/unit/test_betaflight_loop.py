@@ -7,7 +7,7 @@ from flytrack_env.effects import BetaflightLoop
 from flytrack_env.motion import Motion
 from flytrack_env.state import APPLIED_ACTION, RATES, Action
 from flytrack_sysid.importing.betaflight_settings import ASSUMED, rate_loop
-from flytrack_sysid.parameters import base_of
+from flytrack_sysid.inference.parameters import base_of
 from flytrack_sysid.response import half_response_s
 from tests.support.simulated_flights import NOMINAL, drone_with, fly, held
 

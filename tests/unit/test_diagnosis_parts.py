@@ -15,8 +15,17 @@ from benchmarks.diagnosis import model_of
 from flytrack.cli import main
 from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, vetoes
-from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.chunks import (
+from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
+from flytrack_sysid.diagnosis.learned import improves_flights
+from flytrack_sysid.diagnosis.model_selection import Ablation
+from flytrack_sysid.diagnosis.onset import windowed
+from flytrack_sysid.diagnosis.refinement import Fit, Refined
+from flytrack_sysid.diagnosis.report import describe_verdict
+from flytrack_sysid.diagnosis.result import Cause, Estimated
+from flytrack_sysid.diagnosis.summary import collect_warnings, stand_in_notes, with_refined_values
+from flytrack_sysid.diagnosis.vetoes import Selection
+from flytrack_sysid.inference import noise as noises
+from flytrack_sysid.inference.chunks import (
     CHUNK_S,
     LEAD_IN_S,
     NUM_AXES,
@@ -26,21 +35,12 @@ from flytrack_sysid.diagnosis.chunks import (
     spread_chunks,
     thinned,
 )
-from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
-from flytrack_sysid.diagnosis.learned import improves_flights
-from flytrack_sysid.diagnosis.model_selection import Ablation
-from flytrack_sysid.diagnosis.onset import windowed
-from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.refinement import Fit, Refined
-from flytrack_sysid.diagnosis.report import describe_verdict
-from flytrack_sysid.diagnosis.result import Cause, Estimated
-from flytrack_sysid.diagnosis.search import SearchState
-from flytrack_sysid.diagnosis.summary import collect_warnings, stand_in_notes, with_refined_values
-from flytrack_sysid.diagnosis.vetoes import Selection
+from flytrack_sysid.inference.parameters import DRAIN, THRUST_COEFFS
+from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.record import make_record
+from flytrack_sysid.inference.replay import replay, start_replay
+from flytrack_sysid.inference.search import SearchState
 from flytrack_sysid.log_file import save_log
-from flytrack_sysid.parameters import DRAIN, THRUST_COEFFS
-from flytrack_sysid.record import make_record
-from flytrack_sysid.replay import replay, start_replay
 from tests.support.hidden_flights import scripted
 
 SECONDS, DT_S = 40.0, 0.01
@@ -408,7 +408,7 @@ def test_a_long_log_is_thinned_with_a_warning_that_counts_judged_rows(state, mon
     half = chunks.counts & (np.arange(len(chunks.row)) % 2 == 0)[:, None, None, None]
     every = chunks._replace(counts=half)
     assert thinned(every) is every and thinning_warning(every, every) == []
-    monkeypatch.setattr("flytrack_sysid.diagnosis.chunks.MAX_ROWS", 4 * CHUNK_S * 100 + 10)
+    monkeypatch.setattr("flytrack_sysid.inference.chunks.MAX_ROWS", 4 * CHUNK_S * 100 + 10)
     (warning,) = thinning_warning(every, thinned(every))
     kept, number = thinned(every).num_judged, every.num_judged
     assert kept < 0.8 * number and warning.startswith(

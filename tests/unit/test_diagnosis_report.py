@@ -26,10 +26,10 @@ from flytrack_sysid.diagnosis.result import (
     Prediction,
     Unexplained,
 )
-from flytrack_sysid.diagnosis.score_test import BASE_CAUSES
 from flytrack_sysid.diagnosis.traces import REGRESSORS, traces
+from flytrack_sysid.inference.parameters import names_of, to_vector, with_values
+from flytrack_sysid.inference.score_test import BASE_CAUSES
 from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, Verdict, page
-from flytrack_sysid.parameters import names_of, to_vector, with_values
 from tests.contract.test_effects import inside_ranges
 from tests.support.hidden_flights import scripted
 from tests.support.slow import slow_but

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.dynamics import collective_thrust
 from flytrack_sysid import FitError, fit
 from flytrack_sysid.estimate import estimate
-from flytrack_sysid.parameters import (
+from flytrack_sysid.inference.parameters import (
     BASE,
     DRAIN,
     TAUS,

@@ -11,10 +11,12 @@ from flytrack_sysid import collect, fit, load_log, save_log, validate
 from flytrack_sysid.clocks import align_clocks, on_one_clock
 from flytrack_sysid.diagnosis import diagnose_change, joined, motion_of
 from flytrack_sysid.diagnosis.diagnose import split
-from flytrack_sysid.diagnosis.lateness import read_poses
 from flytrack_sysid.diagnosis.size import is_notable
 from flytrack_sysid.fit import what_is_fitted
 from flytrack_sysid.importing.flight import Craft
+from flytrack_sysid.inference.lateness import read_poses
+from flytrack_sysid.inference.parameters import DRAIN
+from flytrack_sysid.inference.record import fill_gaps, make_record
 from flytrack_sysid.log import STATED, LogError
 from flytrack_sysid.log_motion import motion_notes, required_motion
 from flytrack_sysid.log_voltage import (
@@ -23,8 +25,6 @@ from flytrack_sysid.log_voltage import (
     flown_voltages,
     voltage_notes,
 )
-from flytrack_sysid.parameters import DRAIN
-from flytrack_sysid.record import fill_gaps, make_record
 from flytrack_sysid.sensors import measure
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 from tests.support.tables import table

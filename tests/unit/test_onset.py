@@ -7,7 +7,7 @@ import pytest
 
 from flytrack_sysid.diagnosis.model_selection import Marginal
 from flytrack_sysid.diagnosis.onset import is_one_flight, threshold, windowed_gains
-from flytrack_sysid.diagnosis.score_test import Linearization
+from flytrack_sysid.inference.score_test import Linearization
 from flytrack_sysid.log import FlightLog
 
 BLOCKS, TRIMMED = 60, 0.1

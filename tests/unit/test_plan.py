@@ -10,11 +10,11 @@ import pytest
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.plants import Simulator
 from flytrack_sysid import collect
-from flytrack_sysid.diagnosis.chunks import cut_chunks
 from flytrack_sysid.diagnosis.identifiability import Question, advise
-from flytrack_sysid.diagnosis.problem import Problem
-from flytrack_sysid.diagnosis.score_test import Linearization
-from flytrack_sysid.diagnosis.search import FittedModel, SearchState
+from flytrack_sysid.inference.chunks import cut_chunks
+from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.score_test import Linearization
+from flytrack_sysid.inference.search import FittedModel, SearchState
 from flytrack_sysid.manoeuvres import MANOEUVRES, flights_of, hover_action
 from flytrack_sysid.script_file import build_script
 

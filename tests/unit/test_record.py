@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.diagnosis import joined
+from flytrack_sysid.inference.record import fill_gaps
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.record import fill_gaps
 
 
 def ramp(*lost, rows=12, slope=0.02):

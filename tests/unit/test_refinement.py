@@ -6,13 +6,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
-from flytrack_sysid.diagnosis.chunks import cut_chunks
-from flytrack_sysid.diagnosis.problem import Problem
 from flytrack_sysid.diagnosis.refinement import FlightTest, errors_at, refine, sample_windows
-from flytrack_sysid.diagnosis.score_test import CANDIDATES
-from flytrack_sysid.diagnosis.search import FittedModel, SearchState
+from flytrack_sysid.inference.chunks import cut_chunks
+from flytrack_sysid.inference.prediction_windows import QUANTITIES
+from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.score_test import CANDIDATES
+from flytrack_sysid.inference.search import FittedModel, SearchState
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.prediction_windows import QUANTITIES
 from flytrack_sysid.split import held_out_rows
 from tests.support.hidden_flights import scripted
 from tests.support.slow import slow_but

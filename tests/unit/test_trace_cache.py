@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from flytrack_env.compile_cache import FOLDER
-from flytrack_sysid.trace_cache import keep_trace
+from flytrack_sysid.inference.trace_cache import keep_trace
 
 
 @pytest.fixture

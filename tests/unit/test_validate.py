@@ -11,10 +11,10 @@ import pytest
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import CommandDelay, QuadraticDrag
 from flytrack_env.state import STATE_SIZE, unpack
+from flytrack_sysid.inference.prediction import columns, predict
+from flytrack_sysid.inference.record import MAX_DOUBT, fill_gaps
 from flytrack_sysid.log import log_of_states
-from flytrack_sysid.prediction import columns, predict
 from flytrack_sysid.prediction_errors import QUANTITIES
-from flytrack_sysid.record import MAX_DOUBT, fill_gaps
 from flytrack_sysid.sensors import specific_force_b
 from flytrack_sysid.split import held_out_rows
 from flytrack_sysid.steps import MAX_PER_AXIS

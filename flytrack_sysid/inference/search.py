@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.chunks import measured_voltage_range
-from flytrack_sysid.diagnosis.problem import NUM_PAIRS, SEARCHED, Problem
-from flytrack_sysid.diagnosis.score_test import (
+from flytrack_sysid.inference import noise as noises
+from flytrack_sysid.inference.chunks import measured_voltage_range
+from flytrack_sysid.inference.parameters import DRAIN, base_of
+from flytrack_sysid.inference.problem import NUM_PAIRS, SEARCHED, Problem
+from flytrack_sysid.inference.score_test import (
     Candidate,
     Gain,
     Linearization,
@@ -18,7 +19,6 @@ from flytrack_sysid.diagnosis.score_test import (
     threshold,
 )
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.parameters import DRAIN, base_of
 
 PER_PARAMETER = 4.0  # of chi2: the gain that one more parameter needs to be preferred
 MAX_EFFECTS = 6

@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import read_later
-from flytrack_sysid.diagnosis.chunks import NUM_AXES, Chunks
+from flytrack_sysid.inference.chunks import NUM_AXES, Chunks
+from flytrack_sysid.inference.record import Record, build_record, fill_gaps
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.record import Record, build_record, fill_gaps
 
 POSES = ("p", "v", "q")
 TAPS = (1, 0, -1, -2)  # rows that make up a delayed value, relative to its own row

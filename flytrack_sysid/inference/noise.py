@@ -24,8 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.fusion import one_kernel
-from flytrack_sysid.diagnosis.chunks import NUM_AXES, Chunks
-from flytrack_sysid.trace_cache import fast_jit
+from flytrack_sysid.inference.chunks import NUM_AXES, Chunks
+from flytrack_sysid.inference.trace_cache import fast_jit
 
 # Variance of a level at its first row, over that of its noise: its first innovation is about 0.
 UNKNOWN_START = 1e8

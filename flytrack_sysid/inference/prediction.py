@@ -10,11 +10,11 @@ from flytrack_env.dynamics import ModelParameters, advance
 from flytrack_env.effects import acts
 from flytrack_env.quaternion import Vec3
 from flytrack_env.state import Action, Drone
+from flytrack_sysid.inference.record import Filled, Record, build_record, is_applied_certain
+from flytrack_sysid.inference.replay import Step, replay, start_replay
+from flytrack_sysid.inference.trace_cache import fast_jit
 from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
 from flytrack_sysid.log_voltage import with_voltage
-from flytrack_sysid.record import Filled, Record, build_record, is_applied_certain
-from flytrack_sysid.replay import Step, replay, start_replay
-from flytrack_sysid.trace_cache import fast_jit
 
 # For effects with memory, whose memory at the start of a segment is not known.
 SETTLING_S = 0.5

@@ -19,7 +19,7 @@ from flytrack_env.effects import MAX_DELAY_STEPS, at_row, start_memories
 from flytrack_env.fusion import one_kernel
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
-from flytrack_sysid.record import Record
+from flytrack_sysid.inference.record import Record
 
 
 class Step(NamedTuple):

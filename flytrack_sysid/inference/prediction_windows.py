@@ -17,10 +17,10 @@ from flytrack_env.dynamics import ModelParameters, advance, body_rates, observe_
 from flytrack_env.effects import MAX_DELAY_STEPS, ImuLatency, at_row, start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
+from flytrack_sysid.inference.prediction import SETTLING_S
+from flytrack_sysid.inference.record import Record, build_record, fill_gaps
+from flytrack_sysid.inference.replay import measured_drone, where_true
 from flytrack_sysid.log import FlightLog, usual_step
-from flytrack_sysid.prediction import SETTLING_S
-from flytrack_sysid.record import Record, build_record, fill_gaps
-from flytrack_sysid.replay import measured_drone, where_true
 
 HORIZONS_S = (0.1, 0.25, 0.5, 1.0, 2.0)
 # Quantities of an error, three components each, in this order, and the channels that measure them.
@@ -36,7 +36,7 @@ class Windows(NamedTuple):
     """Windows of a log.
 
     Attributes:
-        record: inputs and measurements as in ``flytrack_sysid.record``, the lead-in first,
+        record: inputs and measurements as in ``record``, the lead-in first,
             (rows, windows, ...).
         is_free: whether the state of a row is predicted, (rows,) bool.
         ends: rows at the horizons, (horizons,) int.

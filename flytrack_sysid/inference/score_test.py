@@ -13,7 +13,8 @@ import numpy as np
 from scipy import linalg, stats
 
 from flytrack_env.effects import BY_NAME, Effect
-from flytrack_sysid.diagnosis.problem import (
+from flytrack_sysid.inference.parameters import DRAIN, TAUS, THRUST_COEFFS, neutral_value, range_of
+from flytrack_sysid.inference.problem import (
     SEARCHED,
     Problem,
     Slopes,
@@ -22,7 +23,6 @@ from flytrack_sysid.diagnosis.problem import (
     robust_weight,
     split_seconds,
 )
-from flytrack_sysid.parameters import DRAIN, TAUS, THRUST_COEFFS, neutral_value, range_of
 
 FALSE_POSITIVE_RATE = 1e-4  # that an absent effect is named, for each effect
 # A direction cannot be told from others that explain all but this share of it.

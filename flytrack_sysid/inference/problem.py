@@ -31,8 +31,8 @@ from flytrack_env.dynamics import ModelParameters, read_sensors
 from flytrack_env.effects import BY_NAME, EFFECTS, LEARNED_LAW, Effect, LearnedLaw, effect_of
 from flytrack_env.fusion import one_kernel
 from flytrack_env.quaternion import Quaternion, Vec3
-from flytrack_sysid.diagnosis import noise as noises
-from flytrack_sysid.diagnosis.chunks import (
+from flytrack_sysid.inference import noise as noises
+from flytrack_sysid.inference.chunks import (
     AXES,
     CHUNK_S,
     NUM_AXES,
@@ -40,11 +40,11 @@ from flytrack_sysid.diagnosis.chunks import (
     count_lead_in,
     spread_chunks,
 )
-from flytrack_sysid.diagnosis.lateness import Late
-from flytrack_sysid.parameters import TAUS, from_vector, names_of, range_of, to_vector
-from flytrack_sysid.record import Record
-from flytrack_sysid.replay import ReplayState, Step, replay_row, start_replay
-from flytrack_sysid.trace_cache import keep_trace
+from flytrack_sysid.inference.lateness import Late
+from flytrack_sysid.inference.parameters import TAUS, from_vector, names_of, range_of, to_vector
+from flytrack_sysid.inference.record import Record
+from flytrack_sysid.inference.replay import ReplayState, Step, replay_row, start_replay
+from flytrack_sysid.inference.trace_cache import keep_trace
 
 # The effects that a replay can show of any craft. It is fed with poses, so their lateness has to be
 # known before.

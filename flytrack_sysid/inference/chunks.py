@@ -13,9 +13,14 @@ import jax
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid.inference.record import (
+    Record,
+    is_applied_certain,
+    make_record,
+    measured_channels,
+)
 from flytrack_sysid.log import FlightLog, usual_step
 from flytrack_sysid.log_voltage import with_voltage
-from flytrack_sysid.record import Record, is_applied_certain, make_record, measured_channels
 
 LEAD_IN_S, CHUNK_S = 1, 5
 PIECES = LEAD_IN_S + CHUNK_S  # of a chunk, of a second each; the lead-in is first
@@ -37,7 +42,7 @@ class Chunks(NamedTuple):
     """A log in chunks; (rows, chunks, ...), where row k is followed by row k + 1 after ``step_s``.
 
     Attributes:
-        record: as in ``flytrack_sysid.record``.
+        record: as in ``flytrack_sysid.inference.record``.
         measured: by channel, w (rad/s) and f (m/s^2, body); others are in the record.
         counts: the scored residuals, never of the lead-in, (rows, chunks, NUM_AXES, 2) bool.
         is_joined: the row follows the one before it in flight, (rows, chunks) bool.
