@@ -1,12 +1,18 @@
 """FlyTrack on an accelerator: ``python -m benchmarks.gpu``.
 
 Environment steps with random actions, observations and resets included, beside gymnax's Pendulum
-and, where ``mujoco-mjx`` is installed, a rigid body with four motors in MJX; PPO with the recipe
-for a GPU, alone and many seeds side by side; a training until 95 % of 256 starts finish; and the
-same flights on the accelerator and on the CPU. Times are wall times without compilation. Without an
-accelerator the page says so and nothing else; ``--cpu`` measures small sizes without a page.
+and, where they are installed, a rigid body with four motors in MJX and a Crazyflie in crazyflow;
+PPO with the recipe for a GPU, alone and many seeds side by side; a training until 95 % of 256
+starts finish; and the same flights on the accelerator and on the CPU. Times are wall times without
+compilation. Without an accelerator the page says so and nothing else; ``--cpu`` measures small
+sizes without a page.
+
+crazyflow cannot be imported after SciPy unless ``SCIPY_ARRAY_API=1`` is set, and is measured only
+where it is. It asks for a later Gymnasium than FlyTrack, which only its renderer and environments
+need: ``pip install --no-deps crazyflow``, and its other dependencies as usual.
 """
 
+import os
 import statistics
 import time
 from collections.abc import Callable
@@ -31,13 +37,25 @@ from benchmarks.env_speed import Contestant, jax_contestant, measure
 from benchmarks.learning_curve import evaluate, held_from, train
 
 PLAIN, ROBUST, PENDULUM = "FlyTrack-v0", "FlyTrackRobust-v0", "Pendulum-v1"
-MJX = "rigid body in MJX"
+MJX, CRAZYFLOW = "rigid body in MJX", "crazyflow"
 # Environments, as powers of 2, by contestant; of some fewer, because each size is a compilation.
 POWERS: dict[str, tuple[int, ...]] = {
     PLAIN: (8, 10, 16, 20, 21),
     ROBUST: (10, 20),
     PENDULUM: (10, 16, 20),
     MJX: (16,),
+    CRAZYFLOW: (10, 16, 20),
+}
+PEERS = {
+    MJX: (
+        "The rigid body in MJX has four motors; a decision is a step of 0.01 s, without "
+        "observations, gates or resets."
+    ),
+    CRAZYFLOW: (
+        "crazyflow is its `Sim` with all defaults: first-principles dynamics and attitude "
+        "controller of a Crazyflie, explicit Euler at 500 Hz. A decision is a random command of "
+        "attitude and thrust, held for five of its steps, without observations, gates or resets."
+    ),
 }
 UNROLL = 4
 TRAININGS = (("cpu", 1), ("gpu", 1), ("gpu", 16))  # recipe, seeds side by side
@@ -45,6 +63,7 @@ STEPS, EVERY = 40_000_000, 1_000_000  # environment steps: of the training, betw
 NUM_FLIGHTS = 256
 REPEATS, LENGTH = 5, 64  # calls, and steps of each
 CALLS = 200  # of one step each
+PACKAGES = ("mujoco-mjx", "crazyflow")
 PAGE = report.RESULTS / "gpu.md"
 WHAT = (
     "Rates with random actions, observations and resets included, 64 steps a call; "
@@ -70,6 +89,15 @@ RIGID_BODY = """
 """
 
 
+def is_measured(name: str) -> bool:
+    """Return whether a contestant's packages are installed, and can be imported."""
+    if name == MJX:
+        return bool(find_spec("mujoco") and find_spec("mujoco.mjx"))
+    if name == CRAZYFLOW:
+        return bool(find_spec("crazyflow")) and os.environ.get("SCIPY_ARRAY_API") == "1"
+    return True
+
+
 def mjx_contestant(num_envs: int) -> Contestant:
     """Return a scan of ``LENGTH`` steps of 0.01 s of a rigid body with four motors in MJX."""
     import mujoco
@@ -90,6 +118,29 @@ def mjx_contestant(num_envs: int) -> Contestant:
 
     return Contestant(
         MJX, LENGTH * num_envs / 1e6, lambda: jax.block_until_ready(fly(state, controls))
+    )
+
+
+def crazyflow_contestant(num_envs: int) -> Contestant:
+    """Return a scan of ``LENGTH`` commands of attitude and thrust, 0.01 s each, in crazyflow."""
+    import crazyflow  # type: ignore[import-not-found]
+
+    attitude_control = crazyflow.sim.functional.attitude_control
+    sim = crazyflow.Sim(n_worlds=num_envs, device=jax.default_backend())
+    data, step, steps_per_command = sim.data, sim.build_step_fn(), sim.freq // 100
+    space = crazyflow.envs.drone_env.action_space(sim.control, sim.dynamics, sim.drone)
+    shape = (LENGTH, num_envs, 1, *space.shape)
+    commands = jax.random.uniform(jax.random.key(1), shape, minval=space.low, maxval=space.high)
+
+    @jax.jit
+    def fly(data: Any, commands: jax.Array) -> Any:
+        def step_once(data: Any, command: jax.Array) -> tuple[Any, None]:
+            return step(attitude_control(data, command), n_steps=steps_per_command), None
+
+        return jax.lax.scan(step_once, data, commands)[0]
+
+    return Contestant(
+        CRAZYFLOW, LENGTH * num_envs / 1e6, lambda: jax.block_until_ready(fly(data, commands))
     )
 
 
@@ -133,7 +184,8 @@ def agreement() -> str:
     return (
         report.table("the champion on | finish | flying lap (s)", rows)
         + "\n\nAfter the same second of random actions, positions differ by at most "
-        f"{apart_m:.1g} m."
+        f"{apart_m:.1g} m. Both devices run the same equations: this tells of rounding, not of "
+        "physics."
     )
 
 
@@ -141,12 +193,14 @@ def contestant(name: str, power: int, unroll: int = 1) -> Contestant:
     """Return a contestant of 2^power environments."""
     if name == MJX:
         return mjx_contestant(2**power)
+    if name == CRAZYFLOW:
+        return crazyflow_contestant(2**power)
     return jax_contestant(name, name, 2**power, LENGTH, is_batch=False, unroll=unroll)
 
 
 def environments(powers: dict[str, tuple[int, ...]]) -> str:
-    """Return a table of decisions a second by number of environments, and smaller ones apart."""
-    names = [name for name in powers if name != MJX or find_spec("mujoco.mjx")]
+    """Return a table of decisions a second by number of environments, and of unrolled loops."""
+    names = [name for name in powers if is_measured(name)]
     rates = {
         (name, power): f"{1e6 * rate_of(contestant(name, power)):.3g}"
         for name in names
@@ -160,10 +214,13 @@ def environments(powers: dict[str, tuple[int, ...]]) -> str:
     unrolled = ", ".join(
         f"{name} {1e6 * rate_of(contestant(name, 10, UNROLL)):.3g}" for name in (PLAIN, PENDULUM)
     )
-    return report.table(header, rows) + (
-        f"\n\nWith 2^10 environments and {UNROLL} steps in the body of the loop "
-        f"(`unroll={UNROLL}` of `jax.lax.scan`), decisions/s: {unrolled}."
-    )
+    parts = [
+        report.table(header, rows),
+        *(PEERS[name] for name in names if name in PEERS),
+        f"With 2^10 environments and {UNROLL} steps in the body of the loop "
+        f"(`unroll={UNROLL}` of `jax.lax.scan`), decisions/s: {unrolled}.",
+    ]
+    return "\n\n".join(parts)
 
 
 def single_steps() -> str:
@@ -238,7 +295,7 @@ def main(cpu: bool = False) -> None:
         small = replace(Config(), num_envs=64, num_steps=8, num_minibatches=4)
         recipes, powers, steps = RECIPES, POWERS, STEPS
         if cpu:
-            recipes, powers, steps = {"cpu": small, "gpu": small}, {PLAIN: (4,)}, 4096
+            recipes, powers, steps = {"cpu": small, "gpu": small}, dict.fromkeys(POWERS, (4,)), 4096
         parts = []
         for part in (
             partial(environments, powers),
@@ -250,7 +307,7 @@ def main(cpu: bool = False) -> None:
             parts.append(part())
             print(parts[-1], end="\n\n", flush=True)
         device = jax.devices()[0].device_kind
-        parts.append(f"{device}. {report.provenance_line(report.provenance())}")
+        parts.append(f"{device}. {report.provenance_line(report.provenance(*PACKAGES))}")
     report.write_page(path, report.page("On a GPU", f"{report.command_line()}: {WHAT}", *parts))
 
 
