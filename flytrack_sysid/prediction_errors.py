@@ -7,15 +7,17 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binned_statistic_2d
 
 from flytrack_env.battery import Battery
-from flytrack_sysid.inference.prediction import (
-    MAX_S,
-    Prediction,
-    columns,
-    find_runs,
-    free_flights,
-    scored_steps,
+from flytrack_sysid.inference.free_flight import (
+    CHANNEL_OF,
+    HORIZONS_S,
+    QUANTITIES,
+    errors_of,
+    make_windows,
 )
-from flytrack_sysid.log import CHANNELS
+from flytrack_sysid.inference.free_flight import UNITS as FLIGHT_UNITS
+from flytrack_sysid.inference.one_step import Prediction, columns, scored_steps
+from flytrack_sysid.log import CHANNELS, FlightLog
+from flytrack_sysid.log_voltage import with_voltage
 from flytrack_sysid.sensors import specific_force_b
 
 UNITS = {"p": "m", "v": "m/s", "q": "1", "w": "rad/s", "a": "m/s^2", "f": "m/s^2"}
@@ -28,15 +30,9 @@ NRMSE_MEANING = {
     BY_SPREAD: "rmse over the standard deviation of the measured channel: 1 is as good as its mean",
 }
 # Free flight.
-HORIZONS_S = (0.1, 0.5, 1.0, MAX_S)
 START_EVERY_S = 0.25
-# Channel of each error, and its unit.
-QUANTITIES = {
-    "position": ("p", "m"),
-    "velocity": ("v", "m/s"),
-    "attitude": ("q", "deg"),
-    "rates": ("w", "rad/s"),
-}
+MAX_STARTS = 10_000
+SHOWN_UNITS = {**FLIGHT_UNITS, "attitude": "deg"}
 HIGH_PERCENTILE = 95.0
 # Thrust error.
 NUM_ACTION_BINS = 10
@@ -191,35 +187,10 @@ class Rollout(NamedTuple):
     def as_json(self) -> dict[str, Any]:
         """Return the numbers as JSON values."""
         errors = {
-            f"{name}_{QUANTITIES[name][1].replace('/', '_per_')}": spread._asdict()
+            f"{name}_{SHOWN_UNITS[name].replace('/', '_per_')}": spread._asdict()
             for name, spread in self.errors.items()
         }
         return {"horizon_s": self.horizon_s, "starts": self.num_starts, **errors}
-
-
-def _starts_and_ends(prediction: Prediction, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows to start from, and the rows at the horizons.
-
-    Returns:
-        Starts, (num_starts,), and ends, (num_starts, num_horizons). An end is the row nearest to
-        its horizon; -1 if the run of scored rows ends before it.
-    """
-    starts, ends = [], []
-    half_step = 0.5 * prediction.step_s
-    for first, end in find_runs(rows, prediction.record):
-        time, is_settled = prediction.log.time[first:end], prediction.is_settled[first:end]
-        if not is_settled.any():
-            continue
-        start_times = np.arange(time[np.argmax(is_settled)], time[-1], START_EVERY_S)
-        begin = np.searchsorted(time, start_times - half_step)
-        begin = begin[prediction.is_measured[first + begin]]
-        reached = np.searchsorted(time, time[begin, None] + np.array(HORIZONS_S) - half_step)
-        last = np.minimum(first + reached, len(rows) - 1)
-        starts.append(first + begin)
-        ends.append(np.where((reached < len(time)) & prediction.is_measured[last], last, -1))
-    if not starts:
-        return np.zeros(0, int), np.zeros((0, len(HORIZONS_S)), int)
-    return np.concatenate(starts), np.concatenate(ends)
 
 
 def _spread(distances: np.ndarray) -> Spread:
@@ -227,37 +198,30 @@ def _spread(distances: np.ndarray) -> Spread:
     return Spread(median, float(np.sqrt(np.mean(distances**2))), high)
 
 
-def rollout_errors(prediction: Prediction, rows: np.ndarray) -> tuple[Rollout, ...]:
-    """Return the errors of free flights from measured states, a start every 0.25 s of scored runs.
+def rollout_errors(prediction: Prediction, log: FlightLog, rows: np.ndarray) -> tuple[Rollout, ...]:
+    """Return the errors of free flights from measured states, a start every 0.25 s of scored rows.
 
     Args:
         prediction: steps from every row.
-        rows: rows that are scored, (num_rows,) bool. A flight stays within them, and begins and
+        log: the log, which may have gaps.
+        rows: its rows that are scored, (num_rows,) bool. A flight stays within them, and begins and
             ends in measured rows.
     """
-    log, lacking = prediction.log, prediction.lacking
-    names = [
-        name for name, (channel, _) in QUANTITIES.items() if channel in log and not lacking[channel]
-    ]
-    starts, ends = _starts_and_ends(prediction, rows)
-    starts, ends = starts[(ends >= 0).any(axis=1)], ends[(ends >= 0).any(axis=1)]
-    is_reached = ends >= 0
-    flights = free_flights(prediction, starts, np.where(is_reached, ends, starts[:, None] + 1))
+    windows = make_windows(with_voltage(log, prediction.model), rows, START_EVERY_S, MAX_STARTS)
+    if not len(windows.start):
+        return tuple(Rollout(horizon_s, 0, {}) for horizon_s in HORIZONS_S)
+    names = [name for name, channel in CHANNEL_OF.items() if not prediction.lacking[channel]]
+    with np.errstate(over="ignore", invalid="ignore"):  # a model may diverge
+        distances = np.linalg.norm(errors_of(prediction.model, windows), axis=-1)
+    distances[..., QUANTITIES.index("attitude")] *= 180.0 / np.pi
     rollouts = []
-    for index, horizon_s in enumerate(HORIZONS_S):
-        reaches = is_reached[:, index]
+    for horizon_s, by_window, counts in zip(HORIZONS_S, distances, windows.counts, strict=True):
         errors = {}
-        for name in names if reaches.any() else ():
-            channel = QUANTITIES[name][0]
-            with np.errstate(over="ignore", invalid="ignore"):  # a model may diverge
-                measured, at_end = (
-                    log[channel][ends[reaches, index]],
-                    flights[channel][reaches, index],
-                )
-                difference = turn_between(measured, at_end) if channel == "q" else measured - at_end
-                distances = np.linalg.norm(difference, axis=1)
-                errors[name] = _spread(np.rad2deg(distances) if channel == "q" else distances)
-        rollouts.append(Rollout(horizon_s, int(reaches.sum()), errors))
+        for name in names:
+            index = QUANTITIES.index(name)
+            if counts[:, index].any():
+                errors[name] = _spread(by_window[counts[:, index], index])
+        rollouts.append(Rollout(horizon_s, int(counts.any(axis=1).sum()), errors))
     return tuple(rollouts)
 
 

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_sysid.inference.prediction import Prediction, find_runs, free_flights
+from flytrack_sysid.inference.free_flight import fly_freely
+from flytrack_sysid.inference.one_step import Prediction, find_runs
 
 AXES = ("roll", "pitch", "yaw")
 MIN_JUMP = 0.2
@@ -96,9 +97,10 @@ def step_responses(prediction: Prediction, rows: np.ndarray) -> tuple[StepRespon
         for axis in range(len(AXES))
         for step_rows in _largest_steps(prediction, rows, axis)
     ]
-    firsts, ends = np.array([(first, end) for _, first, _, end in shown], int).reshape(-1, 2).T
-    since_first = np.arange(1, np.max(ends - firsts, initial=1))
-    flights = free_flights(prediction, firsts, firsts[:, None] + since_first)
+    if not shown:
+        return ()
+    firsts, ends = np.array([(first, end) for _, first, _, end in shown]).T
+    flights = fly_freely(prediction.model, prediction.filled, firsts, int(max(ends - firsts)) - 1)
     responses = []
     for (axis, first, step, end), rates in zip(shown, flights["w"], strict=True):
         shown_rows = slice(first + 1, end)

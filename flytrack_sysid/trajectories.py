@@ -17,20 +17,15 @@ from flytrack_env.effects import BY_NAME
 from flytrack_env.state import ACTION_SIZE, POSITION, QUATERNION, STATE_SIZE
 from flytrack_env.viz_rerun import Trajectory
 from flytrack_sysid.diagnosis.traces import Traces, traces
+from flytrack_sysid.inference.free_flight import CHANNEL_OF, HORIZONS_S, fly_freely
+from flytrack_sysid.inference.one_step import Prediction, inputs_that_lack, predict
 from flytrack_sysid.inference.parameters import with_neutral_effects
-from flytrack_sysid.inference.prediction import (
-    FLOWN,
-    MAX_S,
-    Prediction,
-    free_flights,
-    inputs_that_lack,
-    predict,
-)
 from flytrack_sysid.inference.record import fill_gaps
 from flytrack_sysid.log import IN_STATE, FlightLog, time_in_line
 
 WINDOW_S = 0.1  # of means: long enough to average out noise, short against a manoeuvre
 RESTART_S = 1.0  # of free flight: the horizon of the report's first sentence
+FLOWN = tuple(CHANNEL_OF.values())
 AWAY_M = 10.0  # from the measured path: a model that is farther away has diverged
 # 1 min at 100 Hz. The path is most of a recording, and its size grows with the power 1.5 of the
 # number of rows.
@@ -190,16 +185,17 @@ def _free_flight(timed: _Timed, name: str, model: ModelParameters) -> Trajectory
     starts, ends = _starts_and_ends(prediction)
     if not len(starts):
         return None
-    steps = np.arange(1 + int(np.ceil(MAX_S / prediction.step_s)))
+    steps = np.arange(1 + int(np.ceil(HORIZONS_S[-1] / prediction.step_s)))
     rows = starts[:, None] + steps
-    predicted = free_flights(prediction, starts, rows[:, 1:])
+    predicted = fly_freely(model, filled, starts, len(steps) - 1)
     initial = {channel: log[channel][starts[:, None]] for channel in FLOWN if channel in log}
     states = np.concatenate([states_of(initial), states_of(predicted)], axis=1)
     is_before, rows = rows < ends[:, None], np.minimum(rows, len(log) - 1)
     with np.errstate(over="ignore", invalid="ignore"):
         away_m = np.linalg.norm(states[..., POSITION] - log["p"][rows], axis=-1)
     is_finite = np.all(
-        [np.isfinite(states[..., IN_STATE[channel]]).all(axis=-1) for channel in FLOWN], axis=0
+        [np.isfinite(states[..., IN_STATE[channel]]).all(axis=-1) for channel in FLOWN],
+        axis=0,
     )
     is_near = is_finite & (away_m < AWAY_M)
     is_near[:, 0] = True

@@ -6,7 +6,7 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid import prediction_errors
-from flytrack_sysid.inference.prediction import Prediction, predict
+from flytrack_sysid.inference.one_step import Prediction, predict
 from flytrack_sysid.inference.record import fill_gaps
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_motion import motion_notes, required_motion
@@ -135,12 +135,13 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
     model = model._replace(motion=required_motion(log) or model.motion)
     contradictions += voltage_notes(log, model.battery)
     filled = fill_gaps(log)
-    prediction, rows = predict(model, filled), rows[filled.behind]
+    prediction = predict(model, filled)
+    rollouts = prediction_errors.rollout_errors(prediction, log, rows)
+    rows = rows[filled.behind]
     notes = [*contradictions, *_notes_of(prediction)]
     one_step = prediction_errors.one_step_errors(prediction, rows)
     if not one_step.num_steps:
         notes.append("one step: no judged row is followed by a judged row")
-    rollouts = prediction_errors.rollout_errors(prediction, rows)
     too_long = [f"{rollout.horizon_s:g} s" for rollout in rollouts if not rollout.num_starts]
     if too_long:
         notes.append(f"free flight of {', '.join(too_long)}: no judged stretch is that long")

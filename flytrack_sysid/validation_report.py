@@ -14,7 +14,7 @@ from flytrack_sysid.plots import draw_steps, draw_thrust, png_of
 from flytrack_sysid.prediction_errors import (
     NORMALISED_BY,
     NRMSE_MEANING,
-    QUANTITIES,
+    SHOWN_UNITS,
     START_EVERY_S,
     UNITS,
     ThrustError,
@@ -59,7 +59,7 @@ def _rollout_table(validation: Validation) -> Table:
     for rollout in validation.rollouts:
         for name, spread in rollout.errors.items():
             numbers = [_number(number) for number in spread]
-            quantity = f"{name} ({QUANTITIES[name][1]})"
+            quantity = f"{name} ({SHOWN_UNITS[name]})"
             rows.append([f"{rollout.horizon_s:g} s", quantity, *numbers, str(rollout.num_starts)])
     caption = f"Free flight: a start every {START_EVERY_S:g} s of judged flight"
     return Table(["after", "error", "median", "rms", "95th pct", "starts"], rows, caption)

@@ -26,8 +26,8 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis.refinement import FlightErrors
-from flytrack_sysid.inference.prediction import columns, predict
-from flytrack_sysid.inference.prediction_windows import HORIZONS_S, Windows
+from flytrack_sysid.inference.free_flight import HORIZONS_S, Windows
+from flytrack_sysid.inference.one_step import columns, predict
 from flytrack_sysid.inference.record import fill_gaps
 from flytrack_sysid.log import FlightLog, usual_step
 from flytrack_sysid.split import held_out_rows

@@ -29,7 +29,7 @@ from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_sysid import FlightLog, import_log
 from flytrack_sysid.diagnosis import joined
 from flytrack_sysid.diagnosis.refinement import sample_windows
-from flytrack_sysid.inference.prediction_windows import HORIZONS_S, QUANTITIES, make_windows
+from flytrack_sysid.inference.free_flight import HORIZONS_S, QUANTITIES, make_windows
 from flytrack_sysid.log import usual_step
 
 BETAFLIGHT = "betaflight_acro_log"

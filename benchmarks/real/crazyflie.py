@@ -35,9 +35,9 @@ from flytrack_sysid import FlightLog, import_log
 from flytrack_sysid.diagnosis import joined, refinement
 from flytrack_sysid.diagnosis.diagnose import split
 from flytrack_sysid.inference.chunks import cut_chunks, thinned
+from flytrack_sysid.inference.free_flight import HORIZONS_S, QUANTITIES, make_windows
 from flytrack_sysid.inference.noise import fit_noise
 from flytrack_sysid.inference.parameters import STICKS, TAUS, THRUST_COEFFS, from_vector
-from flytrack_sysid.inference.prediction_windows import HORIZONS_S, QUANTITIES, make_windows
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import CANDIDATES
 from flytrack_sysid.inference.search import SearchState

@@ -24,12 +24,7 @@ from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.evidence import words_of
 from flytrack_sysid.diagnosis.refinement import FlightErrors
 from flytrack_sysid.diagnosis.report import describe_verdict
-from flytrack_sysid.inference.prediction_windows import (
-    QUANTITIES,
-    Windows,
-    cut_batches,
-    prediction_errors,
-)
+from flytrack_sysid.inference.free_flight import Windows, errors_of
 
 Record = dict[str, Any]
 STYLES: dict[str, dict[str, Any]] = {
@@ -71,15 +66,9 @@ def import_mapped(files: Path | Sequence[Path], kind: str, mapping: str) -> Impo
         return import_log(files, kind, path)
 
 
-_errors = jax.jit(prediction_errors)
-
-
 def test_model(model: ModelParameters, windows: Windows) -> FlightErrors:
-    """Return a model's errors on windows; inside ``jax.enable_x64(True)``."""
-    model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
-    parts = [np.asarray(_errors(model, chunk)) for chunk in cut_batches(windows)]
-    errors = np.concatenate(parts, axis=1)[:, : len(windows.start)]
-    return FlightErrors(errors.reshape(1, *errors.shape[:-1], len(QUANTITIES), 3), windows)
+    """Return a model's errors on windows."""
+    return FlightErrors(errors_of(model, windows)[None], windows)
 
 
 def format_number(value: float | None, unit: str = "1") -> str:

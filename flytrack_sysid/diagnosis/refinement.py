@@ -28,8 +28,7 @@ from flytrack_env.effects import BY_NAME, LearnedLaw
 from flytrack_sysid.diagnosis.model_selection import ablate_all
 from flytrack_sysid.diagnosis.onset import ended
 from flytrack_sysid.diagnosis.vetoes import Selection
-from flytrack_sysid.inference.parameters import DRAIN, from_vector, in_batches
-from flytrack_sysid.inference.prediction_windows import (
+from flytrack_sysid.inference.free_flight import (
     HORIZONS_S,
     QUANTITIES,
     UNITS,
@@ -39,6 +38,7 @@ from flytrack_sysid.inference.prediction_windows import (
     make_windows,
     prediction_errors,
 )
+from flytrack_sysid.inference.parameters import DRAIN, from_vector, in_batches
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import (
     Candidate,

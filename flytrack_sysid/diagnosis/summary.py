@@ -37,6 +37,7 @@ from flytrack_sysid.diagnosis.result import (
 )
 from flytrack_sysid.diagnosis.unexplained import is_like_drift
 from flytrack_sysid.inference.chunks import measured_voltage_range
+from flytrack_sysid.inference.free_flight import HORIZONS_S, QUANTITIES
 from flytrack_sysid.inference.parameters import (
     DRAIN,
     MAX_RATES,
@@ -46,7 +47,6 @@ from flytrack_sysid.inference.parameters import (
     from_vector,
     range_of,
 )
-from flytrack_sysid.inference.prediction_windows import HORIZONS_S, QUANTITIES
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import (
     BASE_CAUSES,

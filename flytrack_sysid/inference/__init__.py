@@ -6,7 +6,7 @@ A module imports only modules before it:
 - ``parameters``: a model's parameters as one vector, with names and bounds.
 - ``trace_cache``: programs that are traced once.
 - ``replay``: a model's step from every row.
-- ``prediction``, ``prediction_windows``: free flight from measured states.
+- ``one_step``: a model's step from every row; ``free_flight``: many steps from measured states.
 - ``lateness``, ``chunks``: clocks of the channels, and the chunks a log is cut into.
 - ``noise``: what the residuals of a log are made of, and whitening.
 - ``problem``: residuals of many models on many chunks, and their slopes.

@@ -94,7 +94,11 @@ def test_inference_imports_neither_fit_nor_diagnosis():
     above = ("diagnosis", "fit", "estimate", "validate", "prediction_errors")
     for module, targets in import_graph().items():
         if module.startswith("flytrack_sysid.inference"):
-            assert not {name for name in targets if name.removeprefix("flytrack_sysid.").split(".")[0] in above}, module
+            assert not {
+                name
+                for name in targets
+                if name.removeprefix("flytrack_sysid.").split(".")[0] in above
+            }, module
 
 
 def test_the_black_boxs_plant_is_reached_only_through_its_artifact():

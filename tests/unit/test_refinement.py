@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.diagnosis import model_of
 from flytrack_sysid.diagnosis.refinement import FlightTest, errors_at, refine, sample_windows
 from flytrack_sysid.inference.chunks import cut_chunks
-from flytrack_sysid.inference.prediction_windows import QUANTITIES
+from flytrack_sysid.inference.free_flight import QUANTITIES
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import CANDIDATES
 from flytrack_sysid.inference.search import FittedModel, SearchState

@@ -11,10 +11,10 @@ import pytest
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import CommandDelay, QuadraticDrag
 from flytrack_env.state import STATE_SIZE, unpack
-from flytrack_sysid.inference.prediction import columns, predict
+from flytrack_sysid.inference.free_flight import QUANTITIES
+from flytrack_sysid.inference.one_step import columns, predict
 from flytrack_sysid.inference.record import MAX_DOUBT, fill_gaps
 from flytrack_sysid.log import log_of_states
-from flytrack_sysid.prediction_errors import QUANTITIES
 from flytrack_sysid.sensors import specific_force_b
 from flytrack_sysid.split import held_out_rows
 from flytrack_sysid.steps import MAX_PER_AXIS
@@ -75,7 +75,7 @@ def test_truth_has_no_error(exact):
     assert set(exact.one_step.channels) == {"p", "v", "q", "w", "a"}
     assert max(nrmse(exact).values()) < 1e-6
     assert exact.one_step.channels["q"].angle_rms_deg < 1e-6
-    assert [rollout.num_starts for rollout in exact.rollouts] == [60, 50, 40, 20]
+    assert [rollout.num_starts for rollout in exact.rollouts] == [50, 45, 40, 30, 10]
     for rollout in exact.rollouts:
         assert max(spread.p95 for spread in rollout.errors.values()) < 1e-5
     assert exact.thrust.total_rms_n < 1e-5
@@ -99,7 +99,7 @@ def test_wrong_lag_shows_in_rates_and_steps_only_of_its_axis(log):
     assert by_axis[1] > 1e-3 and max(by_axis[0], by_axis[2]) < 1e-9
     assert {step.axis for step in slow.steps if step.rms > 0.1} == {"pitch"}
     assert slow.thrust.total_rms_n < 1e-5
-    assert slow.rollouts[1].errors["attitude"].p95 > 0.5
+    assert slow.rollouts[2].errors["attitude"].p95 > 0.5
 
 
 def test_wrong_thrust_shows_in_the_map_by_its_formula(log):
@@ -121,7 +121,7 @@ def test_delay_is_flown_with_its_memory():
     for known in (validate(delayed, log), validate(delayed, log.without("uprev"))):
         assert max(nrmse(known).values()) < 1e-6
         assert max(step.rms for step in known.steps) < 1e-5
-        assert max(known.rollouts[2].errors[name].p95 for name in QUANTITIES) < 1e-5
+        assert max(known.rollouts[3].errors[name].p95 for name in QUANTITIES) < 1e-5
     missing = validate(TRUTH, log)
     assert min(step.rms for step in missing.steps) > 0.05
 

@@ -1,4 +1,4 @@
-"""Multi-step prediction: free flight from measured states, many windows at once, differentiable.
+"""Free flight from measured states, many windows at once; differentiable in the model.
 
 A window begins with a lead-in. In the lead-in, the state of each row is the measured one, and the
 commands settle the applied action and the memories of effects. If there is a gyro, the body rates
@@ -17,10 +17,12 @@ from flytrack_env.dynamics import ModelParameters, advance, body_rates, observe_
 from flytrack_env.effects import MAX_DELAY_STEPS, ImuLatency, at_row, start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
-from flytrack_sysid.inference.prediction import SETTLING_S
-from flytrack_sysid.inference.record import Record, build_record, fill_gaps
+from flytrack_sysid.inference.one_step import SETTLING_S, in_float64
+from flytrack_sysid.inference.record import Filled, Record, build_record, fill_gaps
 from flytrack_sysid.inference.replay import measured_drone, where_true
+from flytrack_sysid.inference.trace_cache import fast_jit
 from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.log_voltage import with_voltage
 
 HORIZONS_S = (0.1, 0.25, 0.5, 1.0, 2.0)
 # Quantities of an error, three components each, in this order, and the channels that measure them.
@@ -103,7 +105,7 @@ def make_windows(
     """
     filled = fill_gaps(log)
     step_s = float(np.median(usual_step(filled.log)))
-    lead, ends = round(SETTLING_S / step_s), np.round(np.array(HORIZONS_S) / step_s).astype(int)
+    lead, ends = _lead_and_ends(filled.log)
     is_scored = scored_rows[filled.behind] & (filled.source_row >= 0)
     begins = filled.log.is_start()
     segment = np.cumsum(begins)
@@ -123,20 +125,41 @@ def make_windows(
     if len(starts) > max_windows:
         kept = np.linspace(0, len(starts) - 1, max_windows).round().astype(int)
         starts, is_reached = starts[kept], is_reached[:, kept]
-    index = np.minimum(starts + np.arange(-lead, ends[-1] + 1)[:, None], len(rows) - 1)
-    has_channel = np.array([name in log for name in CHANNEL_OF.values()])
-    gyro = filled.log["w"] if "w" in log else np.zeros((len(rows), 3))
-    record = build_record(filled)
-    return Windows(
-        record=Record(*(leaf[index] for leaf in record)),
-        is_free=np.arange(len(index)) > lead,
-        ends=lead + ends,
-        gyro_b=gyro[index],
-        has_gyro=np.array("w" in log),
-        counts=is_reached[..., None] & has_channel,
+    windows = _windows_at(filled, starts)
+    return windows._replace(
+        counts=is_reached[..., None] & np.array([name in log for name in CHANNEL_OF.values()]),
         block=run[starts] * len(rows) + ((starts - first[starts]) * step_s / BLOCK_S).astype(int),
         start=filled.behind[starts],
     )
+
+
+def _windows_at(filled: Filled, starts: np.ndarray) -> Windows:
+    """Return windows that start at some rows of a log without gaps; none of them counts.
+
+    Where a flight begins within a lead-in, its first row comes repeatedly before the others.
+    """
+    log = filled.log
+    lead, ends = _lead_and_ends(log)
+    begins = np.flatnonzero(log.is_start())
+    first = begins[np.searchsorted(begins, starts, side="right") - 1]
+    index = np.clip(starts + np.arange(-lead, ends[-1] + 1)[:, None], first, len(log) - 1)
+    gyro_b = log["w"] if "w" in log else np.zeros((len(log), 3))
+    return Windows(
+        record=Record(*(leaf[index] for leaf in build_record(filled))),
+        is_free=np.arange(len(index)) > lead,
+        ends=lead + ends,
+        gyro_b=gyro_b[index],
+        has_gyro=np.array("w" in log),
+        counts=np.zeros((len(ends), len(starts), len(QUANTITIES)), bool),
+        block=np.zeros(len(starts), int),
+        start=starts,
+    )
+
+
+def _lead_and_ends(log: FlightLog) -> tuple[int, np.ndarray]:
+    """Return the number of rows of a lead-in, and those from its end to each horizon."""
+    step_s = float(np.median(usual_step(log)))
+    return round(SETTLING_S / step_s), np.round(np.array(HORIZONS_S) / step_s).astype(int)
 
 
 def _turn(measured: Quaternion, predicted: Quaternion) -> jax.Array:
@@ -165,10 +188,10 @@ def _gyro_in_time(
     return reading, model.with_effects(ImuLatency(jnp.zeros_like(latency_s)))
 
 
-def _fly(model: ModelParameters, record: Record, gyro_b: jax.Array, windows: Windows) -> jax.Array:
-    """Return the errors of one window at its horizons, (horizons, 12)."""
+def _fly(model: ModelParameters, record: Record, gyro_b: jax.Array, windows: Windows) -> Drone:
+    """Return the drone of one window after each row; its body rates are those that a gyro reads."""
 
-    def step(carry: tuple[Drone, Any], inputs: tuple[Record, Any, Any]) -> tuple[Any, Any]:
+    def step(carry: tuple[Drone, Any], inputs: tuple[Record, Any, Any]) -> tuple[Any, Drone]:
         (predicted, memories), (row, is_free, gyro) = carry, inputs
         applied = where_true(row.is_applied_known, Action(*row.applied), predicted.applied)
         memories = at_row(memories, row.time_s)
@@ -177,22 +200,29 @@ def _fly(model: ModelParameters, record: Record, gyro_b: jax.Array, windows: Win
         observed = observe_rates(drone, memories, drone.rates_b + gyro_offset, row.step_s, model)
         drone, memories = where_true(windows.has_gyro & ~is_free, observed, (drone, memories))
         after, memories_after = advance(drone, memories, Action(*row.command), row.step_s, model)
-        gyro = read_gyro(after, memories_after, row.step_s, model)
-        return (after, memories_after), (after.pos_w, after.vel_w, after.quat, gyro)
+        read = read_gyro(after, memories_after, row.step_s, model)
+        return (after, memories_after), after._replace(rates_b=read)
 
     read_b, in_time = _gyro_in_time(gyro_b, record.step_s, model)
     first = jax.tree.map(lambda leaf: leaf[0], record)
     applied = Action(*first.applied)
     start = measured_drone(first, applied, body_rates(applied, model.max_rate))
     memories = start_memories(model.effects, start, MAX_DELAY_STEPS)
-    _, predicted = jax.lax.scan(step, (start, memories), (record, windows.is_free, read_b))
-    pos, vel, quat, gyro = jax.tree.map(lambda leaf: leaf[windows.ends - 1], predicted)
+    return jax.lax.scan(step, (start, memories), (record, windows.is_free, read_b))[1]
+
+
+def _errors(
+    model: ModelParameters, record: Record, gyro_b: jax.Array, windows: Windows
+) -> jax.Array:
+    """Return the errors of one window at its horizons, (horizons, 12)."""
+    flown = _fly(model, record, gyro_b, windows)
+    drone = jax.tree.map(lambda leaf: leaf[windows.ends - 1], flown)
     row, gyro_b = jax.tree.map(lambda leaf: leaf[windows.ends], (record, gyro_b))
-    turn = jax.vmap(_turn)(Quaternion(*row.quat.T), quat)
-    stacked = [jnp.stack(vector, axis=-1) for vector in (gyro, vel, pos)]
-    return jnp.concatenate(
-        [turn, gyro_b - stacked[0], row.vel_w - stacked[1], row.pos_w - stacked[2]], axis=-1
+    turn = jax.vmap(_turn)(Quaternion(*row.quat.T), drone.quat)
+    rates, vel, pos = (
+        jnp.stack(vector, axis=-1) for vector in (drone.rates_b, drone.vel_w, drone.pos_w)
     )
+    return jnp.concatenate([turn, gyro_b - rates, row.vel_w - vel, row.pos_w - pos], axis=-1)
 
 
 def prediction_errors(model: ModelParameters, windows: Windows) -> jax.Array:
@@ -202,7 +232,57 @@ def prediction_errors(model: ModelParameters, windows: Windows) -> jax.Array:
         Errors, (horizons, windows, 12): turn (rad, body frame), rates (rad/s), velocity (m/s) and
         position (m), three components each; 0 where nothing is scored.
     """
-    fly = jax.vmap(lambda record, gyro: _fly(model, record, gyro, windows), in_axes=1, out_axes=1)
+    fly = jax.vmap(
+        lambda record, gyro: _errors(model, record, gyro, windows), in_axes=1, out_axes=1
+    )
     return jnp.where(
         jnp.repeat(windows.counts, 3, axis=-1), fly(windows.record, windows.gyro_b), 0.0
     )
+
+
+_errors_of_batch = fast_jit(prediction_errors)
+
+
+def errors_of(model: ModelParameters, windows: Windows) -> np.ndarray:
+    """Return the errors of one model, (horizons, windows, quantities, 3) float64."""
+    with jax.enable_x64(True):
+        batches = [
+            np.asarray(_errors_of_batch(in_float64(model), batch)) for batch in cut_batches(windows)
+        ]
+    errors = np.concatenate(batches, axis=1)[:, : len(windows.start)]
+    return errors.reshape(*errors.shape[:-1], len(QUANTITIES), 3)
+
+
+@fast_jit
+def _flights(model: ModelParameters, windows: Windows) -> Drone:
+    fly = jax.vmap(lambda record, gyro: _fly(model, record, gyro, windows), in_axes=1, out_axes=1)
+    return fly(windows.record, windows.gyro_b)
+
+
+def fly_freely(
+    model: ModelParameters, filled: Filled, starts: np.ndarray, num_steps: int
+) -> dict[str, np.ndarray]:
+    """Return free flights from measured rows under the logged commands, of at most 2 s.
+
+    Args:
+        model: the model that flies.
+        filled: the log without gaps.
+        starts: rows to start from, at least one, (num_starts,).
+        num_steps: steps of every flight; beyond the end of the log the last command is held.
+
+    Returns:
+        p, v, q, w after each step, (num_starts, num_steps, size) float64, in the units of the log.
+    """
+    filled = filled._replace(log=with_voltage(filled.log, model))
+    windows = _windows_at(filled, starts)
+    free = slice(windows.first_free - 1, windows.first_free - 1 + num_steps)
+    with jax.enable_x64(True):
+        batches = [_flights(in_float64(model), batch) for batch in cut_batches(windows)]
+    result = {}
+    for name, leaf in (("p", "pos_w"), ("v", "vel_w"), ("q", "quat"), ("w", "rates_b")):
+        flown = [
+            np.stack([np.asarray(part)[free] for part in getattr(batch, leaf)], axis=-1)
+            for batch in batches
+        ]
+        result[name] = np.concatenate(flown, axis=1)[:, : len(starts)].swapaxes(0, 1)
+    return result
