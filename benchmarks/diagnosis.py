@@ -80,7 +80,9 @@ def model_of(truth: hidden.Truth) -> ModelParameters:
     )
 
 
-def make_log(trial: Trial) -> tuple[hidden.Truth, FlightLog, FlightLog, ModelParameters, Rng]:
+def make_log(
+    trial: Trial, seconds: float = SECONDS
+) -> tuple[hidden.Truth, FlightLog, FlightLog, ModelParameters, Rng]:
     """Return a plant, its clean and its noisy flight, its team's model, and its generator.
 
     The generator is the random one that drew the plant.
@@ -90,7 +92,7 @@ def make_log(trial: Trial) -> tuple[hidden.Truth, FlightLog, FlightLog, ModelPar
     draw, noise = ROWS[trial.row]
     rng = np.random.default_rng([trial.seed, trial.number, list(ROWS).index(trial.row)])
     truth = replace(draw(rng), motion=trial.motion, step_s=1.0 / trial.rate)
-    clean = hidden.fly(truth, SECONDS, rng)
+    clean = hidden.fly(truth, seconds, rng)
     return truth, clean, hidden.measure(clean, noise, rng), model_of(truth), rng
 
 
