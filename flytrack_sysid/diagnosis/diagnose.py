@@ -345,15 +345,16 @@ def name_causes(vetted: VettedModel, parts: Split) -> NamedModel:
     contradicted = [
         name for name, veto in vetted.rejected.items() if veto is contradicted_on_held_out
     ]
-    extended = model if refined.fit is None else model._replace(vector=refined.fit.vector)
+    fit = refined.fit
+    extended = model if fit is None else model._replace(vector=fit.vector)
     causes = summary.with_refined_values([*effects, *in_base], refined, extended.vector)
     spans = find_spans(selection, test, parts.log)
     causes = tuple(replace(named, **spans.get(named.effect, {})) for named in causes)
 
     def without(cause: Cause) -> np.ndarray:
-        if refined.fit is None:
+        if fit is None:
             return summary.vector_without(cause, selection, linearization)
-        return refined.vector_without(cause.effect)
+        return refined.vector_without(cause.effect, fit)
 
     causes, negligible = split_by_size(
         causes, state.problem, extended.vector, refined.flight_errors, without
@@ -411,15 +412,6 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
         extended = extended._replace(vector=vector)
         test, refined = test.with_law(learned.effect), refined.with_law(learned.effect)
     prediction = summary.summarize_prediction(refined, flying)
-    notes = [
-        *outlier_notes(outliers),
-        *summary.collect_warnings(problem, (*causes, *beyond), named.lost),
-        *summary.refinement_notes(vetted.refined, selection.model),
-        *summary.stand_in_notes(selection, flying["extended"]),
-        *summary.given_law_notes(problem, unexplained),
-        *summary.unseen_at_rest_notes(vetted.rejected),
-        *describe_changes(selection, linearization, parts.log),
-    ]
     all_unexplained = summary.with_lost_causes(unexplained, named.lost)
     all_unexplained = replace(all_unexplained, flagged=all_unexplained.flagged or bool(beyond))
     return Diagnosis(
@@ -442,7 +434,11 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
         voltages=measured_voltage_range(problem.chunks),
         source=Path(parts.logged.source).name,
         sha256=parts.logged.sha256,
-        warnings=(*parts.warnings, *notes),
+        warnings=(
+            *parts.warnings,
+            *outlier_notes(outliers),
+            *notes_on(named, vetted, parts, flying),
+        ),
         prediction=prediction,
         changed=summary.changed_parameters(linearization, extended, vetted.refined),
         half_response_s=summary.summarize_half_responses(
@@ -451,6 +447,22 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
         outliers=outliers,
         learned=learned,
     )
+
+
+def notes_on(
+    named: NamedModel, vetted: VettedModel, parts: Split, flying: Mapping[str, np.ndarray]
+) -> list[str]:
+    """Return what a reader has to know about the causes and about what else was found."""
+    selection = named.selection
+    problem = selection.state.problem
+    return [
+        *summary.collect_warnings(problem, (*vetted.refused, *named.found), named.lost),
+        *summary.refinement_notes(vetted.refined, selection.model),
+        *summary.stand_in_notes(selection, flying["extended"]),
+        *summary.given_law_notes(problem, selection.unexplained),
+        *summary.unseen_at_rest_notes(vetted.rejected),
+        *describe_changes(selection, named.linearization, parts.log),
+    ]
 
 
 def check_log(log: FlightLog) -> None:

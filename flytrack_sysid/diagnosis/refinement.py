@@ -429,13 +429,12 @@ class Refined(NamedTuple):
         costs = np.sqrt(losses[1:] / losses[0]) - 1.0
         return {name: float(cost) for name, cost in zip(self.without, costs, strict=True)}
 
-    def vector_without(self, effect: str) -> np.ndarray:
+    def vector_without(self, effect: str, fit: Fit) -> np.ndarray:
         """Return the fitted model without an effect, or with nominal base parameters."""
-        assert self.fit is not None
         if effect in self.without:
             return self.without[effect]
         of_sensor = [name for name in self.problem.names if name.startswith(f"{effect}.")]
-        return self.problem.at_start(self.fit.vector, base_fields(effect) or of_sensor)
+        return self.problem.at_start(fit.vector, base_fields(effect) or of_sensor)
 
     def flight_errors(self, vector: np.ndarray) -> dict[str, float]:
         """Return the held-out errors of free flight by horizon in seconds; empty without a test.
@@ -594,12 +593,13 @@ class _Refinement(NamedTuple):
         flight_test = self.flight_test.seeing(fit.vector)
         base = target.fitted(self.base, self.indices(problem, ()), MAX_ROUNDS).vector
         refined = unrefined._replace(fit=fit, base=base, problem=problem, flight_test=flight_test)
-        return self._eliminate(refined, target)
+        return self._eliminate(refined, fit, flight_test, target)
 
-    def _eliminate(self, refined: Refined, target: Target) -> Refined:
+    def _eliminate(
+        self, refined: Refined, fit: Fit, flight_test: FlightTest, target: Target
+    ) -> Refined:
         """Remove effects that are not needed, or that make any horizon worse."""
-        assert refined.fit is not None and refined.flight_test is not None
-        flight_test, fit, without = refined.flight_test, refined.fit, {}
+        without: dict[str, np.ndarray] = {}
         kept = [
             candidate
             for candidate in refined.kept
