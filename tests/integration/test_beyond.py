@@ -15,7 +15,7 @@ from flytrack_sysid.diagnosis import diagnose, text_of, write_diagnosis
 
 pytestmark = pytest.mark.slow
 
-SECONDS = 60.0
+SECONDS, SHORT_S = 60.0, 30.0
 BUMP_MS, WIDTH_MS = 6.0, 1.0
 
 
@@ -25,15 +25,15 @@ PEAK = hidden.Outside(
 LOAD = hidden.Outside("payload", ("airspeed",), "force", 1.5, {"string_m": 0.6})
 
 
-def flights(seed, law=PEAK):
+def flights(seed, law=PEAK, seconds=SECONDS):
     """Return a plant with a law, a measured and a clean flight.
 
     By default the law is drag that peaks at an airspeed.
     """
     rng = np.random.default_rng(seed)
     truth = replace(hidden.draw_base(rng), outside=law, motion="fine")
-    log = hidden.measure(hidden.fly(truth, SECONDS, rng), "sensors", rng)
-    return truth, log, hidden.fly(truth, SECONDS, rng)
+    log = hidden.measure(hidden.fly(truth, seconds, rng), "sensors", rng)
+    return truth, log, hidden.fly(truth, seconds, rng)
 
 
 def share_removed(found, clean):
@@ -68,7 +68,7 @@ def test_a_law_is_found_with_its_numbers(tmp_path):
 
 
 def test_nothing_is_learnt_beside_a_law_of_another_log():
-    truth, log, _ = flights(71)
+    truth, log, _ = flights(71, seconds=SHORT_S)
     too_small = Term(
         "force", "air", (Factor("airspeed", "bump", (BUMP_MS, WIDTH_MS)),), (-0.1,), (0.0,)
     )
@@ -85,7 +85,7 @@ def test_a_thermal_that_held_out_rows_do_not_pass_is_found():
 
 
 def test_a_load_on_a_string_stays_unexplained():
-    truth, log, clean = flights(73, LOAD)
+    truth, log, clean = flights(73, LOAD, SHORT_S)
     found = diagnose(log, model_of(truth))
     assert "unexplained" in found.verdict and not found.causes
     assert found.learned is None or share_removed(found, clean) > 0.0
