@@ -18,7 +18,10 @@ from flytrack_env.effects.base import (
     AccelerometerContext,
     BatteryContext,
     CommandContext,
+    Effects,
     ForceContext,
+    Memories,
+    Rates,
     RatesContext,
     StepContext,
 )
@@ -57,7 +60,7 @@ class ModelParameters(NamedTuple):
     m: Scalar
     g: Scalar
     battery_drain_v_per_min: Scalar = 1.0
-    effects: tuple[Any, ...] = ()
+    effects: Effects = ()
     motion: Motion = Motion.HANDOUT
     battery: Battery = Battery()
 
@@ -149,13 +152,13 @@ def start_rates(drone: Drone, params: ModelParameters) -> Vec3:
 
 def _rates(
     drone: Drone,
-    memories: tuple[Any, ...],
+    memories: Memories,
     applied: Action,
     applied_slope: Action,
     elapsed_s: Scalar,
     params: ModelParameters,
-    first_rates: tuple[Vec3, ...] = (),
-) -> tuple[Vec3, ...]:
+    first_rates: Rates = (),
+) -> Rates:
     """Return the body rates of an applied action before each effect, and after all of them.
 
     Args:
@@ -172,7 +175,7 @@ def _rates(
 
 def _force_context(
     drone: Drone,
-    memories: tuple[Any, ...],
+    memories: Memories,
     applied: Action,
     body_axes_w: tuple[Vec3, Vec3, Vec3],
     params: ModelParameters,
@@ -190,7 +193,7 @@ def _force_context(
 
 
 def _forces(
-    context: ForceContext, memories: tuple[Any, ...], params: ModelParameters
+    context: ForceContext, memories: Memories, params: ModelParameters
 ) -> tuple[Vec3, Vec3]:
     """Return acceleration, world, and specific force, body, m/s^2, with what effects add."""
     axes, thrust_acc = context.body_axes_w, context.thrust_acc
@@ -209,13 +212,13 @@ class Moved(NamedTuple):
     """A step: the drone after it, what effects remember then, and what an accelerometer reads."""
 
     after: Drone
-    memories: tuple[Any, ...]
+    memories: Memories
     context: AccelerometerContext
 
 
 def advance(
-    drone: Drone, memories: tuple[Any, ...], command: Action, dt: Scalar, params: ModelParameters
-) -> tuple[Drone, tuple[Any, ...]]:
+    drone: Drone, memories: Memories, command: Action, dt: Scalar, params: ModelParameters
+) -> tuple[Drone, Memories]:
     """Return the drone ``dt`` seconds later under a held command, and the memories of its effects.
 
     Commands are not clipped here.
@@ -227,7 +230,7 @@ def advance(
 
 
 def move(
-    drone: Drone, memories: tuple[Any, ...], command: Action, dt: Scalar, params: ModelParameters
+    drone: Drone, memories: Memories, command: Action, dt: Scalar, params: ModelParameters
 ) -> Moved:
     """Return the step of ``advance`` with what sensors need (``read_sensors``)."""
     if params.motion is Motion.CONTINUOUS:
@@ -245,14 +248,14 @@ class _Response(NamedTuple):
     """
 
     applied: Action
-    memories: tuple[Any, ...]
+    memories: Memories
     acting: Action
     tau: Action
 
 
 def _respond(
     drone: Drone,
-    memories: tuple[Any, ...],
+    memories: Memories,
     command: Action,
     dt: Scalar,
     span: tuple[float, float],
@@ -284,7 +287,7 @@ def _respond(
 
 def _voltage(
     drone: Drone,
-    memories: tuple[Any, ...],
+    memories: Memories,
     applied: Action,
     elapsed_s: Scalar,
     params: ModelParameters,
@@ -296,7 +299,7 @@ def _voltage(
 
 
 def _move_at_once(
-    drone: Drone, memories: tuple[Any, ...], command: Action, dt: Scalar, params: ModelParameters
+    drone: Drone, memories: Memories, command: Action, dt: Scalar, params: ModelParameters
 ) -> Moved:
     """Return the step of a simulator that takes each quantity once.
 
@@ -357,11 +360,11 @@ class _Instant(NamedTuple):
 
     applied: Action
     battery_v: Scalar
-    rates: tuple[Vec3, ...]
+    rates: Rates
 
 
 def _lag_within_step(
-    drone: Drone, memories: tuple[Any, ...], command: Action, dt: Scalar, params: ModelParameters
+    drone: Drone, memories: Memories, command: Action, dt: Scalar, params: ModelParameters
 ) -> tuple[tuple[_Instant, _Instant, _Instant], _Response]:
     """Return the beginning, middle and end of a step under a held command.
 
@@ -373,7 +376,7 @@ def _lag_within_step(
         applied: Action,
         elapsed_s: Scalar,
         response: _Response,
-        first_rates: tuple[Vec3, ...] = (),
+        first_rates: Rates = (),
     ) -> _Instant:
         now = zip(response.acting, applied, response.tau, strict=True)
         slope = Action(*((target - current) / tau for target, current, tau in now))
@@ -395,7 +398,7 @@ def _lag_within_step(
 
 
 def _move_continuously(
-    drone: Drone, memories: tuple[Any, ...], command: Action, dt: Scalar, params: ModelParameters
+    drone: Drone, memories: Memories, command: Action, dt: Scalar, params: ModelParameters
 ) -> Moved:
     """Return the step of a drone whose rates and force change within it.
 
@@ -465,8 +468,8 @@ def _move_continuously(
 
 
 def observe_rates(
-    drone: Drone, memories: tuple[Any, ...], rates_b: Vec3, dt: Scalar, params: ModelParameters
-) -> tuple[Drone, tuple[Any, ...]]:
+    drone: Drone, memories: Memories, rates_b: Vec3, dt: Scalar, params: ModelParameters
+) -> tuple[Drone, Memories]:
     """Return a drone with measured body rates, rad/s, and the memories of its effects.
 
     A rate loop with a memory takes up how far they are from the model's; where there is none, the
@@ -492,7 +495,7 @@ class Reading(NamedTuple):
     force_b: Vec3
 
 
-def read_gyro(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: ModelParameters) -> Vec3:
+def read_gyro(drone: Drone, memories: Memories, dt: Scalar, params: ModelParameters) -> Vec3:
     """Return the body rates that the gyro of a drone reads, rad/s.
 
     Args:
@@ -502,7 +505,7 @@ def read_gyro(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: Model
     return effects.fold("gyro", params.effects, memories, drone.rates_b, dt)
 
 
-def sensed(drone: Drone, memories: tuple[Any, ...], dt: Scalar, params: ModelParameters) -> Drone:
+def sensed(drone: Drone, memories: Memories, dt: Scalar, params: ModelParameters) -> Drone:
     """Return the drone as its sensors report it: gyro and pose; the rest is true.
 
     Args:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from flytrack_env.battery import Battery
 from flytrack_env.dynamics import ModelParameters, advance, sensed
 from flytrack_env.effects import DEFAULT_DELAY_STEPS, start_memories
+from flytrack_env.effects.base import Memories
 from flytrack_env.quaternion import Scalar
 from flytrack_env.state import Action, Drone
 
@@ -56,7 +57,7 @@ class SimulatorState(NamedTuple):
     """The drone, and memories: what each effect of the model remembers, None for most."""
 
     drone: Drone
-    memories: tuple[Any, ...]
+    memories: Memories
 
 
 class Simulator(Plant):

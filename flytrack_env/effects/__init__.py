@@ -15,8 +15,11 @@ from flytrack_env.effects.base import (
     STAGES,
     CommandContext,
     Effect,
+    Effects,
+    Memories,
     Pose,
     Range,
+    Rates,
     RatesContext,
     StepContext,
 )
@@ -138,7 +141,7 @@ def check_parameters(parameters: Any, dt: Any, delay_steps: int = DEFAULT_DELAY_
             raise ValueError(f"{effect.name}.{name}: found {value}, expected {expected}")
 
 
-def merge(present: tuple[Any, ...], *added: Any) -> tuple[Any, ...]:
+def merge(present: Effects, *added: Any) -> Effects:
     """Return parameters of effects in the order of ``ORDER``; added ones replace present ones."""
     by_name = {effect_of(parameters).name: parameters for parameters in (*present, *added)}
     return tuple(by_name[effect.name] for effect in ORDER if effect.name in by_name)
@@ -150,7 +153,7 @@ def lasting_s(parameters: Any) -> np.ndarray:
     return np.sum([np.maximum(np.asarray(delay, float), 0.0) for delay in delays], axis=0)
 
 
-def delay_steps_of(effects: tuple[Any, ...], dt: float) -> int:
+def delay_steps_of(effects: Effects, dt: float) -> int:
     """Return how many steps the delays of a model with concrete parameters need.
 
     The number leaves room to draw longer delays.
@@ -161,8 +164,8 @@ def delay_steps_of(effects: tuple[Any, ...], dt: float) -> int:
 
 
 def start_memories(
-    effects: tuple[Any, ...], drone: Drone, delay_steps: int = DEFAULT_DELAY_STEPS
-) -> tuple[Any, ...]:
+    effects: Effects, drone: Drone, delay_steps: int = DEFAULT_DELAY_STEPS
+) -> Memories:
     """Return what the effects of a model remember when an episode begins; None for most.
 
     Args:
@@ -178,20 +181,20 @@ def start_memories(
     return tuple(start(parameters) for parameters in effects)
 
 
-def at_row(memories: tuple[Any, ...], time_s: Scalar) -> tuple[Any, ...]:
+def at_row(memories: Memories, time_s: Scalar) -> Memories:
     """Return memories of effects at the time of a row of a log, s since the flight began."""
     return tuple(Flight(time_s) if isinstance(memory, Flight) else memory for memory in memories)
 
 
-def acts(effects: tuple[Any, ...], stage: str) -> bool:
+def acts(effects: Effects, stage: str) -> bool:
     """Return whether any effect of a model acts at a stage (static)."""
     return any(stage in effect_of(parameters).hooks for parameters in effects)
 
 
 def fold(
     stage: str,
-    effects: tuple[Any, ...],
-    memories: tuple[Any, ...],
+    effects: Effects,
+    memories: Memories,
     value: Any,
     context: Any,
 ) -> Any:
@@ -204,8 +207,8 @@ def fold(
 
 
 def respond(
-    effects: tuple[Any, ...], memories: tuple[Any, ...], lagged: Any, context: CommandContext
-) -> tuple[Any, tuple[Any, ...]]:
+    effects: Effects, memories: Memories, lagged: Any, context: CommandContext
+) -> tuple[Any, Memories]:
     """Return the applied action at the end of a span of the step, and the effects' memories."""
     later = list(memories)
     for index, parameters in enumerate(effects):
@@ -216,11 +219,11 @@ def respond(
 
 
 def fold_rates(
-    effects: tuple[Any, ...],
-    memories: tuple[Any, ...],
+    effects: Effects,
+    memories: Memories,
     context: RatesContext,
-    first_rates: tuple[Any, ...] = (),
-) -> tuple[Any, ...]:
+    first_rates: Rates = (),
+) -> Rates:
     """Return the value of the stage rates before each effect, and last, after all of them.
 
     The first is ``context.first_input_b``.
@@ -237,12 +240,12 @@ def fold_rates(
 
 
 def remember(
-    effects: tuple[Any, ...],
-    memories: tuple[Any, ...],
+    effects: Effects,
+    memories: Memories,
     context: StepContext,
-    first_rates: tuple[Any, ...],
-    rates: tuple[Any, ...],
-) -> tuple[Any, ...]:
+    first_rates: Rates,
+    rates: Rates,
+) -> Memories:
     """Return what the effects of a model remember after a step.
 
     Args:
@@ -260,8 +263,8 @@ def remember(
 
 
 def observe(
-    effects: tuple[Any, ...], memories: tuple[Any, ...], offset_b: Any, dt: Scalar
-) -> tuple[tuple[Any, ...], Any]:
+    effects: Effects, memories: Memories, offset_b: Any, dt: Scalar
+) -> tuple[Memories, Any]:
     """Update memories by measured body rates; return them and what they do not explain.
 
     Args:

@@ -50,6 +50,10 @@ from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.state import Action, Drone
 
+Effects = tuple[Any, ...]  # the parameters of a model's effects, in the order of ``EFFECTS``
+Memories = tuple[Any, ...]  # what each of these effects remembers, None for most
+Rates = tuple[Vec3, ...]  # the stage rates: before each of these effects, and after all of them
+
 # The stages in the order in which a step passes them, and where an effect that hooks in there acts.
 STAGES = {
     "command": "command",
