@@ -8,7 +8,7 @@ from typing import BinaryIO
 import numpy as np
 
 from flytrack_env.files import open_file
-from flytrack_env.messages import error_text, quote_name
+from flytrack_env.messages import error_text
 
 
 class NpzError(ValueError):
@@ -31,13 +31,14 @@ def load_npz(source: Path | BinaryIO, most_bytes: int) -> dict[str, np.ndarray]:
             return load_npz(file, most_bytes)
     try:
         with zipfile.ZipFile(source) as archive:
-            members = archive.infolist()
-            num_bytes = sum(member.file_size for member in members)
-            if num_bytes > most_bytes:
-                raise NpzError(f"found arrays of {num_bytes} bytes, expected at most {most_bytes}")
-            arrays = {
-                member.filename.removesuffix(".npy"): _read(archive, member) for member in members
-            }
+            num_bytes = sum(member.file_size for member in archive.infolist())
+        if num_bytes > most_bytes:
+            raise NpzError(f"found arrays of {num_bytes} bytes, expected at most {most_bytes}")
+        source.seek(0)
+        arrays = dict(np.load(source, allow_pickle=False))
+        for array in arrays.values():
+            if array.dtype.kind == "U":
+                array.tolist()  # raises for numbers that are no characters
     except NpzError:
         raise
     except Exception as error:  # damaged archives raise anything from struct.error to MemoryError
@@ -48,17 +49,6 @@ def load_npz(source: Path | BinaryIO, most_bytes: int) -> dict[str, np.ndarray]:
     if num_bytes > most_bytes:
         raise NpzError(f"found {num_bytes} bytes as float64, expected at most {most_bytes}")
     return arrays
-
-
-def _read(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    with archive.open(member) as file:
-        try:
-            array = np.lib.format.read_array(file, allow_pickle=False)
-        except Exception as error:
-            raise NpzError(f"{quote_name(member.filename)}: {error_text(error)}") from error
-    if array.dtype.kind == "U":
-        array.tolist()  # raises for numbers that are no characters
-    return array
 
 
 def npz_of(arrays: dict[str, np.ndarray]) -> bytes:
