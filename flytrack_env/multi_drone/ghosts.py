@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from flytrack_env.flown_race import follow_race
 from flytrack_env.multi_drone.opponents import Standing, progress_of
 from flytrack_env.params import DT_S
 from flytrack_env.quaternion import Vec3
-from flytrack_env.race import Race, advance_race, start_race
 from flytrack_env.references import ghost_rollout, shipped_references
 from flytrack_env.state import POSITION, VELOCITY
 from flytrack_env.tracks import Track, build_course
@@ -45,21 +45,13 @@ def time_optimal_ghost(track: Track, delay_s: float = 0.0) -> Ghost:
     states, _ = ghost_rollout(shipped_references(track, ("nominal",)), NUM_ROWS)
     waiting = round(delay_s / DT_S)
     states = np.concatenate([np.repeat(states[:1], waiting, axis=0), states])[:NUM_ROWS]
-    course, radius = build_course(track), 0.0
     pos_w = Vec3(*states[:, POSITION].T.astype(np.float32))
-
-    def fly(race: Race, way: tuple[Vec3, Vec3]) -> tuple[Race, tuple[jax.Array, jax.Array]]:
-        race, _ = advance_race(race, *way, 0.0, DT_S, course, radius)
-        return race, (race.gates_passed, race.gate_index)
-
-    way = (jax.tree.map(lambda leaf: leaf[:-1], pos_w), jax.tree.map(lambda leaf: leaf[1:], pos_w))
-    passed, index = jax.jit(
-        lambda way: jax.lax.scan(fly, start_race(jnp.int32(0), course), way)[1]
-    )(way)
-    passed, index = (np.concatenate([[0], np.asarray(leaf)]) for leaf in (passed, index))
+    race = follow_race(states[:, POSITION], track, first_gate=0)
+    centres = build_course(track).gates.centre
     centre, before = (
-        jax.tree.map(lambda leaf, at=at: leaf[at], course.gates.centre) for at in (index, index - 1)
+        Vec3(*(coordinate[index] for coordinate in centres)) for index in (race.gate, race.gate - 1)
     )
+    passed = race.laps * len(track.gates) + race.gate
     progress = progress_of(passed, pos_w, centre, (centre - before).norm())
     return Ghost(
         pos_w, Vec3(*states[:, VELOCITY].T.astype(np.float32)), np.asarray(progress, np.float32)
