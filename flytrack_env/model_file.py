@@ -80,11 +80,6 @@ class _ModelFields(Fields):
 def _read_effect(source: str, name: str, values: dict[str, Any]) -> Any:
     """Return the parameters of one effect; those that are not in the file are neutral."""
     field = f"effects.{name}"
-    if name == "learned_residual":
-        raise ModelFileError(
-            f"{source}: {field}: networks are no longer part of a model, "
-            "expected other effects only; diagnose the log again"
-        )
     if name not in effects.BY_NAME:
         known = ", ".join(effects.BY_NAME)
         raise ModelFileError(

@@ -150,15 +150,3 @@ def test_what_is_not_in_the_grammar_is_refused(tmp_path, where, value, expected)
     with pytest.raises(ModelFileError, match=expected) as error:
         load_model(path)
     assert str(error.value).startswith(f"{path}: effects.learned_law.law")
-
-
-def test_a_file_with_networks_is_refused(tmp_path):
-    path = tmp_path / "model.json"
-    save_model(path, NOMINAL, {})
-    document = json.loads(path.read_text())
-    document["effects"]["learned_residual"] = {"scale": 1.0, "networks": []}
-    path.write_text(json.dumps(document))
-    with pytest.raises(
-        ModelFileError, match=r"effects\.learned_residual: networks are no longer part"
-    ):
-        load_model(path)
