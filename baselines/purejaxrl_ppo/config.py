@@ -185,10 +185,7 @@ def read_config(where: str, values: Any) -> Config:
             raise ConfigError(
                 f"{where}: {quote_name(name)}: unknown; expected one of {', '.join(names)}"
             )
-    try:
-        return convert(where, values, Config)
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
+    return convert(where, values, Config, ConfigError)
 
 
 def read_config_file(path: Path, defaults: Config = Config()) -> Config:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,12 +40,14 @@ def centres_of(track: Track | None) -> np.ndarray:
     return np.reshape([gate.position for gate in track.gates] if track else [], (-1, 3))
 
 
+def log_once(recording: rr.RecordingStream, entity: str, archetype: rr.AsComponents) -> None:
+    """Log what is the same at all times."""
+    recording.log(entity, archetype, static=True, strict=True)
+
+
 def log_course(recording: rr.RecordingStream, track: Track | None) -> None:
     """Log axes, gates (centre, frame, opening, direction of flight) and bounds, once."""
-
-    def log(entity: str, archetype: rr.AsComponents) -> None:
-        recording.log(entity, archetype, static=True, strict=True)
-
+    log = partial(log_once, recording)
     log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     if track is None:
         return
@@ -138,7 +141,7 @@ class Writer:
             label: before the name of each line.
             events: pairs of row and text.
         """
-        self.recording = recording
+        self.recording, self._log = recording, partial(log_once, recording)
         self._log_drone()
         self._send_poses()
         self._send_path()
@@ -151,9 +154,6 @@ class Writer:
         self._send(self.events, np.array(rows), columns)
         if race is not None and race.passes:
             self._send_passes(race)
-
-    def _log(self, entity: str, archetype: rr.AsComponents) -> None:
-        self.recording.log(entity, archetype, static=True, strict=True)
 
     def _send(self, entity: str, rows: np.ndarray, columns: rr.ComponentColumnList) -> None:
         """Send an entity's columns for these rows; rows after the end count as the last one."""

@@ -13,7 +13,7 @@ from flytrack_env.flown_race import FlownRace
 from flytrack_env.scene import FLIGHT_COLOURS
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE, Action
 from flytrack_env.tracks import Track
-from flytrack_env.viz_rerun.entities import Writer, centres_of, log_course, plots_of
+from flytrack_env.viz_rerun.entities import Writer, centres_of, log_course, log_once, plots_of
 from flytrack_env.viz_rerun.trajectory import Trajectory, checked, track_of_gates
 
 APP_ID = "flytrack_viz"
@@ -134,9 +134,9 @@ def _record(flights: Sequence[Trajectory], track: Track | None, app_id: str) -> 
     key = rr.Points2D(
         points, labels=list(colours), colors=list(colours.values()), radii=0.1, show_labels=True
     )
-    recording.log(KEY, key, static=True, strict=True)
+    log_once(recording, KEY, key)
     about = rr.TextDocument(_describe(flights, races, ends), media_type=rr.MediaType.MARKDOWN)
-    recording.log("about", about, static=True, strict=True)
+    log_once(recording, "about", about)
     for writer, flight_plots, race, ended in zip(writers, plots, races, ends, strict=True):
         label = "" if len(flights) == 1 else f"{writer.trajectory.name}: "
         writer.write(
