@@ -193,7 +193,7 @@ def on_evaluator(checkpoint: Checkpoint, model: ModelParameters) -> Thrust:
     flown = flights.fly_episode(
         env, checkpoint.policy, jax.random.key(0), params, NUM_STEPS, NUM_LAPS
     )
-    states = np.asarray(flown.states, float)[: int(np.sum(flown.is_flying))]
+    states = flown.flown()[0].astype(float)
     w, x, y, z = states[
         :-1, QUATERNION
     ].T  # the handout's step: the force has the attitude before it

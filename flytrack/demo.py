@@ -11,7 +11,7 @@ import numpy as np
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.checkpoint import FINAL, checkpoints_in
 from baselines.purejaxrl_ppo.evaluate import EvaluationSettings, evaluate
-from baselines.purejaxrl_ppo.flights import CANNOT_RECORD, can_record, fly_many, outcomes_of, score
+from baselines.purejaxrl_ppo.flights import CANNOT_RECORD, can_record, fly_many, score
 from baselines.purejaxrl_ppo.monitor import draw_position_density
 from baselines.purejaxrl_ppo.training import train_policy
 from flytrack.flags import Demo
@@ -105,7 +105,7 @@ def run_demo(flags: Demo) -> None:
     env = report.env
     flown = (seed, size.num_episodes, size.num_steps, NUM_LAPS)
     flights = fly_many(env, checkpoint.policy, *flown)
-    result = score(outcomes_of(flights, NUM_LAPS, len(env.track.gates)))
+    result = score(flights.outcome)
 
     summary: dict[str, Any] = {
         "seed": seed,

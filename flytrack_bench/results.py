@@ -23,6 +23,7 @@ QUARTER = 0.25
 SAME_SUCCESS, SAME_LAP = 0.02, 0.005
 NOISE = 1.0  # of common sensors
 MAX_S = 25.0  # of one flight
+MAX_LAPS = 25  # of one flight: a lap takes more than a second
 Report = Callable[[int, int], None]
 
 
@@ -56,7 +57,7 @@ class Data:
         step_s = float(env.default_params.dt)
         steps = round(min(seconds, MAX_S) / step_s)
         flights = fly_many(
-            env, NetworkPolicy(policy.network, policy.params), self._seed, BATCH, steps, steps
+            env, NetworkPolicy(policy.network, policy.params), self._seed, BATCH, steps, MAX_LAPS
         )
         log = log_of_flights(flights, step_s, self._seed, seconds, NOISE)
         return log.select(np.arange(len(log)) < round(seconds / step_s))

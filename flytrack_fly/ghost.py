@@ -125,9 +125,9 @@ def fly_champion(
     model = model or model_from_json(champion.meta["model"], "checkpoint: model")
     env = make(champion.env_id, track=track, model=model)
     params = still_start(env.default_params, MAX_STEPS)
-    flown = fly_episode(env, champion.policy, jax.random.key(0), params, MAX_STEPS, NUM_LAPS)
-    count = int(np.sum(flown.is_flying))
-    return np.asarray(flown.states, float)[:count], np.asarray(flown.actions)[:count], model
+    flight = fly_episode(env, champion.policy, jax.random.key(0), params, MAX_STEPS, NUM_LAPS)
+    states, commands = flight.flown()
+    return states.astype(float), commands, model
 
 
 def cut_laps(states: np.ndarray, track: Track) -> list[GhostLap]:

@@ -91,6 +91,6 @@ def write_flights(out: Path, loop: Loop, plant: Plant, seed: int) -> list[Path]:
         save_flight(files[-1], flight)
     files += write_pictures(read_flights(list(files), track), out)
     if can_record():
-        record_flights(out / "flights.rrd", flights, track, NUM_LAPS, None)
+        record_flights(out / "flights.rrd", flights, track)
         files.append(out / "flights.rrd")
     return files

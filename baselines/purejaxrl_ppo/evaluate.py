@@ -24,7 +24,6 @@ from baselines.purejaxrl_ppo.flights import (
     Rollout,
     can_record,
     fly_episode,
-    outcomes_of,
     race_many,
     record_flights,
     save_flight,
@@ -186,8 +185,7 @@ class Report:
         self.rollout = self._fly_first(self.env, first)
         num_laps = settings.num_laps or settings.steps
         if settings.is_single:
-            one = jax.tree.map(lambda leaf: leaf[None], self.rollout)
-            return outcomes_of(one, num_laps, len(self.env.track.gates))
+            return jax.tree.map(lambda leaf: np.asarray(leaf)[None], self.rollout.outcome)
         models = None if plants is None else plants.repeated(settings.episodes)
         rest = (settings.steps, num_laps, self.params, models, ProgressBar("flights"))
         return race_many(self.env, self.checkpoint.policy, self._keys(), *rest)
@@ -206,6 +204,7 @@ class Report:
     def count(self, outcomes: Outcomes) -> None:
         """Set the numbers of the evaluation."""
         settings, plants, references = self.settings, self.plants, self.references
+        first = self.rollout.outcome
         numbers: dict[str, Any] = {
             "schema": SCHEMA,
             "package_version": flytrack_env.__version__,
@@ -225,10 +224,10 @@ class Report:
             "optimal": None,
             "time_lost_s": None,
             "first_flight": {
-                "steps": int(np.sum(self.rollout.is_flying)),
-                "gates": int(np.max(self.rollout.gates_passed)),
-                "lap_times_s": self.rollout.lap_times().tolist(),
-                "ended": self.rollout.end_reason(settings.num_laps),
+                "steps": int(first.steps),
+                "gates": int(first.gates_passed),
+                "lap_times_s": np.asarray(first.lap_times_s)[: first.laps].tolist(),
+                "ended": first.end_reason(),
             },
         }
         if plants is not None:
@@ -296,7 +295,7 @@ class Report:
             params = with_model_as_given(simulator.default_params)
             flights["simulator"] = self._fly_first(simulator, params)
         ghost = self.references if with_ghost else None
-        record_flights(path, flights, self.env.track, self.settings.num_laps, ghost)
+        record_flights(path, flights, self.env.track, ghost)
         return [*flights, *(["time-optimal"] if ghost is not None else [])]
 
 

@@ -31,43 +31,6 @@ CANNOT_RECORD = (
 BATCH = 1024  # flights side by side: more exceed a core's cache, fewer leave its vector units idle
 
 
-class Rollout(NamedTuple):
-    """One episode; leaves (num_steps, ...), or (num_episodes, num_steps, ...) for many.
-
-    Attributes: states: before the step, (21,). actions: clipped as commanded, (4,). is_flying:
-        whether the step was flown; what follows the end is padding. gates_passed: number, after the
-        step. laps: number, after the step. lap_completed: whether the step completed a lap.
-        lap_time_s: of that lap. gate_time_s: when the step passed a gate, s since the reset,
-        interpolated; 0 without one, of the first where two are passed in one step. causes: of
-        termination, in the step that ended the episode.
-    """
-
-    states: jax.Array
-    actions: jax.Array
-    is_flying: jax.Array
-    gates_passed: jax.Array
-    laps: jax.Array
-    lap_completed: jax.Array
-    lap_time_s: jax.Array
-    gate_time_s: jax.Array
-    causes: Causes
-
-    def positions(self) -> np.ndarray:
-        """Return every position flown through, (num_samples, 3), world, m."""
-        return np.asarray(self.states)[np.asarray(self.is_flying)][:, POSITION]
-
-    def lap_times(self) -> np.ndarray:
-        """Return the lap times of one flight, s, in order; the first is from the standing start."""
-        return np.asarray(self.lap_time_s)[np.asarray(self.lap_completed)]
-
-    def end_reason(self, num_laps: int | None = None) -> str:
-        """Return the causes of termination, or that laps or steps are complete."""
-        causes = [name for name, happened in self.causes._asdict().items() if np.any(happened)]
-        if num_laps is not None and len(self.lap_times()) >= num_laps:
-            return "laps complete"
-        return ", ".join(causes) or "all steps flown"
-
-
 class Outcomes(NamedTuple):
     """Outcomes of flights; leaves (num_flights, ...), or without the first axis for one.
 
@@ -110,6 +73,38 @@ class Outcomes(NamedTuple):
         is_ended = np.any(list(causes.values()), axis=0)
         return {**causes, "time_limit": ~is_complete & ~is_ended}
 
+    def end_reason(self) -> str:
+        """Return the causes that ended one flight, or that laps or steps are complete."""
+        causes = [name for name, happened in self.causes._asdict().items() if happened]
+        if self.is_complete():
+            return "laps complete"
+        return ", ".join(causes) or "all steps flown"
+
+
+class Rollout(NamedTuple):
+    """One episode; leaves (num_steps, ...), or (num_episodes, num_steps, ...) for many.
+
+    Attributes:
+        states: before each step, (21,).
+        actions: clipped as commanded, (4,).
+        is_flying: whether the step was flown; what follows the end is padding.
+        outcome: of the episode, without the axis of steps.
+    """
+
+    states: jax.Array
+    actions: jax.Array
+    is_flying: jax.Array
+    outcome: Outcomes
+
+    def positions(self) -> np.ndarray:
+        """Return every position flown through, (num_samples, 3), world, m."""
+        return self.flown()[0][:, POSITION]
+
+    def flown(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return states and actions of the steps that were flown, (num_samples, ...)."""
+        is_flying = np.asarray(self.is_flying)
+        return np.asarray(self.states)[is_flying], np.asarray(self.actions)[is_flying]
+
 
 class Score(NamedTuple):
     """Score of many episodes.
@@ -129,10 +124,7 @@ class Score(NamedTuple):
 
 def save_flight(path: Path, rollout: Rollout) -> None:
     """Write the steps of one rollout that were flown as a rollout file."""
-    is_flying = np.asarray(rollout.is_flying)
-    save_rollout(
-        path, np.asarray(rollout.states)[is_flying], np.asarray(rollout.actions)[is_flying]
-    )
+    save_rollout(path, *rollout.flown())
 
 
 def can_record() -> bool:
@@ -148,7 +140,6 @@ def record_flights(
     path: Path,
     flights: Mapping[str, Rollout],
     track: Track,
-    num_laps: int | None = None,
     references: References | None = None,
 ) -> None:
     """Write flights by name on one timeline as a Rerun recording; the first is in the foreground.
@@ -157,7 +148,6 @@ def record_flights(
         path: of the recording.
         flights: by name.
         track: that is shown.
-        num_laps: laps to complete, if limited.
         references: the time-optimal flights of the track, shown as ghost.
 
     Raises:
@@ -168,12 +158,10 @@ def record_flights(
 
     shown = []
     for name, flight in flights.items():
-        is_flying = np.asarray(flight.is_flying)
-        states, actions = (np.asarray(part)[is_flying] for part in (flight.states, flight.actions))
-        ended = flight.end_reason(num_laps).replace("_", " ")
-        shown.append(Trajectory(name, states, actions, ended=ended))
+        ended = flight.outcome.end_reason().replace("_", " ")
+        shown.append(Trajectory(name, *flight.flown(), ended=ended))
     if references is not None:
-        longest = max(len(one.states) for one in shown)
+        longest = max(len(flight.states) for flight in shown)
         shown.append(Trajectory("time-optimal", *ghost_rollout(references, longest)))
     write_recording(path, shown, track)
 
@@ -199,44 +187,56 @@ def start_pose_params(params: EnvParams, num_steps: int) -> EnvParams:
     )
 
 
-Step = Callable[..., tuple[Any, ...]]
+Carry = tuple[Memory, jax.Array, Any, jax.Array, Outcomes]
 
 
-def make_step(env: EpisodicEnvironment, policy: Policy, params: EnvParams, num_laps: Any) -> Step:
-    """Return one step of the mean action as a function ``step(memory, observation, state, index)``.
+def begin_flight(
+    env: EpisodicEnvironment, policy: Policy, key: jax.Array, params: EnvParams, num_laps: int
+) -> Carry:
+    """Return what ``advance_flight`` takes, before its first step."""
+    outcome = Outcomes(
+        steps=jnp.int32(0),
+        gates_passed=jnp.int32(0),
+        laps=jnp.int32(0),
+        lap_times_s=jnp.full(num_laps, jnp.nan),
+        gate_times_s=jnp.full(num_laps * params.course.num_gates, jnp.nan),
+        causes=Causes(*(jnp.asarray(False) for _ in Causes._fields)),
+    )
+    return policy.network.first_memory(), *env.reset(key, params), jnp.asarray(False), outcome
 
-    ``index`` counts steps from 0. The function returns the next memory, observation and state,
-    whether the flight is over, and the step as a ``Rollout`` without its axis of steps.
+
+def advance_flight(
+    env: EpisodicEnvironment, policy: Policy, params: EnvParams, carry: Carry
+) -> tuple[Carry, jax.Array]:
+    """Return a flight after a step of the mean action, and the action.
+
+    Args:
+        carry: memory, observation, state, whether the flight is over, and its outcome so far.
     """
-
-    def step(
-        memory: Memory, observation: jax.Array, state: Any, index: jax.Array
-    ) -> tuple[Any, ...]:
-        memory, action = policy.network.act(policy.params, memory, observation)
-        next_observation, next_state, _, terminated, info = env.step_env(
-            None, state, action, params
-        )
-        before, race = env.drone(state), env.race(state)
-        after = env.drone(next_state)
-        fraction = cross_gate(race.gate, before.pos_w, after.pos_w, params.drone_radius).fraction
-        is_pass = info["gates_passed"] > race.gates_passed
-        flown = Rollout(
-            states=pack(before),
-            actions=action,
-            is_flying=jnp.asarray(True),
-            gates_passed=info["gates_passed"],
-            laps=info["laps"],
-            lap_completed=info["lap_completed"],
-            lap_time_s=info["lap_time_s"],
-            gate_time_s=jnp.where(is_pass, (index + fraction) * params.dt, 0.0),
-            causes=Causes(*(info[name] for name in Causes._fields)),
-        )
-        return memory, next_observation, next_state, terminated | (info["laps"] >= num_laps), flown
-
-    return step
+    memory, observation, state, _, outcome = carry
+    memory, action = policy.network.act(policy.params, memory, observation)
+    observation, after, _, terminated, info = env.step_env(None, state, action, params)
+    ends_w, race = (env.drone(state).pos_w, env.drone(after).pos_w), env.race(state)
+    fraction = cross_gate(race.gate, *ends_w, params.drone_radius).fraction
+    lap, gate = jnp.arange(outcome.lap_times_s.size), jnp.arange(outcome.gate_times_s.size)
+    is_lap = info["lap_completed"] & (lap == info["laps"] - 1)
+    # Two gates can be passed in one step; both have the time of the first.
+    is_pass = (gate >= outcome.gates_passed) & (gate < info["gates_passed"])
+    outcome = Outcomes(
+        steps=outcome.steps + 1,
+        gates_passed=info["gates_passed"],
+        laps=info["laps"],
+        lap_times_s=jnp.where(is_lap, info["lap_time_s"], outcome.lap_times_s),
+        gate_times_s=jnp.where(
+            is_pass, (outcome.steps + fraction) * params.dt, outcome.gate_times_s
+        ),
+        causes=Causes(*(info[name] for name in Causes._fields)),
+    )
+    is_over = terminated | (info["laps"] >= lap.size)
+    return (memory, observation, after, is_over, outcome), action
 
 
-@partial(jax.jit, static_argnames=("env", "num_steps"))
+@partial(jax.jit, static_argnames=("env", "num_steps", "num_laps"))
 def fly_episode(
     env: EpisodicEnvironment,
     policy: Policy,
@@ -246,26 +246,16 @@ def fly_episode(
     num_laps: int,
 ) -> Rollout:
     """Return one episode of the mean action, from a reset to its end or to ``num_laps`` laps."""
-    step = make_step(env, policy, params, num_laps)
 
-    def advance(carry: tuple[Any, ...], index: jax.Array) -> tuple[Any, ...]:
-        *now, is_flying = carry
-        *after, is_over, flown = step(*now, index)
-        state = now[-1]
-        race = env.race(state)
-        padded = flown._replace(
-            is_flying=is_flying,
-            gates_passed=jnp.where(is_flying, flown.gates_passed, race.gates_passed),
-            laps=jnp.where(is_flying, flown.laps, race.laps),
-            lap_completed=flown.lap_completed & is_flying,
-            gate_time_s=jnp.where(is_flying, flown.gate_time_s, 0.0),
-            causes=Causes(*(cause & is_flying for cause in flown.causes)),
-        )
-        keep = partial(jax.tree.map, partial(jnp.where, is_flying))
-        return (*keep(tuple(after), tuple(now)), is_flying & ~is_over), padded
+    def advance(carry: Carry, _: None) -> tuple[Carry, tuple[jax.Array, ...]]:
+        state, is_over = carry[2:4]
+        later, action = advance_flight(env, policy, params, carry)
+        kept = jax.tree.map(partial(jnp.where, is_over), carry, later)
+        return kept, (pack(env.drone(state)), action, ~is_over)
 
-    start = (policy.network.first_memory(), *env.reset(key, params), jnp.asarray(True))
-    return jax.lax.scan(advance, start, jnp.arange(num_steps))[1]
+    start = begin_flight(env, policy, key, params, num_laps)
+    (*_, outcome), steps = jax.lax.scan(advance, start, None, num_steps)
+    return Rollout(*steps, outcome)
 
 
 def fly_many(
@@ -292,52 +282,6 @@ def start_keys(seed: int, num_episodes: int) -> jax.Array:
     return jax.random.split(jax.random.key(seed), num_episodes)
 
 
-def _no_outcome(num_laps: int, num_gates: int) -> Outcomes:
-    """Return the outcome of a flight before its first step."""
-    return Outcomes(
-        steps=jnp.int32(0),
-        gates_passed=jnp.int32(0),
-        laps=jnp.int32(0),
-        lap_times_s=jnp.full(num_laps, jnp.nan),
-        gate_times_s=jnp.full(num_laps * num_gates, jnp.nan),
-        causes=Causes(*(jnp.asarray(False) for _ in Causes._fields)),
-    )
-
-
-def _update_outcome(outcome: Outcomes, flown: Rollout) -> Outcomes:
-    """Return the outcome of one flight after another step."""
-    lap, gate = jnp.arange(outcome.lap_times_s.size), jnp.arange(outcome.gate_times_s.size)
-    is_lap = flown.lap_completed & (lap == flown.laps - 1)
-    # Two gates can be passed in one step.
-    is_pass = (gate >= outcome.gates_passed) & (gate < flown.gates_passed)
-    return Outcomes(
-        steps=outcome.steps + 1,
-        gates_passed=flown.gates_passed,
-        laps=flown.laps,
-        lap_times_s=jnp.where(is_lap, flown.lap_time_s, outcome.lap_times_s),
-        gate_times_s=jnp.where(is_pass, flown.gate_time_s, outcome.gate_times_s),
-        causes=flown.causes,
-    )
-
-
-@partial(jax.jit, static_argnames=("num_laps", "num_gates"))
-def _outcomes(flights: Rollout, num_laps: int, num_gates: int) -> Outcomes:
-    def step(outcome: Outcomes, flown: Rollout) -> tuple[Outcomes, None]:
-        later = _update_outcome(outcome, flown)
-        return jax.tree.map(partial(jnp.where, flown.is_flying), later, outcome), None
-
-    start = _no_outcome(num_laps, num_gates)
-    return jax.vmap(lambda flight: jax.lax.scan(step, start, flight)[0])(flights)
-
-
-def outcomes_of(flights: Rollout, num_laps: int, num_gates: int) -> Outcomes:
-    """Return the outcomes of rollouts, leaves (num_flights, num_steps, ...), as NumPy arrays.
-
-    num_gates: of a lap.
-    """
-    return jax.tree.map(np.asarray, _outcomes(flights, num_laps, num_gates))
-
-
 @partial(jax.jit, static_argnames=("env", "num_laps"))
 def _race_batch(
     env: EpisodicEnvironment,
@@ -355,21 +299,17 @@ def _race_batch(
 
     def race(key: jax.Array, model: ModelParameters | None) -> Outcomes:
         own = params if model is None else params.replace(model=model)
-        step = make_step(env, policy, own, num_laps)
 
-        def is_flying(carry: tuple[Any, ...]) -> jax.Array:
+        def is_flying(carry: Carry) -> jax.Array:
             *_, is_over, outcome = carry
             return ~is_over & (outcome.steps < num_steps)
 
-        def advance(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-            *now, _, outcome = carry
-            *after, is_over, flown = step(*now, outcome.steps)
-            return *after, is_over, _update_outcome(outcome, flown)
+        def advance(carry: Carry) -> Carry:
+            return advance_flight(env, policy, own, carry)[0]
 
-        nothing = _no_outcome(num_laps, params.course.num_gates)
         # Under vmap the loop runs until no flight is left, and flights that are over stay as they
         # are.
-        start = (policy.network.first_memory(), *env.reset(key, own), jnp.asarray(False), nothing)
+        start = begin_flight(env, policy, key, own, num_laps)
         return jax.lax.while_loop(is_flying, advance, start)[-1]
 
     return jax.vmap(race)(keys, models)

@@ -15,7 +15,6 @@ from baselines.purejaxrl_ppo.flights import (
     Outcomes,
     can_record,
     fly_many,
-    outcomes_of,
     record_flights,
     save_flight,
     score,
@@ -79,7 +78,7 @@ def evaluate_policy(
     rollout, chart = folder / f"rollout_{steps}.npy", folder / f"position_density_{steps}.png"
     try:
         flights = fly_many(env, policy, EVALUATION_SEED, num_episodes, NUM_STEPS, NUM_LAPS)
-        metrics = evaluation_metrics(outcomes_of(flights, NUM_LAPS, len(env.track.gates)))
+        metrics = evaluation_metrics(flights.outcome)
         first = jax.tree.map(lambda leaf: leaf[0], flights)
         save_flight(rollout, first)
         files.append(rollout)
@@ -88,7 +87,7 @@ def evaluate_policy(
         files.append(chart)
         if is_recorded and can_record():
             recording = rollout.with_suffix(".rrd")
-            record_flights(recording, {"policy": first}, env.track, NUM_LAPS)
+            record_flights(recording, {"policy": first}, env.track)
             files.append(recording)
         elif is_recorded:
             logger.warning(

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from baselines.purejaxrl_ppo import checkpoint_env, evaluate
 from baselines.purejaxrl_ppo import flights as flights_module
 from baselines.purejaxrl_ppo.checkpoint import load_checkpoint
-from baselines.purejaxrl_ppo.flights import fly_many, outcomes_of, race_many, score, start_keys
+from baselines.purejaxrl_ppo.flights import fly_many, race_many, score, start_keys
 from baselines.purejaxrl_ppo.report import summarize_plants
 from flytrack_env import FlyTrack, make, nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag, ThrustScale
@@ -79,7 +79,7 @@ def test_lap_times_are_those_of_the_rails(flights, raced):
 
 def test_every_step_kept_or_not_is_the_same_flight(flights, raced):
     assert NUM_FLIGHTS % 4
-    chex.assert_trees_all_close(raced, outcomes_of(flights, NUM_LAPS, 8), rtol=1e-5, atol=1e-5)
+    chex.assert_trees_all_close(raced, flights.outcome, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("flown_by", slow_but(["black box"], ["black box", "plants"]))

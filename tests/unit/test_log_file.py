@@ -155,9 +155,7 @@ def test_full_stick_within_rounding_is_fine(value, tmp_path):
 
 
 BAD_ARRAYS = {
-    "not an .npz file, .*: Object arrays cannot be loaded": np.array(
-        [print] * NUM_ROWS
-    ),
+    "not an .npz file, .*: Object arrays cannot be loaded": np.array([print] * NUM_ROWS),
     "column w_x: found an array of <U1, shape .* expected a row of numbers": np.array(
         ["1"] * NUM_ROWS
     ),
