@@ -14,6 +14,7 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec.structs import asdict
 
 from baselines.purejaxrl_ppo import load_checkpoint
 from benchmarks import report
@@ -182,7 +183,7 @@ def grade_trial(trial: Trial) -> dict[str, Any]:
     changes = dict(SETUPS[trial.setup])
     for kind in trial.kinds:
         changes |= KINDS[kind].draw(rng)
-    nominal = vars(Body())
+    nominal = asdict(Body())
     fields = {name: value for name, value in changes.items() if name in nominal}
     settings = {name: value for name, value in changes.items() if name not in nominal}
     body = Body(**fields)

@@ -1,23 +1,26 @@
 """The quadcopter's body in numbers: what ``body.c`` moves and a diagnosis is graded on."""
 
-import dataclasses
 import json
 import math
-import struct
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta, structs
 
 from flytrack_env.files import read_at_most
-from flytrack_env.messages import error_text, quote_name, quote_value
+from flytrack_env.messages import error_text
+from flytrack_env.validation import Fields, convert
 
 STEP_S = 125e-6  # of body.c
 MOTORS = ("rear right", "front right", "rear left", "front left")  # Betaflight's order
-STRONGEST_HEALTH = 1.5
-MAX_TILT_RAD = 0.3
 MAX_NUMBER = 1e6
+Number = Annotated[float, Meta(gt=-MAX_NUMBER, lt=MAX_NUMBER)]
+Positive = Annotated[float, Meta(gt=0.0, lt=MAX_NUMBER)]
+NotNegative = Annotated[float, Meta(ge=0.0, lt=MAX_NUMBER)]
+Health = Annotated[float, Meta(ge=0.0, le=1.5)]
+Tilt = Annotated[float, Meta(ge=-0.3, le=0.3)]
+PerAxis = tuple[NotNegative, NotNegative, NotNegative]
 MAX_BYTES = 2**20  # of a body's file
 
 
@@ -25,8 +28,7 @@ class FirmwareError(ValueError):
     """Firmware cannot be built, configured or flown; the message is one sentence that says what."""
 
 
-@dataclass(frozen=True)
-class Body:
+class Body(Fields, frozen=True):
     """A rigid body, four motors and a battery; x forward, y left, z up.
 
     The default is a 1 kg racer.
@@ -39,49 +41,49 @@ class Body:
     Assumption: rotors neither flap nor see each other's wake, and there is no ground.
     """
 
-    mass_kg: float = 1.0
-    gravity: float = 9.80665
+    mass_kg: Positive = 1.0
+    gravity: Positive = 9.80665
     """m/s^2."""
-    inertia: tuple[float, float, float] = (0.0035, 0.0035, 0.006)
+    inertia: tuple[Positive, Positive, Positive] = (0.0035, 0.0035, 0.006)
     """About x, y, z, kg m^2."""
-    arm_m: tuple[float, float] = (0.08, 0.08)
+    arm_m: tuple[Positive, Positive] = (0.08, 0.08)
     """Of the motors, from the middle of the frame along x and y."""
-    center_of_mass_m: tuple[float, float] = (0.0, 0.0)
+    center_of_mass_m: tuple[Number, Number] = (0.0, 0.0)
     """From the middle of the frame along x and y."""
-    thrust_tilt_rad: tuple[float, float] = (0.0, 0.0)
+    thrust_tilt_rad: tuple[Tilt, Tilt] = (0.0, 0.0)
     """Of the motors' thrust, towards x and y."""
-    max_thrust_n: float = 8.5875
+    max_thrust_n: Positive = 8.5875
     """Of one motor at full command and ``full_v``."""
-    health: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
+    health: tuple[Health, Health, Health, Health] = (1.0, 1.0, 1.0, 1.0)
     """Factor on each motor's thrust: rear right, front right, rear left, front left."""
-    linear: float = 0.0
+    linear: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     """Linear share of the thrust curve, from 0 to 1; the rest is quadratic in the command."""
-    lag_up_s: float = 0.018
-    lag_down_s: float = 0.018
+    lag_up_s: Positive = 0.018
+    lag_down_s: Positive = 0.018
     """Time constants of a motor that speeds up, and of one that slows down."""
-    torque_m: float = 0.016
+    torque_m: NotNegative = 0.016
     """Yaw torque per thrust, N m / N."""
-    rotor_inertia: float = 0.017
+    rotor_inertia: NotNegative = 0.017
     """Yaw torque of one motor per change of its speed, as a share of full speed, N m s."""
-    linear_drag: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    linear_drag: PerAxis = (0.0, 0.0, 0.0)
     """Body axes, N s/m."""
-    quadratic_drag: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quadratic_drag: PerAxis = (0.0, 0.0, 0.0)
     """Body axes, N s^2/m^2."""
-    rotor_drag: float = 0.0
+    rotor_drag: NotNegative = 0.0
     """Of the thrust, per edgewise speed, s/m."""
-    translational_lift: float = 0.0
+    translational_lift: NotNegative = 0.0
     """Share that thrust gains in fast edgewise flight."""
-    full_v: float = 24.0
-    volt_exponent: float = 1.4
-    drain_v_per_min: float = 1.0
+    full_v: Positive = 24.0
+    volt_exponent: NotNegative = 1.4
+    drain_v_per_min: NotNegative = 1.0
     """Of the open voltage."""
-    resistance_ohm: float = 0.0
+    resistance_ohm: NotNegative = 0.0
     """Of the battery."""
-    full_current_a: float = 100.0
+    full_current_a: Positive = 100.0
     """Of all motors at full speed."""
-    gyro_noise: float = 0.0
+    gyro_noise: NotNegative = 0.0
     """Standard deviation of each sample, 8 kHz, before the firmware's filters, rad/s."""
-    acc_noise: float = 0.0
+    acc_noise: NotNegative = 0.0
     """m/s^2."""
 
     def __post_init__(self) -> None:
@@ -90,56 +92,27 @@ class Body:
         Raises:
             FirmwareError: of a field; the message names it.
         """
-        for field in dataclasses.fields(self):
-            default: Any = field.default
-            values, size = np.ravel(getattr(self, field.name)), np.size(default)
-            is_number = values.dtype.kind in "fiu" and values.size == size
-            if not is_number or not np.all(np.abs(values) < MAX_NUMBER):
-                expected = "a finite number" if size == 1 else f"{size} finite numbers"
-                raise FirmwareError(
-                    f"body: {field.name}: found {getattr(self, field.name)}, expected {expected}"
-                )
-        for name, (text, is_good) in self._checks().items():
-            if not is_good:
-                raise FirmwareError(f"body: {name}: found {getattr(self, name)}, expected {text}")
-        weight_n = self.mass_kg * self.gravity
-        if self.full_thrust_n <= weight_n:
-            found = f"found {self.full_thrust_n:g} N of all motors"
-            raise FirmwareError(
-                f"body: max_thrust_n: {found}, expected more than the weight, {weight_n:g} N"
-            )
-
-    def _checks(self) -> dict[str, tuple[str, bool]]:
-        """Return what each field must be, and whether it is."""
-        positive = "mass_kg gravity max_thrust_n full_v full_current_a lag_up_s lag_down_s"
-        not_negative = (
-            "linear_drag quadratic_drag rotor_drag translational_lift torque_m rotor_inertia "
-            "volt_exponent drain_v_per_min resistance_ohm gyro_noise acc_noise"
-        )
-        checks = {name: ("more than 0", getattr(self, name) > 0) for name in positive.split()}
-        checks |= {
-            name: ("0 or more", np.min(getattr(self, name)) >= 0) for name in not_negative.split()
-        }
-        largest = max(self.inertia)
-        is_solid = min(self.inertia) > 0 and largest <= sum(self.inertia) - largest
-        inside = all(abs(c) < arm for c, arm in zip(self.center_of_mass_m, self.arm_m, strict=True))
-        return checks | {
+        for field in structs.fields(self):
+            value = np.asarray(getattr(self, field.name)).tolist()
+            convert("body", value, field.type, FirmwareError, field.name)
+        largest, weight_n = max(self.inertia), self.mass_kg * self.gravity
+        centers = zip(self.center_of_mass_m, self.arm_m, strict=True)
+        checks = {
             "inertia": (
-                "three of a solid body: each positive, none above the other two's sum",
-                is_solid,
+                largest <= sum(self.inertia) - largest,
+                "none above the sum of the other two, as of a solid body",
             ),
-            "arm_m": ("more than 0", min(self.arm_m) > 0),
-            "center_of_mass_m": ("within the arms", inside),
-            "thrust_tilt_rad": (
-                f"at most {MAX_TILT_RAD:g} either way",
-                max(map(abs, self.thrust_tilt_rad)) <= MAX_TILT_RAD,
+            "center_of_mass_m": (all(abs(c) < arm for c, arm in centers), "within the arms"),
+            "max_thrust_n": (
+                self.full_thrust_n > weight_n,
+                f"all motors above the weight, {weight_n:g} N",
             ),
-            "health": (
-                f"four from 0 to {STRONGEST_HEALTH:g}",
-                min(self.health) >= 0 and max(self.health) <= STRONGEST_HEALTH,
-            ),
-            "linear": ("0 to 1", 0 <= self.linear <= 1),
         }
+        for name, (is_good, expected) in checks.items():
+            if not is_good:
+                raise FirmwareError(
+                    f"body: {name}: found {getattr(self, name)}, expected {expected}"
+                )
 
     @property
     def full_thrust_n(self) -> float:
@@ -162,16 +135,14 @@ class Body:
 
         is_reversed: the firmware's ``yaw_motors_reversed``.
         """
-        blends = [-math.expm1(-STEP_S / lag) for lag in (self.lag_up_s, self.lag_down_s)]
-        numbers = [
-            *(self.mass_kg, self.gravity, *self.inertia, *self.arm_m, *self.center_of_mass_m),
-            *(*self.thrust_tilt_rad, self.max_thrust_n, *self.health, self.linear, *blends),
-            *(self.torque_m, self.rotor_inertia, -1.0 if is_reversed else 1.0),
-            *(*self.linear_drag, *self.quadratic_drag, self.rotor_drag, self.translational_lift),
-            *(self.full_v, self.volt_exponent, self.drain_v_per_min / 60.0),
-            *(self.resistance_ohm, self.full_current_a, self.gyro_noise, self.acc_noise),
-        ]
-        return struct.pack(f"={len(numbers)}d", *numbers)
+        values = structs.asdict(self)  # body.h has the fields in the same order
+        for name in ("lag_up_s", "lag_down_s"):
+            values[name] = -math.expm1(-STEP_S / values[name])
+        values["rotor_inertia"] = (self.rotor_inertia, -1.0 if is_reversed else 1.0)
+        values["drain_v_per_min"] /= 60.0
+        return (
+            np.concatenate([np.ravel(value) for value in values.values()]).astype(float).tobytes()
+        )
 
 
 def read_body(path: Path) -> Body:
@@ -184,20 +155,4 @@ def read_body(path: Path) -> Body:
         values = json.loads(read_at_most(path, MAX_BYTES))
     except ValueError as error:
         raise FirmwareError(f"{path}: found no JSON: {error_text(error)}") from error
-    if not isinstance(values, dict):
-        raise FirmwareError(
-            f"{path}: found {quote_value(values)}, expected an object of fields of Body"
-        )
-    names = [field.name for field in dataclasses.fields(Body)]
-    unknown = next((name for name in values if name not in names), None)
-    if unknown is not None:
-        raise FirmwareError(
-            f"{path}: {quote_name(unknown)}: unknown, expected of {', '.join(names)}"
-        )
-    try:
-        fields: dict[str, Any] = {
-            name: tuple(v) if isinstance(v, list) else v for name, v in values.items()
-        }
-        return Body(**fields)
-    except (FirmwareError, TypeError) as error:
-        raise FirmwareError(f"{path}: {error_text(error)}") from error
+    return convert(str(path), values, Body, FirmwareError)

@@ -14,13 +14,13 @@ import struct
 import threading
 import weakref
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from msgspec.structs import replace
 
 from firmware.body import Body, FirmwareError
 from firmware.building import find_executable

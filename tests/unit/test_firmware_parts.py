@@ -2,7 +2,6 @@
 
 import re
 import shutil
-from dataclasses import replace
 
 import pytest
 
@@ -68,8 +67,8 @@ def test_what_the_firmware_did_not_keep_is_named():
 
 @pytest.mark.parametrize(("field", "value"), table("bodies")["fields"])
 def test_impossible_bodies_are_refused_by_name(field, value):
-    with pytest.raises(FirmwareError, match=f"body: {field}: found"):
-        replace(Body(), **{field: value})
+    with pytest.raises(FirmwareError, match=rf"body: {field}(\[\d\])?: found"):
+        Body(**{field: value})
 
 
 def test_body_is_packed_as_its_header_counts_it():
