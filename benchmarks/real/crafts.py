@@ -23,13 +23,13 @@ from benchmarks.real.crazyflie import (
     error_ratios,
     load_flights,
 )
-from benchmarks.real.section import Record, diagnose_log, import_mapped, test_model
+from benchmarks.real.section import Record, diagnose_log, import_mapped
 from benchmarks.report import table
 from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_sysid import FlightLog, import_log
 from flytrack_sysid.diagnosis import joined
-from flytrack_sysid.diagnosis.refinement import sample_windows
-from flytrack_sysid.inference.free_flight import HORIZONS_S, QUANTITIES, make_windows
+from flytrack_sysid.diagnosis.refinement import FlightErrors, sample_windows
+from flytrack_sysid.inference.free_flight import HORIZONS_S, QUANTITIES, errors_of, make_windows
 from flytrack_sysid.log import usual_step
 
 BETAFLIGHT = "betaflight_acro_log"
@@ -145,7 +145,8 @@ def nanobench(data: Path) -> Record:
         with jax.enable_x64(True):
             windows = make_windows(log, held_out, SPACING_S, MAX_WINDOWS)
             base, extended = (
-                test_model(model, windows) for model in (diagnosis.base, diagnosis.extended)
+                FlightErrors(errors_of(model, windows)[None], windows)
+                for model in (diagnosis.base, diagnosis.extended)
             )
         ratios = error_ratios(base, extended, log.segment[windows.start])
         record["by_flight"] = {names[int(number)]: cells for number, cells in ratios.items()}

@@ -1,6 +1,6 @@
 """A diagnosis of a measured flight: its record, and its section of a page.
 
-The section has a paragraph for pilots, a picture and tables.
+The section has sentences for pilots, a picture and tables.
 """
 
 import time
@@ -21,10 +21,7 @@ from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
 from flytrack_sysid import FlightLog, Imported, diagnose, import_log
 from flytrack_sysid.diagnosis import Diagnosis
-from flytrack_sysid.diagnosis.evidence import words_of
-from flytrack_sysid.diagnosis.refinement import FlightErrors
 from flytrack_sysid.diagnosis.report import describe_verdict
-from flytrack_sysid.inference.free_flight import Windows, errors_of
 
 Record = dict[str, Any]
 STYLES: dict[str, dict[str, Any]] = {
@@ -36,8 +33,6 @@ STYLES: dict[str, dict[str, Any]] = {
     "arx": {"color": "black", "linestyle": "-."},
     "network": {"color": "black", "linestyle": "--"},
 }
-MAX_VALUES = 3  # of a cause, in a sentence
-SPOKEN = (("attitude_rad", "0.25"), ("rates_rad_per_s", "0.25"), ("position_m", "1"))
 WIDTH_IN, HEIGHT_IN = 2.6, 3.2
 
 
@@ -66,56 +61,20 @@ def import_mapped(files: Path | Sequence[Path], kind: str, mapping: str) -> Impo
         return import_log(files, kind, path)
 
 
-def test_model(model: ModelParameters, windows: Windows) -> FlightErrors:
-    """Return a model's errors on windows."""
-    return FlightErrors(errors_of(model, windows)[None], windows)
-
-
 def format_number(value: float | None, unit: str = "1") -> str:
     """Return three digits, and the unit if there is one."""
     text = "none" if value is None or not np.isfinite(value) else f"{value:.3g}"
     return text if unit == "1" else f"{text} {unit}"
 
 
-def in_degrees(key: str, value: float) -> tuple[float, str]:
-    """Return an error and its unit, with angles in degrees.
-
-    key: "attitude_rad", "rates_rad_per_s", ...
-    """
-    unit = key.split("_", 1)[1].replace("_per_", "/")
-    if unit.startswith("rad"):
-        return float(np.rad2deg(value)), unit.replace("rad", "deg")
-    return value, unit
+def split_key(key: str) -> tuple[str, str]:
+    """Return the quantity and the unit of a key: "attitude_rad", "rates_rad_per_s", ..."""
+    quantity, unit = key.split("_", 1)
+    return quantity, unit.replace("_per_", "/")
 
 
-def describe(measured: Record) -> str:
-    """Return what is wrong with the model, in words."""
-    diagnosis = measured["diagnosis"]
-    parts = [
-        measured["sentence"],
-        _describe_values(diagnosis["causes"]),
-        _describe_responses(diagnosis["half_response_s"]),
-        _describe_flights(diagnosis["prediction"]),
-    ]
-    return " ".join(filter(None, parts))
-
-
-def _describe_values(causes: list[Record]) -> str:
-    texts = []
-    for cause in causes:
-        parameters = cause["parameters"]
-        if "mean_factor" in parameters:
-            parameters = {"mean_factor": parameters["mean_factor"]}
-        if len(parameters) <= MAX_VALUES:
-            values = ", ".join(
-                f"{name.replace('_', ' ')} {format_number(one['value'], one['unit'])}"
-                for name, one in parameters.items()
-            )
-            texts.append(f"{words_of(cause['effect'])}: {values}")
-    return f"In numbers: {'; '.join(texts)}." if texts else ""
-
-
-def _describe_responses(by_model: Mapping[str, Mapping[str, Record]]) -> str:
+def describe_responses(by_model: Mapping[str, Mapping[str, Record]]) -> str:
+    """Return how fast the craft answers its sticks, and how fast the nominal model did."""
     if not by_model:
         return ""
 
@@ -139,30 +98,6 @@ def _describe_responses(by_model: Mapping[str, Mapping[str, Record]]) -> str:
     )
 
 
-def _describe_flights(prediction: Record) -> str:
-    errors, texts, sentences = prediction["errors"], [], []
-    for key, horizon in SPOKEN:
-        if horizon in errors.get("extended", {}).get(key, {}):
-            values = [
-                f"{in_degrees(key, errors[name][key][horizon])[0]:.3g}"
-                for name in ("extended", "nominal", "refitted_base")
-            ]
-            unit, quantity = in_degrees(key, 0.0)[1], key.split("_")[0]
-            texts.append(
-                f"{quantity} {values[0]} {unit} after {horizon} s "
-                f"(nominal {values[1]}, refitted {values[2]})"
-            )
-    if texts:
-        sentences.append(f"Errors of free flight that was held out: {'; '.join(texts)}.")
-    silent = [quantity for quantity, horizons in prediction["evidence"].items() if not horizons]
-    if silent:
-        sentences.append(
-            f"Of {' and '.join(silent)}, a guess from the start alone, without commands, "
-            "is as good."
-        )
-    return " ".join(sentences)
-
-
 def draw_errors(measured: Record) -> Figure | None:
     """Draw held-out errors of free flight over its length, a panel a quantity; None without any."""
     errors = measured["diagnosis"]["prediction"]["errors"]
@@ -172,14 +107,17 @@ def draw_errors(measured: Record) -> Figure | None:
     figure = new_figure(max(WIDTH_IN * len(by_quantity), 2 * WIDTH_IN), HEIGHT_IN)
     panels = figure.subplots(1, len(by_quantity), squeeze=False)[0]
     for axes, (key, horizons) in zip(panels, by_quantity.items(), strict=True):
+        quantity, unit = split_key(key)
+        scale = np.rad2deg(1.0) if unit.startswith("rad") else 1.0
         for name, style in STYLES.items():
             by_horizon = errors.get(name, {}).get(key)
             if by_horizon:
-                seconds = [*map(float, by_horizon)]
-                values = [in_degrees(key, value)[0] for value in by_horizon.values()]
+                values = scale * np.array([*by_horizon.values()])
                 label = name.replace("_", " ")
-                plain(axes).loglog(seconds, values, markersize=3, label=label, **style)
-        title = f"{key.split('_')[0]} ({in_degrees(key, 0.0)[1]})"
+                plain(axes).loglog(
+                    [*map(float, by_horizon)], values, markersize=3, label=label, **style
+                )
+        title = f"{quantity} ({unit.replace('rad', 'deg')})"
         axes.set_title(title, fontsize="small", loc="left")
         axes.set_xticks([*map(float, horizons)], [*horizons])
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -228,11 +166,10 @@ def errors_table(diagnosis: Record) -> str:
         cells = [format_number(one_step.get(name, {}).get(channel)) for name in columns]
         rows.append([f"{channel}, one step, NRMSE", *cells])
     for key, by_horizon in flights.get("nominal", {}).items():
-        quantity, unit = key.split("_", 1)
+        quantity, unit = split_key(key)
         for horizon in by_horizon:
             errors = [flights.get(name, {}).get(key, {}).get(horizon) for name in columns]
-            title = f"{quantity} after {horizon} s, {unit.replace('_per_', '/')}"
-            rows.append([title, *map(format_number, errors)])
+            rows.append([f"{quantity} after {horizon} s, {unit}", *map(format_number, errors)])
     heads = [name.replace("_", " ") for name in columns]
     return table(["rms error on held-out rows", *heads], rows)
 
@@ -265,7 +202,8 @@ def format_section(measured: Record, picture: str) -> str:
     cost = f"{measured['cpu_s']:.0f} CPU s, compilation included; commit {measured['commit']}"
     has_flights = diagnosis["prediction"]["errors"]
     parts = [
-        describe(measured),
+        measured["sentence"],
+        describe_responses(diagnosis["half_response_s"]),
         f"![Errors of free flight over its length]({picture})" if has_flights else "",
         f"{measured['num_rows']} rows; verdict `{diagnosis['verdict']}`; "
         f"motion `{diagnosis['motion']}`; {cost}.",
