@@ -105,39 +105,29 @@ def _draw_stochastic(rng: Rng) -> ChannelAndShape:
     return ("force" if rng.random() < 0.5 else "rate"), {"time_constant_s": rng.uniform(*GUST_S)}
 
 
-# Kind -> what it is a function of, and its draw.
-DRAWS: dict[str, tuple[str, Callable[[Rng], ChannelAndShape]]] = {
-    "position": ("position", _draw_position),
-    "time": ("time", _draw_time),
-    "heading": ("heading", _draw_heading),
-    "airspeed": (
-        "airspeed",
-        lambda rng: (
-            "force",
-            {"speed_ms": rng.uniform(*SPEED_MS), "width_ms": rng.uniform(*SPEED_WIDTH_MS)},
-        ),
+DRAWS: dict[str, Callable[[Rng], ChannelAndShape]] = {
+    "position": _draw_position,
+    "time": _draw_time,
+    "heading": _draw_heading,
+    "airspeed": lambda rng: (
+        "force",
+        {"speed_ms": rng.uniform(*SPEED_MS), "width_ms": rng.uniform(*SPEED_WIDTH_MS)},
     ),
-    "attitude": ("tilt", _draw_attitude),
-    "command": ("command", _draw_command),
-    "periodic": ("frequency", _draw_periodic),
-    "stochastic": ("chance", _draw_stochastic),
+    "attitude": _draw_attitude,
+    "command": _draw_command,
+    "periodic": _draw_periodic,
+    "stochastic": _draw_stochastic,
 }
 KINDS = tuple(DRAWS)
 # Drawn by name only: laws that a learner may find (benchmarks.beyond).
 DRAWS |= {
-    "flapping": (
-        "airspeed",
-        lambda rng: ("rate", {"x": 0.0, "y": float(rng.choice([-1.0, 1.0])), "z": 0.0}),
+    "flapping": lambda rng: ("rate", {"x": 0.0, "y": float(rng.choice([-1.0, 1.0])), "z": 0.0}),
+    "cable": lambda rng: (
+        "force",
+        {"phase": rng.uniform(-math.pi, math.pi), **direction(*AXES)(1.0, rng)},
     ),
-    "cable": (
-        "heading",
-        lambda rng: (
-            "force",
-            {"phase": rng.uniform(-math.pi, math.pi), **direction(*AXES)(1.0, rng)},
-        ),
-    ),
-    "heating": ("time", lambda rng: ("thrust", DOWN | {"warming_s": rng.uniform(*WARMING_S)})),
-    "payload": ("airspeed", lambda rng: ("force", {"string_m": rng.uniform(*STRING_M)})),
+    "heating": lambda rng: ("thrust", DOWN | {"warming_s": rng.uniform(*WARMING_S)}),
+    "payload": lambda rng: ("force", {"string_m": rng.uniform(*STRING_M)}),
 }
 
 
@@ -153,6 +143,5 @@ def draw_outside(rng: Rng, kind: str | None = None, amplitude: float | None = No
     """
     kind = str(rng.choice(KINDS)) if kind is None else kind
     amplitude = log_uniform(SMALLEST, LARGEST, rng) if amplitude is None else amplitude
-    depends_on, draw = DRAWS[kind]
-    channel, shape = draw(rng)
-    return Outside(kind, (depends_on,), channel, float(amplitude), shape)
+    channel, shape = DRAWS[kind](rng)
+    return Outside(kind, channel, float(amplitude), shape)

@@ -14,12 +14,12 @@ they add to the specific force, body, m/s^2. Where the package has another law f
 same name, the difference is intended: no real plant follows the package's laws.
 """
 
-import cmath
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from flytrack_bench.hidden.laws import (
@@ -116,40 +116,35 @@ def _yaw_reaction(values: Parameters) -> Hook:
 class RateLoop:
     """y'' / wn^2 + lag_s y' + y = omega, with lag_s = 2 damping / wn: an oscillator per axis.
 
-    Exact for rates held over the step. Each axis has its own lag, s, and damping, not 1. rates_b,
+    Exact for rates held over the step. Each axis has its own lag, s, and damping. rates_b,
     slopes_b: y and y', rad/s and rad/s^2.
     """
 
     def __init__(self, values: Parameters):
         self._axes = [(values[f"{axis}_damping"], values[f"{axis}_s"]) for axis in STICKS]
-        self._known: dict[float, list[tuple[float, float, float, float]]] = {}
+        self._responses: dict[float, list[list[list[float]]]] = {}
         self.rates_b: Vector = (0.0, 0.0, 0.0)
         self.slopes_b: Vector = (0.0, 0.0, 0.0)
 
     def follow(self, asked_b: Vector, step_s: float) -> Vector:
         """Return the body rates after a step in which these are asked for."""
-        if step_s not in self._known:
-            self._known[step_s] = [
+        if step_s not in self._responses:
+            self._responses[step_s] = [
                 _response(damping, lag_s, step_s) for damping, lag_s in self._axes
             ]
-        axes = zip(self._known[step_s], asked_b, self.rates_b, self.slopes_b, strict=True)
+        axes = zip(self._responses[step_s], asked_b, self.rates_b, self.slopes_b, strict=True)
         after = []
-        for (stay, follow, pull, keep), rate, now, slope in axes:
+        for ((stay, follow), (pull, keep)), rate, now, slope in axes:
             offset = now - rate
             after.append((rate + stay * offset + follow * slope, pull * offset + keep * slope))
         self.rates_b, self.slopes_b = zip(*after, strict=True)
         return self.rates_b
 
 
-def _response(damping: float, lag_s: float, step_s: float) -> tuple[float, float, float, float]:
+def _response(damping: float, lag_s: float, step_s: float) -> list[list[float]]:
     """Return what stays of an offset and of a slope after a step: in the rate, and in its slope."""
-    natural = 2.0 * damping / lag_s
-    decay, root = natural * damping, natural * cmath.sqrt(damping * damping - 1.0)
-    shrink = math.exp(-decay * step_s)
-    # Both are real, whether the root is (two lags) or not (oscillation).
-    even, odd = cmath.cosh(root * step_s).real, (cmath.sinh(root * step_s) / root).real
-    pull = -natural * natural * shrink * odd
-    return shrink * (even + decay * odd), shrink * odd, pull, shrink * (even - decay * odd)
+    stiffness = (2.0 * damping / lag_s) ** 2
+    return expm(step_s * np.array([[0.0, 1.0], [-stiffness, -stiffness * lag_s]])).tolist()
 
 
 def _rate_slew_limit(values: Parameters) -> Hook:
@@ -230,30 +225,32 @@ def _wind(values: Parameters) -> Hook:
     return lambda drone: to_body(drone.rows, push_w)
 
 
-# In the order in which they act: first what a flight controller makes of the sticks, then the
-# frame.
-COMMAND_EFFECTS = {
-    "rate_expo": _rate_expo,
-    "rate_saturation": _rate_saturation,
-    "rate_slew_limit": _rate_slew_limit,
-}
-RATE_EFFECTS = {
-    "rate_scale": _rate_scale,
-    "rate_cross_coupling": _rate_cross_coupling,
-    "motor_imbalance": _motor_imbalance,
-    "yaw_reaction": _yaw_reaction,
-}
-THRUST_EFFECTS = {
-    "thrust_scale": _thrust_scale,
-    "translational_lift": _translational_lift,
-    "ground_effect": _ground_effect,
-}
-FORCE_EFFECTS = {
-    "linear_drag": _linear_drag,
-    "quadratic_drag": _quadratic_drag,
-    "rotor_drag": _rotor_drag,
-    "thrust_tilt": _thrust_tilt,
-    "wind": _wind,
+# By stage, in the order in which they act: first what a flight controller makes of the sticks, then
+# the frame. Laws and noise that turn the drone have a stage of their own, "turn".
+EFFECTS: dict[str, dict[str, Callable[[Parameters], Hook]]] = {
+    "command": {
+        "rate_expo": _rate_expo,
+        "rate_saturation": _rate_saturation,
+        "rate_slew_limit": _rate_slew_limit,
+    },
+    "rate": {
+        "rate_scale": _rate_scale,
+        "rate_cross_coupling": _rate_cross_coupling,
+        "motor_imbalance": _motor_imbalance,
+        "yaw_reaction": _yaw_reaction,
+    },
+    "thrust": {
+        "thrust_scale": _thrust_scale,
+        "translational_lift": _translational_lift,
+        "ground_effect": _ground_effect,
+    },
+    "force": {
+        "linear_drag": _linear_drag,
+        "quadratic_drag": _quadratic_drag,
+        "rotor_drag": _rotor_drag,
+        "thrust_tilt": _thrust_tilt,
+        "wind": _wind,
+    },
 }
 
 
@@ -354,27 +351,25 @@ class HiddenDrone:
         self.tracked = Tracked(self.pos_w, self.vel_w, self.quat)
         asymmetry = truth.effects.get("thrust_lag_asymmetry", {}).get("ratio", 1.0)
         self._taus = (*truth.tau, asymmetry * truth.tau[3])
-        self._hooks(rng)
+        self._collect_hooks(rng)
         self._parts = self._planned_parts()
         steps = {truth.step_s, *(0.5 * part.length_s for part in self._parts)}
         self._shares = {
             step: tuple(-math.expm1(-step / tau) for tau in self._taus) for step in steps
         }
 
-    def _hooks(self, rng: np.random.Generator) -> None:
+    def _collect_hooks(self, rng: np.random.Generator) -> None:
         """Collect the hooks of each stage, in the order of its table."""
         effects, outside, gust = self.truth.effects, self.truth.outside, self.truth.gust
-
-        def made(makers: Mapping[str, Callable[[Parameters], Hook]]) -> list[Hook]:
-            return [
+        self._hooks = {
+            stage: [
                 self._from_onset(make(effects[name]))
                 for name, make in makers.items()
                 if name in effects
             ]
-
-        self._command_hooks, self._rate_hooks = made(COMMAND_EFFECTS), made(RATE_EFFECTS)
-        self._thrust_hooks, self._force_hooks = made(THRUST_EFFECTS), made(FORCE_EFFECTS)
-        self._turn_hooks: list[Hook] = []
+            for stage, makers in EFFECTS.items()
+        }
+        self._hooks["turn"] = []
         self._noises: list[FirstOrderNoise] = []
         delay_s = effects.get("command_delay", {}).get("delay_s", 0.0)
         whole, self._late_share = divmod(delay_s / self.truth.step_s, 1.0)
@@ -383,13 +378,13 @@ class HiddenDrone:
         loop = effects.get("second_order_rates")
         self._loop = RateLoop(loop) if loop else None
         if outside is not None and outside.kind == "command":
-            self._command_hooks.insert(0, command_hook(outside, self.truth))
+            self._hooks["command"].insert(0, command_hook(outside, self.truth))
         elif outside is not None and outside.kind == "stochastic":
             size = outside.amplitude * SCALES[outside.channel]
             self._add_noise(outside.shape["time_constant_s"], size, outside.channel, rng)
         elif outside is not None:
-            hooks = self._turn_hooks if outside.channel == "rate" else self._force_hooks
-            hooks.append(vector_hook(outside))
+            stage = "turn" if outside.channel == "rate" else "force"
+            self._hooks[stage].append(vector_hook(outside))
         if gust is not None:
             self._add_noise(gust.time_constant, gust.std, "force", rng)
             self._add_noise(gust.time_constant, gust.rate_std, "rate", rng)
@@ -400,9 +395,8 @@ class HiddenDrone:
         process, is_rate = FirstOrderNoise(time_constant_s, rng), channel == "rate"
         if size:
             self._noises.insert(0 if is_rate else len(self._noises), process)
-            (self._turn_hooks if is_rate else self._force_hooks).append(
-                noise_hook(process, size, channel)
-            )
+            stage = "turn" if is_rate else "force"
+            self._hooks[stage].append(noise_hook(process, size, channel))
 
     def _from_onset(self, hook: Hook) -> Hook:
         """Return a hook that acts from the onset on."""
@@ -536,7 +530,7 @@ class HiddenDrone:
         self.time_s += step_s
 
     def _shaped(self, sticks: Sticks) -> Sticks:
-        for hook in self._command_hooks:
+        for hook in self._hooks["command"]:
             sticks = hook(self, sticks)
         return sticks
 
@@ -560,7 +554,7 @@ class HiddenDrone:
         self.rows = rotation(quat)
         self.airspeed_b = to_body(self.rows, add(self.vel_w, scale(-1.0, self._air_w)))
         thrust = self.truth.thrust(self.applied[3], self.battery_v)
-        for hook in self._thrust_hooks:
+        for hook in self._hooks["thrust"]:
             thrust = hook(self, thrust)
         self.thrust_acc = thrust / self.truth.mass
 
@@ -569,19 +563,19 @@ class HiddenDrone:
         self._see(quat)
         full, stick = self.full_rates, self.applied
         rates = (full[0] * stick[0], full[1] * stick[1], full[2] * stick[2])
-        for hook in self._rate_hooks:
+        for hook in self._hooks["rate"]:
             rates = hook(self, rates)
         return rates
 
     def _with_turns(self, rates_b: Vector) -> Vector:
-        for hook in self._turn_hooks:
+        for hook in self._hooks["turn"]:
             rates_b = add(rates_b, hook(self))
         return rates_b
 
     def _force(self) -> Vector:
         """Return the specific force in the attitude that was seen last."""
         force = (0.0, 0.0, self.thrust_acc)
-        for hook in self._force_hooks:
+        for hook in self._hooks["force"]:
             force = add(force, hook(self))
         return force
 

@@ -6,14 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from flytrack_bench.hidden.drone import (
-    COMMAND_EFFECTS,
-    FORCE_EFFECTS,
-    RATE_EFFECTS,
-    THRUST_EFFECTS,
-    HiddenDrone,
-    Start,
-)
+from flytrack_bench.hidden import drone as equations
+from flytrack_bench.hidden.drone import HiddenDrone, Start
 from flytrack_bench.hidden.laws import STATELESS_KINDS
 from flytrack_bench.hidden.truth import DT_S, Truth
 from flytrack_bench.hidden.vectors import Number, Quaternion, Vector
@@ -24,8 +18,10 @@ from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Action, Drone
 
 # Without those that remember more than commands, and those of the sensors.
-EFFECTS = {"command_delay", "thrust_lag_asymmetry", "voltage_sag", *COMMAND_EFFECTS, *RATE_EFFECTS}
-EFFECTS = (EFFECTS | {*THRUST_EFFECTS, *FORCE_EFFECTS}) - {"rate_slew_limit"}
+EFFECTS = {"command_delay", "thrust_lag_asymmetry", "voltage_sag"}.union(
+    *equations.EFFECTS.values()
+)
+EFFECTS -= {"rate_slew_limit"}
 START = Start((0.0, 0.0, 0.0), 0.0, 0.0, 0.0)  # every number of it is replaced
 
 
@@ -63,10 +59,15 @@ class HiddenPlant(Plant):
             raise ValueError(
                 f"outside: found {truth.outside.kind!r}, expected one of {STATELESS_KINDS}"
             )
-        others = {"motion": truth.motion == "fine", "step_s": truth.step_s != DT_S}
-        others |= {name: getattr(truth, name) is not None for name in ("gust", "onset_s")}
-        for name in (name for name, is_wrong in others.items() if is_wrong):
-            raise ValueError(f"{name}: found {getattr(truth, name)!r}, expected the default")
+        accepted: dict[str, tuple[Any, ...]] = {
+            "motion": ("handout", "semi_implicit"),
+            "step_s": (DT_S,),
+            "gust": (None,),
+            "onset_s": (None,),
+        }
+        for name, values in accepted.items():
+            if getattr(truth, name) not in values:
+                raise ValueError(f"{name}: found {getattr(truth, name)!r}, expected {values[0]!r}")
 
     def __repr__(self) -> str:
         return f"HiddenPlant({self.truth})"
@@ -74,19 +75,11 @@ class HiddenPlant(Plant):
     def reset(self, drone: Drone, model: ModelParameters) -> HiddenState:
         """Return the plant with a drone in it, nothing remembered; ``model`` is not used."""
         hidden = self._hidden()
-        hidden.applied, hidden.open_v = tuple(drone.applied), 0.0
-        state = HiddenState(
-            pos_w=tuple(drone.pos_w),
-            vel_w=tuple(drone.vel_w),
-            acc_w=tuple(drone.acc_w),
-            quat=tuple(drone.quat),
-            rates_b=tuple(drone.rates_b),
-            applied=hidden.applied,
-            open_v=drone.battery_v - hidden.loaded_v(),
-            past=hidden.past,
-            has_flown=None,
-        )
-        state = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), state)
+        for name in ("pos_w", "vel_w", "acc_w", "quat", "rates_b", "applied"):
+            setattr(hidden, name, tuple(getattr(drone, name)))
+        hidden.open_v = 0.0
+        hidden.open_v = drone.battery_v - hidden.loaded_v()
+        state = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), _state_of(hidden))
         return state._replace(has_flown=jnp.bool_(False))
 
     def drone(self, state: HiddenState) -> Drone:
@@ -112,8 +105,7 @@ class HiddenPlant(Plant):
         hidden.step(
             tuple(jnp.clip(jnp.asarray(stick, jnp.float32), -1.0, 1.0) for stick in command)
         )
-        after = HiddenState(*(getattr(hidden, name) for name in HiddenState._fields))
-        return after._replace(has_flown=jnp.bool_(True))
+        return _state_of(hidden)._replace(has_flown=jnp.bool_(True))
 
     def _hidden(self, state: HiddenState | None = None) -> HiddenDrone:
         """Return the drone in a state."""
@@ -123,3 +115,7 @@ class HiddenPlant(Plant):
                 setattr(hidden, name, value)
             hidden.battery_v = hidden.loaded_v()
         return hidden
+
+
+def _state_of(hidden: HiddenDrone) -> HiddenState:
+    return HiddenState(*(getattr(hidden, name) for name in HiddenState._fields))

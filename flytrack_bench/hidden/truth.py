@@ -15,13 +15,11 @@ MOTIONS = ("handout", "semi_implicit", "fine")
 class Outside:
     """An effect outside the package's list.
 
-    kind: of ``flytrack_bench.hidden.laws``. depends_on: tags of what it is a function of. channel:
-    what it changes, of ``laws.SCALES``. amplitude: its largest size in that unit. shape: parameters
-    of the kind.
+    kind: of ``flytrack_bench.hidden.laws``. channel: what it changes, of ``laws.SCALES``.
+    amplitude: its largest size in that unit. shape: parameters of the kind.
     """
 
     kind: str
-    depends_on: tuple[str, ...]
     channel: str
     amplitude: float
     shape: Mapping[str, float]
@@ -79,8 +77,7 @@ class Truth:
         parts = [f"{name}({_values(values)})" for name, values in self.effects.items()]
         if self.outside is not None:
             out = self.outside
-            tags = ", ".join(out.depends_on)
-            parts.append(f"outside {out.kind}[{tags}] on {out.channel} x{out.amplitude:.3g}")
+            parts.append(f"outside {out.kind} on {out.channel} x{out.amplitude:.3g}")
         if self.gust is not None:
             parts.append(f"gust({self.gust.std:.3g} m/s^2, {self.gust.time_constant:.3g} s)")
         if self.mocap_late_s:

@@ -66,35 +66,31 @@ def to_body(rows: tuple[Vector, ...], vector_w: Vector) -> Vector:
     )
 
 
+def multiply(first: Quaternion, second: Quaternion) -> Quaternion:
+    """Return the product of two quaternions."""
+    w, x, y, z = first
+    real, roll, pitch, yaw = second
+    return (
+        w * real - x * roll - y * pitch - z * yaw,
+        x * real + w * roll + y * yaw - z * pitch,
+        y * real + w * pitch - x * yaw + z * roll,
+        z * real + w * yaw + x * pitch - y * roll,
+    )
+
+
 def integrate_attitude(quat: Quaternion, rates_b: Vector, step_s: float) -> Quaternion:
     """Return the attitude after a step at body rates, rad/s, to first order as in the handout."""
-    w, x, y, z = quat
-    half = 0.5 * step_s
-    roll, pitch, yaw = half * rates_b[0], half * rates_b[1], half * rates_b[2]
-    new = (
-        w - x * roll - y * pitch - z * yaw,
-        x + w * roll + y * yaw - z * pitch,
-        y + w * pitch - x * yaw + z * roll,
-        z + w * yaw + x * pitch - y * roll,
-    )
-    norm = sqrt(new[0] * new[0] + new[1] * new[1] + new[2] * new[2] + new[3] * new[3])
-    return (new[0] / norm, new[1] / norm, new[2] / norm, new[3] / norm)
+    new = multiply(quat, (1.0, *scale(0.5 * step_s, rates_b)))
+    length = sqrt(sum(part * part for part in new))
+    return tuple(part / length for part in new)
 
 
 def turn(quat: Quaternion, rates_b: Vector, step_s: float) -> Quaternion:
     """Return the attitude after a time at constant body rates, rad/s, exactly."""
-    x, y, z = rates_b
-    rate = math.sqrt(x * x + y * y + z * z)
+    rate = norm(rates_b)
     half = 0.5 * rate * step_s
     share = math.sin(half) / rate if rate > 0.0 else 0.0
-    cosine, roll, pitch, yaw = math.cos(half), share * x, share * y, share * z
-    w, x, y, z = quat
-    return (
-        w * cosine - x * roll - y * pitch - z * yaw,
-        x * cosine + w * roll + y * yaw - z * pitch,
-        y * cosine + w * pitch - x * yaw + z * roll,
-        z * cosine + w * yaw + x * pitch - y * roll,
-    )
+    return multiply(quat, (math.cos(half), *scale(share, rates_b)))
 
 
 def add(first: Vector, second: Vector) -> Vector:
@@ -110,12 +106,6 @@ def scale(factor: Number, vector: Vector) -> Vector:
 def norm(vector: Vector) -> Number:
     """Return the length of a vector."""
     return sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
-
-
-def clip_length(vector: Vector, most: float) -> Vector:
-    """Return a vector shortened to a length, if it is longer."""
-    length = norm(vector)
-    return vector if length <= most else scale(most / length, vector)
 
 
 def wrap_angle(angle_rad: float) -> float:

@@ -19,10 +19,8 @@ SECONDS, SHORT_S = 60.0, 30.0
 BUMP_MS, WIDTH_MS = 6.0, 1.0
 
 
-PEAK = hidden.Outside(
-    "airspeed", ("airspeed",), "force", 2.0, {"speed_ms": BUMP_MS, "width_ms": WIDTH_MS}
-)
-LOAD = hidden.Outside("payload", ("airspeed",), "force", 1.5, {"string_m": 0.6})
+PEAK = hidden.Outside("airspeed", "force", 2.0, {"speed_ms": BUMP_MS, "width_ms": WIDTH_MS})
+LOAD = hidden.Outside("payload", "force", 1.5, {"string_m": 0.6})
 
 
 def flights(seed, law=PEAK, seconds=SECONDS):
