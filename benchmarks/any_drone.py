@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
 import flytrack_env
 from baselines.purejaxrl_ppo import Checkpoint, flights, load_checkpoint
@@ -194,10 +195,9 @@ def on_evaluator(checkpoint: Checkpoint, model: ModelParameters) -> Thrust:
         env, checkpoint.policy, jax.random.key(0), params, NUM_STEPS, NUM_LAPS
     )
     states = flown.flown()[0].astype(float)
-    w, x, y, z = states[
-        :-1, QUATERNION
-    ].T  # the handout's step: the force has the attitude before it
-    body_z = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    # The handout's step: the force has the attitude before it.
+    attitude = Rotation.from_quat(states[:-1, QUATERNION], scalar_first=True)
+    body_z = attitude.apply([0.0, 0.0, 1.0])
     force = np.sum((states[1:, ACCELERATION] + [0.0, 0.0, float(model.g)]) * body_z, axis=1)
     coeffs = np.asarray(model.thrust_coeffs, float)
     thrust_action, volts = states[1:, APPLIED_ACTION][:, 3], states[:-1, BATTERY]

@@ -42,6 +42,11 @@ REPLAY_HEADER = (
     "track | model | flight | flown by | gates | time (s) | off the optimum (ms) | drift (mm) | "
     "frames touched"
 )
+CONDITIONS = (
+    "casadi {casadi}, jax {jax}, one core of {machine}; battery at the start {battery_v:g} V; gates "
+    "passed {clearance_m:g} m inside what a drone of radius {drone_radius_m:g} m may; squared changes "
+    "of commands cost {smoothing_s:g} s each, so that they do not chatter"
+)
 AGREE_SHARE = 1e-3  # of the time: starts this near the best found about the same flight
 
 
@@ -275,24 +280,16 @@ def write_page(path: Path | None, flights: list[Flown]) -> list[Reference]:
     """
     references = [one.reference for one in flights if one.flown_by == "simulator"]
 
-    def each(line: str) -> str:
-        """Return the line for each reference, without repetitions."""
-        return "; ".join(sorted({line.format(**reference.found) for reference in references}))
-
     commands = sorted({reference.found["command"].strip("`") for reference in references})
     tracks = sorted({reference.track for reference in references})
     pictures = [f"![{name}]({path.stem}_{name}.png)\n\n" for name in tracks if path is not None]
+    conditions = sorted({CONDITIONS.format(**reference.found) for reference in references})
     report.fill_page(
         path,
         "time_optimal",
         commands="\n".join(f"- `{line}`" for line in commands),
         agree=AGREE_SHARE,
-        packages_found=each("casadi {casadi}, jax {jax}"),
-        machine=each("{machine}"),
-        battery=each("{battery_v:g} V"),
-        clearance=each("{clearance_m:g} m"),
-        radius=each("{drone_radius_m:g} m"),
-        smoothing=each("{smoothing_s:g} s"),
+        conditions="\n".join(f"- {line}" for line in conditions),
         optima=report.table(HEADER, map(_optimum_row, references)),
         replays=report.table(REPLAY_HEADER, map(_replay_row, flights)),
         pictures="".join(pictures),
