@@ -9,6 +9,7 @@ threads.
 import json
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -47,9 +48,9 @@ def pin_to_one_core() -> str:
 def cpu_name() -> str:
     """Return the processor's name as the system gives it."""
     path = Path("/proc/cpuinfo")
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+    text = path.read_text(encoding="utf-8") if path.exists() else ""
+    name = re.search(r"^model name\s*: (.+)", text, re.MULTILINE)
+    return name[1] if name else platform.processor() or platform.machine()
 
 
 def commit_of_checkout() -> str:
@@ -160,9 +161,8 @@ def page(title: str, *parts: str) -> str:
 
 def filled(name: str, /, **values: Any) -> str:
     """Return a template of ``benchmarks/pages`` with values filled in."""
-    return (
-        (ROOT / "benchmarks" / "pages" / f"{name}.md").read_text(encoding="utf-8").format(**values)
-    )
+    template = ROOT / "benchmarks" / "pages" / f"{name}.md"
+    return template.read_text(encoding="utf-8").format(**values)
 
 
 def fill_page(path: Path | None, name: str, /, packages: Sequence[str] = (), **values: Any) -> None:
@@ -170,12 +170,8 @@ def fill_page(path: Path | None, name: str, /, packages: Sequence[str] = (), **v
 
     ``{command}`` and ``{provenance}`` need not be given. packages: as for ``provenance``.
     """
-    values = {
-        "command": command_line(),
-        "provenance": provenance_line(provenance(*packages)),
-        **values,
-    }
-    write_page(path, filled(name, **values))
+    source = provenance_line(provenance(*packages))
+    write_page(path, filled(name, command=command_line(), provenance=source, **values))
 
 
 def write_page(path: Path | None, text: str) -> None:

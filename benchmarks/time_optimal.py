@@ -43,9 +43,9 @@ REPLAY_HEADER = (
     "frames touched"
 )
 CONDITIONS = (
-    "casadi {casadi}, jax {jax}, one core of {machine}; battery at the start {battery_v:g} V; gates "
-    "passed {clearance_m:g} m inside what a drone of radius {drone_radius_m:g} m may; squared changes "
-    "of commands cost {smoothing_s:g} s each, so that they do not chatter"
+    "casadi {casadi}, jax {jax}, one core of {machine}; battery at the start {battery_v:g} V; "
+    "gates passed {clearance_m:g} m inside what a drone of radius {drone_radius_m:g} m may; "
+    "squared changes of commands cost {smoothing_s:g} s each, so that they do not chatter"
 )
 AGREE_SHARE = 1e-3  # of the time: starts this near the best found about the same flight
 
