@@ -5,16 +5,13 @@ many seconds of each other policy, and judges on the left-out flights, which the
 beside black boxes that are trained on the same rows. The effects in question are those that single
 steps propose, and drag, which every drone has (``PROPOSED``; a search for each policy would take
 hours); which of them stay, and all values, are found without the left-out policy. It appends a line
-of JSON for each policy to benchmarks/data/real/crazyflie.jsonl. ``--fits`` fits one structure to
-the flights of each policy alone instead, to crazyflie_fits.json beside it. ``python -m
-benchmarks.real_logs`` writes the page.
+of JSON for each policy to benchmarks/data/real/crazyflie.jsonl. ``python -m benchmarks.real_logs``
+writes the page.
 """
 
-import json
 import os
 import time
 from collections.abc import Sequence
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -34,23 +31,18 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid import FlightLog, import_log
 from flytrack_sysid.diagnosis import joined, refinement
 from flytrack_sysid.diagnosis.diagnose import split
-from flytrack_sysid.inference.chunks import cut_chunks, thinned
 from flytrack_sysid.inference.free_flight import HORIZONS_S, QUANTITIES, make_windows
 from flytrack_sysid.inference.noise import fit_noise
-from flytrack_sysid.inference.parameters import STICKS, TAUS, THRUST_COEFFS, from_vector
-from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.parameters import from_vector
 from flytrack_sysid.inference.score_test import CANDIDATES
 from flytrack_sysid.inference.search import SearchState
-from flytrack_sysid.response import SMALL_STEP, half_responses
 
 VARIABLE, FOLDER = "FLYTRACK_SHARED_DATA", "crazyflie_rate_flights"
 DATA = Path(os.environ.get(VARIABLE, ROOT.parent / "shared" / "data"))
 LINES = ROOT / "benchmarks" / "data" / "real" / "crazyflie.jsonl"
-FITS = LINES.with_name("crazyflie_fits.json")
 PROPOSED = ("command_delay", "second_order_rates", "rate_scale", "motor_imbalance", "linear_drag")
 SECONDS = 10.0  # learnt from of each policy: 100 s in all
 SPACING_S, MAX_WINDOWS = 0.25, 10_000
-MIN_ROWS = 2000  # of a policy, to fit it alone
 MAPPING = "crazyflie_phoenix"
 FIGURES = (("attitude", 0.1, 0.70), ("attitude", 0.25, 0.83), ("position", 0.5, 0.80))
 BLACK_BOXES = {
@@ -63,7 +55,6 @@ OTHERS = {
     "placebo": "placebo: the state at the start, no commands",
 }
 AS_GOOD = 1.005  # rounds to 1.00
-WITHIN_MS = 5.0  # times to half response
 Line = dict[str, Any]
 
 
@@ -140,14 +131,7 @@ def measure_fold(folder: Path, policy: str, seconds: float) -> dict[str, Any]:
         "by_flight": error_ratios(
             results["refitted_base"], results["extended"], log.segment[windows.start]
         ),
-        "values": {} if fit is None else read_values(problem, fit),
     }
-
-
-def read_values(problem: Problem, fit: Any) -> dict[str, list[float]]:
-    """Return the fitted parameters by name: value and half of the 95 % interval."""
-    pairs = zip(fit.indices, fit.half_widths, strict=True)
-    return {problem.names[i]: [float(fit.vector[i]), float(half)] for i, half in pairs}
 
 
 def error_ratios(
@@ -167,34 +151,6 @@ def error_ratios(
         )
         ratios[str(number)] = np.nan_to_num(rms / base_rms, nan=0.0).round(4).tolist()
     return ratios
-
-
-def fit_policies(
-    folder: Path, structure: Sequence[str], start: dict[str, float]
-) -> list[dict[str, Any]]:
-    """Return values of one structure and half-response times, of each policy's flights alone."""
-    result = []
-    for policy in report.progress(policies_in(folder), "policies"):
-        log, model = load_flights(folder, [policy])
-        is_used = np.ones(len(log), bool)
-        if len(log) < MIN_ROWS:
-            continue
-        windows = refinement.sample_windows(log, is_used)
-        assert windows is not None
-        problem = Problem.of(thinned(cut_chunks(log, is_used, model)), model)
-        vector = problem.start.copy()
-        vector[problem.parameter_indices(list(start))] = list(start.values())
-        scale = refinement.errors_at(problem, vector[None], windows).rms()[0]
-        target = refinement.Target(problem, windows, scale, np.ones(scale.shape, bool))
-        fields = [name for name in problem.names if name.partition(".")[0] in structure]
-        fitted = problem.parameter_indices([*TAUS, *THRUST_COEFFS, *fields])
-        fit = target.fitted(vector, fitted, refinement.MAX_ROUNDS)
-        half_s = half_responses(fit.vector[None], problem.like, SMALL_STEP)[0]
-        times = dict(zip(STICKS, half_s.tolist(), strict=True))
-        result.append(
-            {"policy": policy, "values": read_values(problem, fit), "half_response_s": times}
-        )
-    return result
 
 
 # Its part of the page
@@ -256,31 +212,6 @@ def policies_table(lines: list[Line]) -> str:
     return table([*header, "cells worse, by flight", "CPU s"], rows)
 
 
-def fits_table() -> str:
-    """Return a table of one structure's values by policy, and whether they agree."""
-    fits = json.loads(FITS.read_text(encoding="utf-8"))
-    rows = []
-
-    def add_row(title: str, cells: list[str], agree: list[bool]) -> None:
-        rows.append([title, *cells, f"{sum(agree)} of {len(agree)}"])
-
-    for name in fits[0]["values"]:
-        if "." in name or name.startswith("tau"):
-            pairs = [fit["values"][name] for fit in fits]
-            agree = [
-                abs(a - b) <= half_a + half_b for (a, half_a), (b, half_b) in combinations(pairs, 2)
-            ]
-            add_row(f"`{name}`", [f"{value:.3g} ± {half:.2g}" for value, half in pairs], agree)
-    for stick in fits[0]["half_response_s"]:
-        times_ms = [1e3 * fit["half_response_s"][stick] for fit in fits]
-        agree = [abs(a - b) <= WITHIN_MS for a, b in combinations(times_ms, 2)]
-        add_row(f"half response, {stick}", [f"{time:.1f} ms" for time in times_ms], agree)
-    heads = [f"policy {fit['policy']}" for fit in fits]
-    return table(
-        ["parameter", *heads, f"pairs that overlap (times: within {WITHIN_MS:g} ms)"], rows
-    )
-
-
 def crazyflie_part() -> str:
     """Return the part of the page, of the last line of each policy."""
     last = {line["policy"]: line for line in report.lines_in(LINES)}
@@ -292,22 +223,14 @@ def crazyflie_part() -> str:
         figures=figures_table(lines),
         horizons=horizons_table(lines),
         judged=policies_table(lines),
-        fits=fits_table(),
     )
 
 
-def main(
-    data: Path = DATA, policies: str = "", seconds: float = SECONDS, fits: bool = False
-) -> None:
-    """Refine and judge for each policy, all by default, or fit each policy's flights alone."""
+def main(data: Path = DATA, policies: str = "", seconds: float = SECONDS) -> None:
+    """Refine and judge for each policy, all by default."""
     folder = data / FOLDER
     LINES.parent.mkdir(parents=True, exist_ok=True)
     with jax.enable_x64(True):
-        if fits:
-            last = report.lines_in(LINES)[-1]
-            start = {name: value for name, (value, _) in last["values"].items()}
-            report.write_json(FITS, fit_policies(folder, last["kept"], start))
-            return
         commit = report.commit_of_checkout()  # before its lines change a file
         chosen = policies.split(",") if policies else policies_in(folder)
         for policy in report.progress(chosen, "policies"):
