@@ -1,9 +1,6 @@
 """The functions that run ``flytrack``'s commands ``collect`` to ``plan``, and ``import``."""
 
-import importlib
-import sys
 from collections.abc import Sequence
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +9,7 @@ import numpy as np
 from flytrack.flags import Collect, Diagnose, Fit, Import, Plan, Validate
 from flytrack_env import Motion, blackbox, load_model, load_provenance, save_model
 from flytrack_env.dynamics import nominal_parameters
+from flytrack_env.extras import import_object
 from flytrack_env.model_file import ModelFileError
 from flytrack_env.plants import Plant
 from flytrack_env.progress import ProgressBar
@@ -46,15 +44,9 @@ RECORDING_NAME = "flight.rrd"
 
 def load_plant(where: str) -> Any:
     """Return the plant in an artifact, or the object that ``module:name`` names."""
-    module, colon, name = where.partition(":")
-    if not colon or Path(where).exists():
+    if ":" not in where or Path(where).exists():
         return blackbox.load(where)
-    sys.path.insert(0, str(Path.cwd()))  # stays there: the module may import later
-    try:
-        found = attrgetter(name)(importlib.import_module(module))
-    except Exception as error:  # whatever a user's module raises
-        reason = f"{type(error).__name__}: {error}"
-        raise CollectError(f"--black-box {where}: cannot be imported: {reason}") from error
+    found = import_object(where, "--black-box", CollectError)
     if not callable(found) and not isinstance(found, Plant):
         raise CollectError(
             f"--black-box {where}: found {type(found).__name__}, expected step(x, u) or a plant"

@@ -9,9 +9,10 @@ import numpy as np
 from tyro.conf import arg
 
 from baselines.purejaxrl_ppo.config import OPTIONAL, OptionalPath
-from flytrack_bench.policies import PolicyError, find_object, load_policy
+from flytrack_bench.policies import PolicyError, load_policy
 from flytrack_bench.results import differences, run
 from flytrack_bench.suite import Suite, SuiteError, load_suite
+from flytrack_env.extras import import_object
 from flytrack_env.files import read_at_most, write_atomically
 from flytrack_env.messages import error_text
 from flytrack_env.progress import ProgressBar
@@ -50,12 +51,10 @@ def run_bench(flags: Flags) -> int:
 def fly(flags: Flags, suite: Suite, ids: tuple[str, ...]) -> dict[str, Any]:
     """Return the result of the policies on some tasks."""
     policies = [load_policy(one) for one in flags.policy]
-    tasks, adapt = (
-        suite.chosen(ids),
-        None if flags.adapt is None else find_object(flags.adapt, "--adapt"),
-    )
-    if adapt is not None and not ids:
-        tasks = tuple(task for task in tasks if task.craft is not None)
+    tasks, adapt = suite.chosen(ids), None
+    if flags.adapt is not None:
+        adapt = import_object(flags.adapt, "--adapt", PolicyError)
+        tasks = tasks if ids else tuple(task for task in tasks if task.craft is not None)
     return run(suite, policies, tasks, flags.data_seconds, adapt, ProgressBar("flights"))
 
 

@@ -1,10 +1,7 @@
 """Policies: a checkpoint of the baseline, or a function or object of the user's own module."""
 
 import hashlib
-import importlib
-import sys
 from dataclasses import dataclass
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +12,7 @@ import flytrack_env
 from baselines.purejaxrl_ppo import Checkpoint, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint_env import plant_env
 from flytrack_env.episodes import EpisodicEnvironment
+from flytrack_env.extras import import_object
 from flytrack_env.plants import Plant
 from flytrack_env.state import ACTION_SIZE
 from flytrack_env.tracks import Track
@@ -82,7 +80,7 @@ def load_policy(where: str) -> Policy:
     if ":" not in where or Path(where).exists():
         checkpoint, content = load_checkpoint(Path(where)), Path(where).read_bytes()
         return policy_of(checkpoint, Path(where).name, hashlib.sha256(content).hexdigest())
-    found = find_object(where, "policy")
+    found = import_object(where, "policy", PolicyError)
     network = found if hasattr(found, "act") else Function(found)
     space = flytrack_env.FlyTrack().observation_space(flytrack_env.FlyTrack().default_params)
     try:
@@ -97,19 +95,3 @@ def load_policy(where: str) -> Policy:
             f"policy: {where}: found an action of shape {action.shape}, expected (4,)"
         )
     return Policy(where, network, None, None, "")
-
-
-def find_object(where: str, argument: str) -> Any:
-    """Return the object that ``module:name`` names; the working directory is searched first.
-
-    argument: whose value this is, for the error.
-
-    Raises:
-        PolicyError: it cannot be imported.
-    """
-    module, _, name = where.partition(":")
-    sys.path.insert(0, str(Path.cwd()))  # stays there: the module may import later
-    try:
-        return attrgetter(name)(importlib.import_module(module))
-    except Exception as error:  # whatever a user's module raises
-        raise PolicyError(f"{argument}: {where}: {type(error).__name__}: {error}") from error

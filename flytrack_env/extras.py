@@ -1,6 +1,11 @@
-"""Packages that only an extra of FlyTrack brings: say what is missing and how to install it."""
+"""Packages that only an extra of FlyTrack brings, and objects in modules of the user's own."""
 
+import importlib
+import sys
 from importlib.util import find_spec
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
 
 PACKAGES = {
     "PIL": "Pillow",
@@ -39,3 +44,19 @@ def check_installed(extra: str, who: str, *modules: str) -> None:
             package = PACKAGES.get(module, module)
             how = f"pip install 'flytrack[{extra}]'"
             raise ImportError(f"{who} need {package}, which is not installed: {how}", name=module)
+
+
+def import_object(where: str, argument: str, error: type[Exception]) -> Any:
+    """Return the object that ``module:name`` names; the working directory is searched first.
+
+    Args:
+        argument: whose value this is, for the message.
+        error: what is raised where it cannot be imported.
+    """
+    module, _, name = where.partition(":")
+    sys.path.insert(0, str(Path.cwd()))  # stays there: the module may import later
+    try:
+        return attrgetter(name)(importlib.import_module(module))
+    except Exception as problem:  # whatever a user's module raises
+        reason = f"{type(problem).__name__}: {problem}"
+        raise error(f"{argument}: {where}: cannot be imported: {reason}") from problem
