@@ -233,7 +233,7 @@ def grade(changes: Sequence[tuple[set[str], set[str]]], names: list[str]) -> dic
     change.
     """
     named = set(names)
-    exact, equivalent = ([change[side] for change in changes] for side in (0, 1))
+    exact, equivalent = zip(*changes, strict=True) if changes else ((), ())
 
     def fits(classes: Sequence[set[str]]) -> bool:
         return all(named & one for one in classes) and named <= set().union(*classes)
@@ -267,21 +267,21 @@ def figures(by_row: Mapping[str, list[Line]]) -> list[report.Figure]:
             result.append(report.share_figure(name, "", [line[flag] for line in notable]))
     changed = [*by_row["single"], *by_row["pair"]]
     errors = [line["error"] for line in changed if line["found"] and line["error"]]
+    largest = [max(ratios.values()) for ratios in errors]
+    after_1_s = [ratios["1"] for ratios in errors if "1" in ratios]
     seconds = [line["cpu_s"] for lines in by_row.values() for line in lines]
     ratio = "extended over refitted"
-    values: dict[str, tuple[list[float], Callable[..., Any], str]] = {
-        f"{ratio}: largest at any horizon": ([max(one.values()) for one in errors], np.max, ".3f"),
-        f"{ratio} after 1 s: median": (
-            [one["1"] for one in errors if "1" in one],
-            np.median,
-            ".3f",
-        ),
-        "CPU s of a diagnosis: median": (seconds, np.median, ".0f"),
-    }
-    for name, (sizes, statistic, digits) in values.items():
-        if sizes:
-            result.append(report.Figure(name, "", format(statistic(sizes), digits), len(sizes)))
-    return result
+    if errors:
+        result += [
+            report.Figure(
+                f"{ratio}: largest at any horizon", "", f"{max(largest):.3f}", len(largest)
+            ),
+            report.Figure(
+                f"{ratio} after 1 s: median", "", f"{np.median(after_1_s):.3f}", len(after_1_s)
+            ),
+        ]
+    median_s = f"{np.median(seconds):.0f}"
+    return [*result, report.Figure("CPU s of a diagnosis: median", "", median_s, len(seconds))]
 
 
 def kinds_table(singles: list[Line]) -> str:
