@@ -119,10 +119,8 @@ def close_loop(
         after = before._replace(name="after")
     loop = Loop(before, found, after, excitation, race_log, held_out)
     report("6/6 flown again")
-    content = (
-        json.dumps(loop_as_json(loop, seed, config, settings), indent=2, allow_nan=False) + "\n"
-    )
-    write_atomically(out / "loop.json", content.encode())
+    content = json.dumps(loop_as_json(loop, seed, config, settings), indent=2, allow_nan=False)
+    write_atomically(out / "loop.json", f"{content}\n".encode())
     return loop
 
 

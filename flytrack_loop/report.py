@@ -24,42 +24,31 @@ from flytrack_loop.stages import NUM_LAPS, NUM_STEPS, Stage
 
 def describe(loop: Loop) -> str:
     """Return before and after as lines of text: errors on held-out flight, the race, the gap."""
-    before, after = loop.before, loop.after
-
-    def line(label: str, first: float | None, second: float | None, form: str) -> str:
-        cells = (
-            "-" if one is None or not np.isfinite(one) else format(one, form)
-            for one in (first, second)
-        )
-        return f"{label:58}" + "".join(f"{cell:>12}" for cell in cells)
-
+    columns = [_figures(stage) for stage in (loop.before, loop.after)]
     lines = [f"{'':58}{'before':>12}{'after':>12}"]
-    if before.errors is not None and after.errors is not None:
-        for name, value in before.errors.one_step_nrmse.items():
-            label = f"held-out flight, one step, {name}: NRMSE"
-            lines.append(line(label, value, after.errors.one_step_nrmse.get(name), ".4f"))
-        for horizon, value in before.errors.position_m.items():
-            label = f"held-out flight, {horizon} s of free flight: position, m"
-            lines.append(line(label, value, after.errors.position_m.get(horizon), ".4f"))
-    for side in ("simulator", "plant"):
-        first, second = getattr(before.gap, side), getattr(after.gap, side)
-        lines.append(
-            line(
-                f"{side}: starts that finish {NUM_LAPS} laps", first.success, second.success, ".1%"
-            )
-        )
-        for name in ("first_lap_s", "flying_lap_s"):
-            label = f"{side}: {name.removesuffix('_s').replace('_', ' ')}, s"
-            lines.append(line(label, getattr(first, name), getattr(second, name), ".3f"))
-    lines.append(
-        line(
-            "lap gap, plant against simulator, %",
-            before.gap.lap_percent,
-            after.gap.lap_percent,
-            "+.2f",
-        )
-    )
+    for label in columns[0]:
+        cells = "".join(f"{column.get(label, '-'):>12}" for column in columns)
+        lines.append(f"{label:58}{cells}")
     return "\n".join(lines)
+
+
+def _figures(stage: Stage) -> dict[str, str]:
+    """Return what was measured of a stage as text, by what it is."""
+    values: dict[str, tuple[float, str]] = {}
+    if stage.errors is not None:
+        for name, error in stage.errors.one_step_nrmse.items():
+            values[f"held-out flight, one step, {name}: NRMSE"] = error, ".4f"
+        for horizon, error in stage.errors.position_m.items():
+            values[f"held-out flight, {horizon} s of free flight: position, m"] = error, ".4f"
+    for side, score in stage.gap._asdict().items():
+        values[f"{side}: starts that finish {NUM_LAPS} laps"] = score.success, ".1%"
+        values[f"{side}: first lap, s"] = score.first_lap_s, ".3f"
+        values[f"{side}: flying lap, s"] = score.flying_lap_s, ".3f"
+    values["lap gap, plant against simulator, %"] = stage.gap.lap_percent, "+.2f"
+    return {
+        label: format(value, digits) if np.isfinite(value) else "-"
+        for label, (value, digits) in values.items()
+    }
 
 
 def fly_one(stage: Stage, env: EpisodicEnvironment, seed: int) -> Rollout:

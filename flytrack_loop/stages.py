@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from baselines.purejaxrl_ppo import Checkpoint, Config
@@ -174,17 +175,7 @@ def rounded(value: float) -> float | None:
 
 def stage_as_json(stage: Stage) -> dict[str, Any]:
     """Return what was measured of a stage as JSON values; null where there is no number."""
-    sides = {"simulator": stage.gap.simulator, "plant": stage.gap.plant}
-    return {
-        "name": stage.name,
-        **{
-            side: {key: rounded(v) for key, v in one._asdict().items()}
-            for side, one in sides.items()
-        },
-        "lap_gap_percent": rounded(stage.gap.lap_percent),
-        "errors": stage.errors
-        and {
-            kind: {k: rounded(v) for k, v in values.items()}
-            for kind, values in stage.errors._asdict().items()
-        },
-    }
+    content = {side: one._asdict() for side, one in stage.gap._asdict().items()}
+    content["lap_gap_percent"] = stage.gap.lap_percent
+    content["errors"] = stage.errors and stage.errors._asdict()
+    return {"name": stage.name, **jax.tree.map(rounded, content)}

@@ -8,9 +8,7 @@ only, because its threads stay on the core to which ``pin`` has moved the proces
 import json
 import os
 import shutil
-import sys
 import time
-import traceback
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -29,12 +27,11 @@ def pin(free_cores: Any) -> None:
         os.sched_setaffinity(0, {free_cores.get()})
 
 
-def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any] | None:
+def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
     """Return a job's result, from its file if it has finished; an unfinished job starts again.
 
-    What it prints goes to a log in the job's folder, and so does the traceback of an error, and
-    the result is None. Compiled programs are dropped afterwards: the system limits how many memory
-    mappings a process may have.
+    What it prints goes to a log in the job's folder. Compiled programs are dropped afterwards: the
+    system limits how many memory mappings a process may have.
     """
     folder = out / job
     if (folder / RESULT).exists():
@@ -46,14 +43,8 @@ def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any] | None
 
     started_s = time.process_time()
     with (folder / LOG).open("w") as log, redirect_stdout(log), redirect_stderr(log):
-        try:
-            result = (train_shared if job in SHARED else measure_plant)(job, out, steps, seed)
-        except Exception as error:
-            traceback.print_exc()
-            print(f"{job}: failed, see {folder / LOG}: {error}", file=sys.__stderr__)
-            return None
-        finally:
-            jax.clear_caches()
+        result = (train_shared if job in SHARED else measure_plant)(job, out, steps, seed)
+    jax.clear_caches()
     result["cpu_s"] = time.process_time() - started_s
     write_json(folder / RESULT, result)
     return result
