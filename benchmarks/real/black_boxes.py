@@ -113,7 +113,7 @@ def _arx(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     return regressors, np.c_[regressors, rows.vel_b]
 
 
-def _fit_ridge(inputs: np.ndarray, outputs: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+def fit_ridge(inputs: np.ndarray, outputs: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """Return a ridge regression with an offset, as a function of inputs."""
     mean, spread = inputs.mean(axis=0), inputs.std(axis=0) + 1e-9
 
@@ -129,8 +129,8 @@ def _fit_ridge(inputs: np.ndarray, outputs: np.ndarray) -> Callable[[np.ndarray]
 def fit_linear(rows: Rows, regressors: Callable[[Rows], tuple[np.ndarray, np.ndarray]]) -> BlackBox:
     """Return a ridge regression of rates and of force, each on its own regressors."""
     of_rates, of_force = regressors(rows)
-    rates = _fit_ridge(of_rates, rows.target[:, :3])
-    force = _fit_ridge(of_force, rows.target[:, 3:])
+    rates = fit_ridge(of_rates, rows.target[:, :3])
+    force = fit_ridge(of_force, rows.target[:, 3:])
 
     def black_box(rows: Rows) -> np.ndarray:
         of_rates, of_force = regressors(rows)

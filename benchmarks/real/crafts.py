@@ -11,6 +11,7 @@ from benchmarks import report
 from benchmarks.real.black_boxes import (
     base_steps,
     fit_linear_boxes,
+    fit_ridge,
     fly_windows,
     rows_of,
     with_pose,
@@ -42,7 +43,6 @@ QUAD, GECKO_MAPPING = (
 )
 GECKO, GECKO_FILE = "bf_gecko", "btfl_002.bbl"
 BEFORE_S, AFTER_S = 0.3, 0.1  # of the setpoints that the best linear law knows
-RIDGE = 1e-6
 HORIZON, TARGETS = "0.25", {"refitted_base": 0.8, "arx": 1.1}
 NANOBENCH = "nanobench"
 HALVES = (
@@ -94,11 +94,9 @@ def best_linear(log: FlightLog, held_out: np.ndarray) -> float:
     back, ahead = round(BEFORE_S / step_s), round(AFTER_S / step_s)
     rows = np.arange(back, len(log) - ahead)
     setpoints = log["u"][rows[:, None] + np.arange(-back, ahead + 1), :3].reshape(len(rows), -1)
-    inputs, is_held_out = np.c_[setpoints, np.ones(len(rows))], held_out[rows]
-    trained, rates = inputs[~is_held_out], log["w"][rows]
-    damping = RIDGE * np.diag(np.square(trained).sum(axis=0) + 1e-9)
-    slopes = np.linalg.solve(trained.T @ trained + damping, trained.T @ rates[~is_held_out])
-    residuals = rates[is_held_out] - inputs[is_held_out] @ slopes
+    rates, is_held_out = log["w"][rows], held_out[rows]
+    law = fit_ridge(setpoints[~is_held_out], rates[~is_held_out])
+    residuals = (rates - law(setpoints))[is_held_out]
     return float(np.sqrt(np.square(residuals).sum(axis=1).mean()))
 
 
