@@ -17,23 +17,31 @@ from flytrack_env.messages import quote_name
 ARM_SWITCH = "aux 0 0 0 1700 2100 0 0"
 CHANNEL_ORDER = "map AETR1234"
 # Lines of a dump about pins, lights, radio and switches, which a simulated board has not: left out.
-HARDWARE = frozenset(
-    {
-        "adjrange",
-        "aux",
-        "batch",
-        "beacon",
-        "beeper",
-        "board_name",
-        "color",
-        "defaults",
-        "dma",
-        "led",
-        "map",
-    }
-    | {"manufacturer_id", "mcu_id", "mode_color", "resource", "rxfail", "rxrange", "save", "serial"}
-    | {"signature", "timer", "vtx", "vtxtable"}
-)
+HARDWARE = {
+    "adjrange",
+    "aux",
+    "batch",
+    "beacon",
+    "beeper",
+    "board_name",
+    "color",
+    "defaults",
+    "dma",
+    "led",
+    "manufacturer_id",
+    "map",
+    "mcu_id",
+    "mode_color",
+    "resource",
+    "rxfail",
+    "rxrange",
+    "save",
+    "serial",
+    "signature",
+    "timer",
+    "vtx",
+    "vtxtable",
+}
 PROFILES, RATE_PROFILES = 4, 4
 MAX_NAMES = 12  # in a message
 

@@ -33,12 +33,6 @@ def run_show(flags: Show) -> None:
     optimal = (
         shipped_reference(track.name, "flying", flags.ghost_model) if flags.animation else None
     )
-    if flags.out is not None:
-        found = next(path for path in (flags.out, *flags.out.parents) if path.exists())
-        if not found.is_dir():
-            raise NotADirectoryError(
-                f"--out {flags.out}: found a file, {found}, expected a folder or a new path"
-            )
     folder = flags.out or fresh_folder(DEFAULT_OUT)
     folder.mkdir(parents=True, exist_ok=True)
     write_recording(folder / RECORDING, recorded, track)

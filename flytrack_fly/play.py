@@ -13,13 +13,14 @@ from flytrack_fly.sticks import NAMES, Gamepad, move_by_keys
 PICTURES_PER_S = 60
 # Which stick a key pulls, and where to.
 KEYS = {
-    **{
-        pygame.K_RIGHT: (0, 1.0),
-        pygame.K_LEFT: (0, -1.0),
-        pygame.K_UP: (1, 1.0),
-        pygame.K_DOWN: (1, -1.0),
-    },
-    **{pygame.K_a: (2, 1.0), pygame.K_d: (2, -1.0), pygame.K_w: (3, 1.0), pygame.K_s: (3, -1.0)},
+    pygame.K_RIGHT: (0, 1.0),
+    pygame.K_LEFT: (0, -1.0),
+    pygame.K_UP: (1, 1.0),
+    pygame.K_DOWN: (1, -1.0),
+    pygame.K_a: (2, 1.0),
+    pygame.K_d: (2, -1.0),
+    pygame.K_w: (3, 1.0),
+    pygame.K_s: (3, -1.0),
 }
 SHIFTS = {pygame.K_LSHIFT, pygame.K_RSHIFT}
 HELP = """

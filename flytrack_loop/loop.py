@@ -1,7 +1,6 @@
 """The loop: collect, fit, train, fly, diagnose the flight, extend the model, retrain, fly again."""
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -66,16 +65,14 @@ def close_loop(
     config: Config = Config(),  # noqa: B008, a frozen dataclass
     seed: int = 0,
     settings: Settings = Settings(),
-    report: Callable[[str], None] = print,
     start: ModelParameters | None = None,
 ) -> Loop:
     """Close the loop on a plant.
 
     Logs, models, diagnosis, trainings and ``loop.json`` are written into ``out``.
 
-    plant: a black box, or any ``flytrack_env.plants.Plant``. config: of both trainings. report:
-    called with a line per step. start: the model to fit from, and how it moves; the nominal one,
-    moving as fits the log, if None.
+    plant: a black box, or any ``flytrack_env.plants.Plant``. config: of both trainings. start: the
+    model to fit from, and how it moves; the nominal one, moving as fits the log, if None.
 
     Raises: ValueError: a plant that does not fly, settings that cannot be used, ``out`` with
         another run in it.
@@ -83,7 +80,7 @@ def close_loop(
     config.check()
     out.mkdir(parents=True, exist_ok=True)
     seeds = seeds_of(seed)
-    report("1/6 collect and fit the minimal model")
+    print("1/6 collect and fit the minimal model")
     excitation = collect(
         plant, settings.minutes, seeds["collect"], settings.noise, ProgressBar("flights")
     )
@@ -95,10 +92,10 @@ def close_loop(
     fitted = fit(excitation, start, report=ProgressBar("rounds"))
     save_model(out / "minimal.json", fitted.model, fitted.provenance())
 
-    report("2/6 train on it")
+    print("2/6 train on it")
     rest = (plant, out, config, seeds["train"], seeds["evaluation"])
     before = train_stage("before", fitted.model, *rest)
-    report("3/6 fly, and log the flight")
+    print("3/6 fly, and log the flight")
     length, noise = settings.log_seconds, settings.noise
     race_log = fly_log(plant, before.checkpoint, seeds["race_log"], length, noise)
     held_out = fly_log(plant, before.checkpoint, seeds["held_out_log"], length, noise)
@@ -106,19 +103,19 @@ def close_loop(
     save_log(out / "held_out.npz", held_out)
     before = before._replace(errors=errors_of(fitted.model, held_out))
 
-    report("4/6 diagnose the flight, extend the model")
+    print("4/6 diagnose the flight, extend the model")
     logs = [race_log, excitation]
     found = diagnose(logs, fitted.model, report=ProgressBar("stages"), motion=motion)
     write_diagnosis(out / "diagnosis", found, joined(logs))
-    report(text_of(found))
+    print(text_of(found))
     if found.causes or found.beyond or found.learned is not None:
-        report("5/6 train on the extended model")
+        print("5/6 train on the extended model")
         after = train_stage("after", found.extended, *rest, held_out)
     else:
-        report("5/6 nothing was named: the policy stays")
+        print("5/6 nothing was named: the policy stays")
         after = before._replace(name="after")
     loop = Loop(before, found, after, excitation, race_log, held_out)
-    report("6/6 flown again")
+    print("6/6 flown again")
     content = json.dumps(loop_as_json(loop, seed, config, settings), indent=2, allow_nan=False)
     write_atomically(out / "loop.json", f"{content}\n".encode())
     return loop
