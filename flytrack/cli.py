@@ -83,7 +83,7 @@ COMMANDS = {
     "firmware": Command(
         "Build and check Betaflight in the loop, in a clone",
         None,
-        "firmware.__main__:main",
+        "firmware.cli:main",
         None,
         True,
     ),

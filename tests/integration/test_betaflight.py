@@ -12,7 +12,7 @@ pytest.importorskip("firmware", reason="firmware/ is in clones only")
 
 import flytrack_env
 from firmware import Betaflight, Body, FirmwareError, build
-from firmware.__main__ import check
+from firmware.cli import check
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import BetaflightLoop, effect_of
 from flytrack_env.plants import Simulator

@@ -3,17 +3,16 @@
 Usage: ``flytrack firmware build [--sdist FILE]``, ``flytrack firmware check``.
 """
 
-import argparse
 import hashlib
-import sys
 import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import tyro
 
-from firmware.body import Body, FirmwareError
+from firmware.body import Body
 from firmware.building import build
 from firmware.plant import DT_S, Betaflight
 from flytrack_env.state import APPLIED_ACTION, BATTERY, POSITION, QUATERNION, STATE_SIZE
@@ -52,30 +51,25 @@ def check() -> str:
     return f"{NUM_FLIGHTS} flights: {digest}, {same}; {speed:.0f} times real time"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Do as the command line says; return the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="flytrack firmware", description="Betaflight in the loop."
-    )
-    commands = parser.add_subparsers(required=True, dest="command")
-    commands.add_parser("check", help="fly a fixed set of flights twice: their hash, and the speed")
-    command = commands.add_parser(
-        "build", help="download by hash and compile, in the user's cache folder"
-    )
-    command.add_argument(
-        "--sdist", type=Path, help="the source distribution, if it is downloaded already"
-    )
-    try:
-        asked = parser.parse_args(arguments)
-        if asked.command == "check":
-            print(check())
-        else:
-            build(partial(print, flush=True), asked.sdist)
-    except (FirmwareError, OSError) as error:
-        print(f"flytrack firmware: error: {error}", file=sys.stderr)
-        return 2
-    return 0
+def print_check() -> None:
+    """Fly a fixed set of flights twice: their hash, and the speed."""
+    print(check())
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+def print_build(sdist: Path | None = None) -> None:
+    """Download by hash and compile, in the user's cache folder.
+
+    Args:
+        sdist: The source distribution, if it is downloaded already.
+    """
+    build(partial(print, flush=True), sdist)
+
+
+def main(words: Sequence[str]) -> None:
+    """Do as the words after ``flytrack firmware`` say."""
+    tyro.extras.subcommand_cli_from_dict(
+        {"build": print_build, "check": print_check},
+        args=words,
+        prog="flytrack firmware",
+        description="Betaflight in the loop.",
+    )
