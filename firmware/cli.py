@@ -7,7 +7,6 @@ import hashlib
 import time
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import tyro
@@ -15,6 +14,7 @@ import tyro
 from firmware.body import Body
 from firmware.building import build
 from firmware.plant import DT_S, Betaflight
+from flytrack.flags import OptionalPath
 from flytrack_env.state import APPLIED_ACTION, BATTERY, POSITION, QUATERNION, STATE_SIZE
 
 NUM_FLIGHTS, NUM_STEPS, HOLD_STEPS, SEED = 24, 250, 10, 0
@@ -56,7 +56,7 @@ def print_check() -> None:
     print(check())
 
 
-def print_build(sdist: Path | None = None) -> None:
+def print_build(sdist: OptionalPath = None) -> None:
     """Download by hash and compile, in the user's cache folder.
 
     Args:
