@@ -32,10 +32,6 @@ def _sign(rng: Rng) -> float:
     return float(rng.choice([-1.0, 1.0]))
 
 
-def _signed(name: str) -> Callable[[float, Rng], Values]:
-    return lambda size, rng: {name: size * _sign(rng)}
-
-
 def _positive(name: str) -> Callable[[float, Rng], Values]:
     return lambda size, rng: {name: size}
 
@@ -121,7 +117,7 @@ EFFECTS: dict[str, EffectRange] = {
     "rate_saturation": EffectRange(0.008, 0.2, _per_axis()),  # share lost at full stick
     "rate_cross_coupling": EffectRange(0.005, 0.08, direction("from_roll", "from_pitch")),  # 1
     "motor_imbalance": EffectRange(0.0006, 0.01, direction("roll", "pitch")),  # rad/s per m/s^2
-    "yaw_reaction": EffectRange(0.003, 0.05, _signed("angle")),  # rad
+    "yaw_reaction": EffectRange(0.003, 0.05, lambda size, rng: {"angle": size * _sign(rng)}),  # rad
     "second_order_rates": EffectRange(0.002, 0.025, _oscillator),  # s, 1 / wn
     "rate_slew_limit": EffectRange(0.02, 0.25, _per_axis("_s")),  # s, centre to full stick
     # m/s^2; with drag 6 times that in m/s

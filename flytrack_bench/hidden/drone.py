@@ -324,12 +324,8 @@ class HiddenDrone:
         """
         self.truth, self.duration_s, self.centre_w = truth, duration_s, centre_w
         self.pos_w, self.vel_w, self.acc_w = start.pos_w, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        self.quat: Quaternion = (
-            math.cos(0.5 * start.heading),
-            0.0,
-            0.0,
-            math.sin(0.5 * start.heading),
-        )
+        half = 0.5 * start.heading
+        self.quat: Quaternion = (math.cos(half), 0.0, 0.0, math.sin(half))
         self.rates_b: Vector = (0.0, 0.0, 0.0)
         self.rows = rotation(self.quat)
         self.force_b, self.airspeed_b, self.thrust_acc = (
@@ -443,12 +439,12 @@ class HiddenDrone:
         older, newer = self._arriving(sticks)
         part = self._late_share
         mean = tuple((1.0 - part) * new + part * old for new, old in zip(newer, older, strict=True))
-        self._lag(self._shaped(mean), step_s)
+        self._lag(self._fold("command", mean), step_s)
         before = self.quat
         asked = self._asked(before)
         if self._loop is not None:
             asked = self._loop.follow(asked, step_s)
-        rates = self._with_turns(asked)
+        rates = self._add("turn", asked)
         self.quat = integrate_attitude(before, rates, step_s)
         if self.truth.motion == "semi_implicit":
             self._see(self.quat)
@@ -495,7 +491,7 @@ class HiddenDrone:
         half_s, pos_w, vel_w, quat = 0.5 * part_s, self.pos_w, self.vel_w, self.quat
         self.part_s = part_s
         self._pass_noise(part_s)
-        sticks = self._shaped(sticks)
+        sticks = self._fold("command", sticks)
         self._lag(sticks, half_s)
         self._pass_time(half_s)
         self.pos_w, self.vel_w = (
@@ -506,7 +502,7 @@ class HiddenDrone:
         if self._loop is not None:
             before = self._loop.rates_b
             rates = scale(0.5, add(before, self._loop.follow(rates, part_s)))
-        self._turning_b = rates = self._with_turns(rates)
+        self._turning_b = rates = self._add("turn", rates)
         self.force_b, self.pos_w, self.vel_w = self._force(), pos_w, vel_w
         self._accelerate(part_s)
         self.quat = turn(quat, rates, part_s)
@@ -518,7 +514,7 @@ class HiddenDrone:
         """Return the body rates at this instant, while a command acts."""
         self._set_slope(sticks)
         asked = self._asked(self.quat)
-        return self._with_turns(asked if self._loop is None else self._loop.rates_b)
+        return self._add("turn", asked if self._loop is None else self._loop.rates_b)
 
     def _pass_noise(self, step_s: float) -> None:
         for process in self._noises:
@@ -529,10 +525,17 @@ class HiddenDrone:
         self.battery_v = self.loaded_v()
         self.time_s += step_s
 
-    def _shaped(self, sticks: Sticks) -> Sticks:
-        for hook in self._hooks["command"]:
-            sticks = hook(self, sticks)
-        return sticks
+    def _fold(self, stage: str, value: Any) -> Any:
+        """Return what the hooks of a stage make of a value, one after the other."""
+        for hook in self._hooks[stage]:
+            value = hook(self, value)
+        return value
+
+    def _add(self, stage: str, vector_b: Vector) -> Vector:
+        """Return a vector with what the hooks of a stage add to it."""
+        for hook in self._hooks[stage]:
+            vector_b = add(vector_b, hook(self))
+        return vector_b
 
     def _lag(self, command: Sticks, step_s: float) -> None:
         before, (*rates, rising, falling) = self.applied, self._shares[step_s]
@@ -554,30 +557,17 @@ class HiddenDrone:
         self.rows = rotation(quat)
         self.airspeed_b = to_body(self.rows, add(self.vel_w, scale(-1.0, self._air_w)))
         thrust = self.truth.thrust(self.applied[3], self.battery_v)
-        for hook in self._hooks["thrust"]:
-            thrust = hook(self, thrust)
-        self.thrust_acc = thrust / self.truth.mass
+        self.thrust_acc = self._fold("thrust", thrust) / self.truth.mass
 
-    def _asked(self, quat: Quaternion) -> Vector:
+    def _asked(self, quat: Quaternion) -> Any:
         """Return the body rates that an inner loop follows, in an attitude."""
         self._see(quat)
         full, stick = self.full_rates, self.applied
-        rates = (full[0] * stick[0], full[1] * stick[1], full[2] * stick[2])
-        for hook in self._hooks["rate"]:
-            rates = hook(self, rates)
-        return rates
-
-    def _with_turns(self, rates_b: Vector) -> Vector:
-        for hook in self._hooks["turn"]:
-            rates_b = add(rates_b, hook(self))
-        return rates_b
+        return self._fold("rate", (full[0] * stick[0], full[1] * stick[1], full[2] * stick[2]))
 
     def _force(self) -> Vector:
         """Return the specific force in the attitude that was seen last."""
-        force = (0.0, 0.0, self.thrust_acc)
-        for hook in self._hooks["force"]:
-            force = add(force, hook(self))
-        return force
+        return self._add("force", (0.0, 0.0, self.thrust_acc))
 
     def _accelerate(self, step_s: float) -> None:
         self.acc_w = add(to_world(self.rows, self.force_b), (0.0, 0.0, -self.truth.gravity))
