@@ -132,10 +132,7 @@ class Sketch:
             self.add(np.zeros(3), sticks=row)
 
     def moments(self, seconds: float) -> list[Moment]:
-        """Return a plan of this length with smoothed velocities and headings."""
-        count = steps_of(seconds)
-        if len(self) < count:
-            self.wait((count - len(self)) * DT_S)
+        """Return the first moments of the plan, with smoothed velocities and headings."""
         width = steps_of(SMOOTH_S)
         kernel = np.hanning(width + 2)[1:-1]
         rows, sticks = np.split(np.array(self._rows), [4], axis=1)
@@ -145,7 +142,8 @@ class Sketch:
         pos_w = self.start_w + np.cumsum(vel_w, axis=0) * DT_S
         acc_w = np.gradient(vel_w, DT_S, axis=0)
         return [
-            Moment(pos_w[i], vel_w[i], acc_w[i], float(heading[i]), sticks[i]) for i in range(count)
+            Moment(pos_w[i], vel_w[i], acc_w[i], float(heading[i]), sticks[i])
+            for i in range(steps_of(seconds))
         ]
 
 
