@@ -70,6 +70,18 @@ def _number(line: str, most: int) -> int:
     return int(words[1])
 
 
+def _setting_in(line: str) -> tuple[str, str] | None:
+    """Return name and value of a line ``set`` or ``feature``, None for another line."""
+    command, _, rest = line.partition(" ")
+    if command == "feature" and rest:
+        name = rest.strip().upper()
+        return f"feature {name.removeprefix('-')}", "OFF" if name.startswith("-") else "ON"
+    if command == "set" and "=" in rest:
+        name, _, value = rest.partition("=")
+        return name.strip().lower(), value.strip()
+    return None
+
+
 def parse_dump(text: str) -> list[Setting]:
     """Return the settings in the text of a dump, in its order; lines about hardware are left out.
 
@@ -80,20 +92,15 @@ def parse_dump(text: str) -> list[Setting]:
     found = []
     for raw in text.splitlines():
         line = raw.partition("#")[0].strip()
-        command, _, rest = line.partition(" ")
+        command = line.partition(" ")[0]
         if not line or command in HARDWARE or line.upper() == "MIXER QUADX":
             continue
         if command == "profile":
             profile = _number(line, PROFILES)
         elif command == "rateprofile":
             rate_profile = _number(line, RATE_PROFILES)
-        elif command == "feature" and rest:
-            name = rest.strip().removeprefix("-").upper()
-            value = "OFF" if rest.strip().startswith("-") else "ON"
-            found.append(Setting(f"feature {name}", value, profile, rate_profile))
-        elif command == "set" and "=" in rest:
-            name, _, value = rest.partition("=")
-            found.append(Setting(name.strip().lower(), value.strip(), profile, rate_profile))
+        elif setting := _setting_in(line):
+            found.append(Setting(*setting, profile, rate_profile))
         else:
             raise FirmwareError(
                 f"settings: found {quote_name(line)}, expected set, feature or profile lines"
@@ -181,13 +188,9 @@ def values_of(dump: str) -> dict[tuple[str, int, str], str]:
         if command in ("profile", "rateprofile"):
             scope, number = command, int(rest)
             found["master", 0, command] = rest  # its last lines select what was selected
-        elif command == "feature" and rest:
-            found["master", 0, f"feature {rest.removeprefix('-')}"] = (
-                "OFF" if rest[0] == "-" else "ON"
-            )
-        elif command == "set" and "=" in rest:
-            name, _, value = rest.partition("=")
-            found[scope, number, name.strip().lower()] = value.strip()
+        elif setting := _setting_in(line):
+            name, value = setting
+            found[scope, number, name] = value  # features come before the profiles
     return found
 
 
