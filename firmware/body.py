@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from msgspec import Meta, structs
+from msgspec import Meta, Struct, structs
 
 from flytrack_env.files import read_at_most
 from flytrack_env.messages import error_text
-from flytrack_env.validation import Fields, convert
+from flytrack_env.validation import convert
 
 STEP_S = 125e-6  # of body.c
 MOTORS = ("rear right", "front right", "rear left", "front left")  # Betaflight's order
@@ -28,7 +28,7 @@ class FirmwareError(ValueError):
     """Firmware cannot be built, configured or flown; the message is one sentence that says what."""
 
 
-class Body(Fields, frozen=True):
+class Body(Struct, frozen=True, forbid_unknown_fields=True):
     """A rigid body, four motors and a battery; x forward, y left, z up.
 
     The default is a 1 kg racer.
