@@ -136,7 +136,7 @@ def plant(trial: Trial) -> dict[str, Any]:
     if truth.outside is not None:
         line["depends_on"] = truth.outside.kind
         line["amplitude"] = round(truth.outside.amplitude, 3)
-        line["visible"] = round(signal_to_noise(clean, diagnosis.base), 1)
+        line["visible"] = round(float(signal_to_noise(truth, clean)), 1)
     return line
 
 

@@ -11,8 +11,11 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from scipy import optimize, signal
 
 from benchmarks.hidden.noise import DIGIT, STD
+from flytrack_bench.hidden import Truth
+from flytrack_bench.hidden.drone import SECONDS_PER_MINUTE
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis.model_selection import MAX_RIVALS, ablate_all
 from flytrack_sysid.inference.chunks import NUM_AXES, cut_chunks
@@ -31,7 +34,8 @@ from flytrack_sysid.log import FlightLog
 
 TURNED_MS2 = 10.0  # about the thrust that attitude noise turns
 NO_DISTURBANCE, ANY_TAU, COUPLED = np.log(1e-3), np.log(0.3), 0.0
-NUM_SENSED = 6  # axes of gyro and accelerometer
+FIRST_ROW = 100  # before it, lags depend on commands from before the log
+SCALES = np.array([STD["f"]] * 3 + [STD["w"]] * 3 + [DIGIT["v_bat"]])
 
 
 class Known(NamedTuple):
@@ -152,17 +156,53 @@ def removed(
         chunks = cut_chunks(clean, np.ones(len(clean), bool), base)
         vectors = [Problem.of(chunks, model).start for model in (base, extended)]
         residuals = Problem.of(chunks, extended).residuals(np.stack(vectors))
-    whitened = residuals[..., :NUM_SENSED, 0] / np.repeat([STD["w"], STD["f"]], 3)
-    is_counted = chunks.counts[..., :NUM_SENSED, 0]
+    whitened = residuals[..., :6, 0] / np.repeat([STD["w"], STD["f"]], 3)
+    is_counted = chunks.counts[..., :6, 0]
     base_power, power = (float(np.mean(np.square(values[is_counted]))) for values in whitened)
     return 1.0 - power / max(base_power, 1e-300), float(np.sqrt(base_power))
 
 
-def signal_to_noise(clean: FlightLog, base: ModelParameters) -> float:
-    """Return how visible an effect outside the list is, which has no law to fit.
+# How visible an effect outside the list is, which has no law to fit
 
-    By about how many standard deviations the clean gyro and accelerometer differ from the refitted
-    base model over the whole log.
+
+def _expected(truth: Truth, log: FlightLog, tau: np.ndarray, coeffs: np.ndarray) -> np.ndarray:
+    """Return specific force, body rates and voltage of the plant without effects, (num_rows, 7).
+
+    tau, coeffs: lags, s, from the first command on, and coefficients of thrust, in place of the
+    truth's.
     """
-    _, rms = removed(clean, base, base)
-    return float(rms * np.sqrt(NUM_SENSED * len(clean)))
+    before = np.maximum(np.arange(len(log)) - 1, 0)
+    applied = []
+    for column, keep in zip(
+        log["u"][before].T, np.exp(-(log.time[1] - log.time[0]) / tau), strict=True
+    ):
+        applied.append(signal.lfilter([1.0 - keep], [1.0, -keep], column, zi=[keep * column[0]])[0])
+    *turns, stick = applied
+    volt = log["v_bat"][before, 0]
+    terms = np.stack([stick**0, stick, stick**2, stick**3, volt, stick * volt])
+    expected = np.zeros((len(log), len(SCALES)))
+    expected[:, 2] = coeffs @ terms / truth.mass
+    expected[:, 3:6] = np.radians(truth.max_rate) * np.stack(turns, axis=1)
+    expected[:, 6] = log["v_bat"][0, 0] - truth.drain / SECONDS_PER_MINUTE * log.time
+    return expected
+
+
+def signal_to_noise(truth: Truth, log: FlightLog) -> float:
+    """Return how far clean sensors are from those of the plant without effects.
+
+    The sensors are accelerometer, gyro and voltage.
+
+    The root of the sum of squared differences, each over the noise of ``benchmarks.hidden.noise``
+    (voltage: over its resolution): by about how many standard deviations the effects are visible to
+    an observer who knows their shape. Position, velocity and attitude are not used and would show
+    more of some effects. Only what other lags and another thrust curve cannot explain counts. log:
+    clean, from ``fly``.
+    """
+    measured = np.column_stack([log["f"], log["w"], log["v_bat"]])
+
+    def missing(change: np.ndarray) -> np.ndarray:
+        tau, coeffs = truth.tau * np.exp(change[:4]), truth.coeffs + change[4:]
+        return ((measured - _expected(truth, log, tau, coeffs)) / SCALES)[FIRST_ROW:].ravel()
+
+    fit = optimize.least_squares(missing, np.zeros(10), method="lm")
+    return float(np.sqrt(2.0 * fit.cost))
