@@ -21,14 +21,14 @@ wall-clock time of a trial, macOS does not limit its memory.
 
 import hashlib
 import math
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import export
-from jax.custom_batching import custom_vmap
+from jax.custom_batching import sequential_vmap
 
 from flytrack_env import artifact, sandbox
 from flytrack_env.battery import Battery
@@ -86,31 +86,6 @@ def start_vector() -> np.ndarray:
     return start
 
 
-def _mapped(exported: export.Exported) -> Callable[[jax.Array, jax.Array], jax.Array]:
-    """Return the artifact as a function of rows: (m, n), (m, 4) -> (m, n), under any ``vmap``.
-
-    An exported function has no batching rule, so rows are run one after the other in one
-    compiled loop. Nested ``vmap`` adds rows to that loop instead of nesting loops.
-    """
-
-    @custom_vmap
-    def call_rows(states: jax.Array, actions: jax.Array) -> jax.Array:
-        if states.shape[0] == 1:
-            return artifact.call(exported, states[0], actions[0])[None]
-        return jax.lax.map(lambda row: artifact.call(exported, *row), (states, actions))
-
-    @call_rows.def_vmap
-    def _batch_rule(size, batched, states, actions):  # type: ignore[no-untyped-def]
-        whole = [
-            array if is_batched else jnp.broadcast_to(array, (size, *array.shape))
-            for array, is_batched in zip((states, actions), batched, strict=True)
-        ]
-        rows = [array.reshape(-1, array.shape[-1]) for array in whole]
-        return call_rows(*rows).reshape(whole[0].shape), True
-
-    return call_rows
-
-
 class BlackBox(Plant):
     """A plant that steps an artifact; ``load`` makes one.
 
@@ -133,7 +108,8 @@ class BlackBox(Plant):
         self.path = path
         self.state_size: int = exported.in_avals[0].shape[0]
         self._full_stick_rad_s = np.deg2rad(np.array(max_rate, np.float32))
-        self._call_rows = _mapped(exported)
+        # An exported function has no batching rule: a batch runs row by row in a compiled loop.
+        self._call = sequential_vmap(partial(artifact.call, exported))
 
     def __repr__(self) -> str:
         return f"BlackBox({str(self.path)!r}, state_size={self.state_size})"
@@ -145,8 +121,8 @@ class BlackBox(Plant):
         """
         x, u = jnp.asarray(x, jnp.float32), jnp.asarray(u, jnp.float32)
         if self.state_size == STATE_SIZE:
-            return self._call_rows(x[None], u[None])[0]
-        after = self._call_rows(x[_REDUCED][None], u[None])[0]
+            return self._call(x, u)
+        after = self._call(x[_REDUCED], u)
         rate_actions = after[RATES] / self._full_stick_rad_s
         return jnp.concatenate([after[:16], rate_actions, after[16:]])
 
