@@ -1,7 +1,6 @@
 """The entities of a recording: those logged once, and those sent for all steps as columns."""
 
 import math
-from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -115,45 +114,63 @@ class Writer:
     """Writes the entities of one flight.
 
     The first flight has ``world/drone`` and so on, as in the handout; others
-    ``world/flights/NAME/drone``.
+    ``world/flights/NAME/drone``, and only plots with numbers.
 
     Args:
+        track: None shows no gates.
         colours: by the names of flights and models.
     """
 
-    def __init__(self, trajectory: Trajectory, is_first: bool, colours: dict[str, Colour]):
-        part = "" if is_first else f"/flights/{rr.escape_entity_path_part(trajectory.name)}"
-        self.world, self.plots, self.events = f"world{part}", f"plots{part}", f"events{part}"
-        self.trajectory, self.colours = trajectory, colours
-        self.all_rows = np.arange(len(trajectory.states))
-
-    def write(
+    def __init__(
         self,
         recording: rr.RecordingStream,
-        plots: Sequence[Plot],
-        label: str,
-        events: Sequence[tuple[int, str]],
-        race: FlownRace | None,
-    ) -> None:
+        trajectory: Trajectory,
+        track: Track | None,
+        is_first: bool,
+        colours: dict[str, Colour],
+    ):
+        part = "" if is_first else f"/flights/{rr.escape_entity_path_part(trajectory.name)}"
+        self.world, self.plots, self.events = f"world{part}", f"plots{part}", f"events{part}"
+        self.recording, self._log = recording, partial(log_once, recording)
+        self.trajectory, self.track, self.colours = trajectory, track, colours
+        self.all_rows = np.arange(len(trajectory.states))
+        self.race = trajectory.race(track)
+        self.ended = trajectory.reason_ended(track, self.race)
+        plots = plots_of(trajectory, self.race)
+        self.lines = [plot for plot in plots if is_first or np.isfinite(plot.values).any()]
+
+    def write(self, label: str) -> None:
         """Write all of the flight.
 
         Args:
             label: before the name of each line.
-            events: pairs of row and text.
         """
-        self.recording, self._log = recording, partial(log_once, recording)
         self._log_drone()
         self._send_poses()
         self._send_path()
-        for plot in plots:
+        for plot in self.lines:
             self._send_plot(plot, label)
         for model, forces_w in self.trajectory.residuals_w.items():
             self._send_arrows(model, forces_w)
-        rows, texts = zip(*events, strict=True)
+        self._send_events()
+        if self.race is not None and self.race.passes:
+            self._send_passes(self.race)
+
+    def _send_events(self) -> None:
+        """Send a text at every gate passed, every lap, and the end."""
+        events = []
+        if self.track is not None and self.race is not None:
+            for gate_pass in self.race.passes:
+                gate = self.track.gates[gate_pass.gate].id
+                events.append((gate_pass.row, f"gate {gate}, {gate_pass.time_s:.3f} s"))
+                if gate_pass.lap:  # an event of its own, as the panel is narrow
+                    lap = f"lap {gate_pass.lap}, {gate_pass.lap_time_s:.3f} s"
+                    events.append((gate_pass.row, lap))
+        events.append((int(self.all_rows[-1]), f"ended, {self.ended}"))
+        rows = np.array([row for row, _ in events])
+        texts = [f"{self.trajectory.name}: {text}" for _, text in events]
         columns = rr.TextLog.columns(text=texts, level=["INFO"] * len(texts))
-        self._send(self.events, np.array(rows), columns)
-        if race is not None and race.passes:
-            self._send_passes(race)
+        self._send(self.events, rows, columns)
 
     def _send(self, entity: str, rows: np.ndarray, columns: rr.ComponentColumnList) -> None:
         """Send an entity's columns for these rows; rows after the end count as the last one."""

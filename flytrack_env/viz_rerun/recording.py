@@ -9,11 +9,10 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn, TextLogColumnKind
 
 from flytrack_env.files import write_atomically
-from flytrack_env.flown_race import FlownRace
 from flytrack_env.scene import FLIGHT_COLOURS
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE, Action
 from flytrack_env.tracks import Track
-from flytrack_env.viz_rerun.entities import Writer, centres_of, log_course, log_once, plots_of
+from flytrack_env.viz_rerun.entities import Writer, centres_of, log_course, log_once
 from flytrack_env.viz_rerun.trajectory import Trajectory, checked, track_of_gates
 
 APP_ID = "flytrack_viz"
@@ -111,69 +110,35 @@ def _record(flights: Sequence[Trajectory], track: Track | None, app_id: str) -> 
     colours = {
         name: FLIGHT_COLOURS[index % len(FLIGHT_COLOURS)] for index, name in enumerate(names)
     }
-    writers = [Writer(flight, index == 0, colours) for index, flight in enumerate(flights)]
-    races = [flight.race(track) for flight in flights]
-    plots = [plots_of(flight, race) for flight, race in zip(flights, races, strict=True)]
-    # The first flight has all the entities of the handout, others only those with numbers.
-    plots[1:] = [
-        [plot for plot in flight_plots if np.isfinite(plot.values).any()]
-        for flight_plots in plots[1:]
+    writers = [
+        Writer(recording, flight, track, index == 0, colours)
+        for index, flight in enumerate(flights)
     ]
-    ends = [flight.reason_ended(track, race) for flight, race in zip(flights, races, strict=True)]
     memory = recording.memory_recording()
-    recording.send_blueprint(
-        make_blueprint(
-            writers,
-            {plot.path for flight_plots in plots for plot in flight_plots},
-            centres_of(track),
-            len(colours),
-        )
-    )
+    recording.send_blueprint(make_blueprint(writers, centres_of(track), len(colours)))
     log_course(recording, track)
     points = [(0.0, float(index)) for index in range(len(colours))]
     key = rr.Points2D(
         points, labels=list(colours), colors=list(colours.values()), radii=0.1, show_labels=True
     )
     log_once(recording, KEY, key)
-    about = rr.TextDocument(_describe(flights, races, ends), media_type=rr.MediaType.MARKDOWN)
+    about = rr.TextDocument(_describe(writers), media_type=rr.MediaType.MARKDOWN)
     log_once(recording, "about", about)
-    for writer, flight_plots, race, ended in zip(writers, plots, races, ends, strict=True):
-        label = "" if len(flights) == 1 else f"{writer.trajectory.name}: "
-        writer.write(
-            recording, flight_plots, label, _events(writer.trajectory, track, race, ended), race
-        )
+    for writer in writers:
+        writer.write("" if len(flights) == 1 else f"{writer.trajectory.name}: ")
     return memory.drain_as_bytes()
 
 
-def _events(
-    flight: Trajectory, track: Track | None, race: FlownRace | None, ended: str
-) -> list[tuple[int, str]]:
-    """Return row and text of every gate passed, every lap, and the end."""
-    events = []
-    if track is not None and race is not None:
-        for gate_pass in race.passes:
-            gate = track.gates[gate_pass.gate].id
-            events.append((gate_pass.row, f"{flight.name}: gate {gate}, {gate_pass.time_s:.3f} s"))
-            if gate_pass.lap:  # an event of its own, as the panel is narrow
-                events.append(
-                    (
-                        gate_pass.row,
-                        f"{flight.name}: lap {gate_pass.lap}, {gate_pass.lap_time_s:.3f} s",
-                    )
-                )
-    return [*events, (len(flight.states) - 1, f"{flight.name}: ended, {ended}")]
-
-
-def _describe(
-    flights: Sequence[Trajectory], races: Sequence[FlownRace | None], ends: Sequence[str]
-) -> str:
+def _describe(writers: Sequence[Writer]) -> str:
     """Return a table of the flights, Markdown."""
     lines = ["| flight | laps (s) | time (s) | gates | ended |", "|---|---|---|---|---|"]
-    for flight, race, ended in zip(flights, races, ends, strict=True):
-        passes = () if race is None else race.passes
+    for writer in writers:
+        flight, passes = writer.trajectory, () if writer.race is None else writer.race.passes
         laps = ", ".join(f"{each.lap_time_s:.3f}" for each in passes if each.lap) or "-"
         duration_s = flight.time_ns[-1] * 1e-9
-        lines.append(f"| {flight.name} | {laps} | {duration_s:.2f} | {len(passes)} | {ended} |")
+        lines.append(
+            f"| {flight.name} | {laps} | {duration_s:.2f} | {len(passes)} | {writer.ended} |"
+        )
     return "\n".join(lines)
 
 
@@ -193,22 +158,20 @@ def _plot(title: str, lines: Sequence[str], writers: Sequence[Writer]) -> rrb.Ti
 
 
 def make_blueprint(
-    writers: Sequence[Writer], paths: set[str], gates_w: np.ndarray, num_colours: int
+    writers: Sequence[Writer], gates_w: np.ndarray, num_colours: int
 ) -> rrb.Blueprint:
     """Return the layout of a recording.
 
     Args:
-        paths: of the lines that its plots have, below that of the plots.
         gates_w: centres (num_gates, 3), world, m.
         num_colours: rows of the key.
     """
-    has_line = {
-        title: any(
-            path.startswith(tuple(line.removesuffix("**") for line in lines)) for path in paths
-        )
-        for title, lines in PLOTS.items()
-    }
-    plots = [_plot(title, lines, writers) for title, lines in PLOTS.items() if has_line[title]]
+    paths = {plot.path for writer in writers for plot in writer.lines}
+    plots = []
+    for title, lines in PLOTS.items():
+        prefixes = tuple(line.removesuffix("**") for line in lines)
+        if any(path.startswith(prefixes) for path in paths):
+            plots.append(_plot(title, lines, writers))
     angles = rrb.Tabs(*(_plot(title, lines, writers) for title, lines in ANGLES.items()))
     body = rrb.TextLogColumns(text_log_columns=[TextLogColumn(TextLogColumnKind.Body)])
     positions = np.concatenate([gates_w, *(writer.trajectory.positions for writer in writers)])
