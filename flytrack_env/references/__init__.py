@@ -10,9 +10,11 @@ import hashlib
 import io
 import json
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.files import write_atomically
@@ -21,6 +23,7 @@ from flytrack_env.model_file import model_as_json, model_from_json
 from flytrack_env.npz_file import load_npz
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE
 from flytrack_env.tracks import Track
+from flytrack_env.validation import convert
 
 __all__ = [
     "FOLDER",
@@ -42,7 +45,6 @@ __all__ = [
 FOLDER = Path(__file__).parent
 KINDS = ("flying", "standing")
 FILE_VERSION = 1
-TEXTS = ("track", "track_sha256", "kind", "model_name", "model_sha256")
 COPIED = ("track", "track_sha256", "kind", "model_name", "dt_s", "time_s", "found")
 MAX_BYTES = 16 * 2**20  # in the file, and unpacked: hours of flight
 MAX_TIME_S = 3600.0  # of a lap, or of one step
@@ -177,21 +179,20 @@ def _check_arrays(data: dict[str, np.ndarray]) -> None:
         raise ValueError(f"commands: found {most:.7g}, expected within [-1, 1]")
 
 
-def _check_notes(notes: dict[str, Any]) -> None:
-    """Raise ValueError for wrong types, times that are not positive, or an unknown kind."""
-    types = {**dict.fromkeys(TEXTS, str), "found": dict, "dt_s": float, "time_s": float}
-    for name, expected in types.items():
-        if not isinstance(notes[name], expected):
-            raise ValueError(
-                f"{name}: found {quote_value(notes[name])}, expected a {expected.__name__}"
-            )
-    for name in ("dt_s", "time_s"):
-        if not 0.0 < notes[name] < MAX_TIME_S:
-            raise ValueError(f"{name}: found {notes[name]}, expected seconds above 0")
-    for name, known in (("version", (FILE_VERSION,)), ("kind", KINDS)):
-        if notes[name] not in known:
-            listed = " or ".join(map(str, known))
-            raise ValueError(f"{name}: found {quote_value(notes[name])}, expected {listed}")
+Seconds = Annotated[float, Meta(gt=0.0, lt=MAX_TIME_S)]
+
+
+class _Notes(msgspec.Struct):
+    version: Literal[1]
+    track: str
+    track_sha256: str
+    kind: Literal["flying", "standing"]
+    model_name: str
+    model_sha256: str
+    model: dict[str, Any]
+    dt_s: Seconds
+    time_s: Seconds
+    found: dict[str, Any]
 
 
 def load_reference(path: str | Path) -> Reference:
@@ -205,14 +206,13 @@ def load_reference(path: str | Path) -> Reference:
     path = Path(path)
     try:
         data = load_npz(path, MAX_BYTES)
-        notes = json.loads(str(data.pop("notes")))
-        _check_notes(notes)
+        notes = convert("", json.loads(str(data.pop("notes"))), _Notes)
         _check_arrays(data)
-        model = model_from_json(notes["model"], path, float)
-        if model_digest(model) != notes["model_sha256"]:
+        model = model_from_json(notes.model, path, float)
+        if model_digest(model) != notes.model_sha256:
             raise ValueError("model: found another one than its digest, expected the same")
         return Reference(
-            **{name: notes[name] for name in COPIED},
+            **{name: getattr(notes, name) for name in COPIED},
             model=model,
             states=data["states"].astype(float),
             commands=np.clip(data["commands"].astype(float), -1.0, 1.0),
@@ -220,9 +220,7 @@ def load_reference(path: str | Path) -> Reference:
         )
     except KeyError as error:
         raise ReferenceFileError(f"{path}: {quote_name(error.args[0])}: missing") from error
-    except (AttributeError, OSError, RecursionError, TypeError, ValueError) as error:
-        # ValueError: NpzError, no JSON, a check; AttributeError and TypeError: JSON of another
-        # structure.
+    except (OSError, RecursionError, ValueError) as error:  # NpzError, no JSON, a check
         raise ReferenceFileError(
             f"{path}: cannot be read: {error_text(error)}; expected a reference file"
         ) from error

@@ -107,10 +107,10 @@ def rewritten(path, **changes):
             r"states: found shape \(3, 21\), expected \(385, 21\)",
         ),
         ({"commands": np.full((384, 4), np.nan)}, "commands: .*finite"),
-        ({"version": 2}, "version: found 2, expected 1"),
-        ({"kind": "hovering"}, "kind: found 'hovering', expected flying or standing"),
+        ({"version": 2}, "version: found 2, expected one of 1"),
+        ({"kind": "hovering"}, "kind: found 'hovering', expected one of flying, standing"),
         ({"model_sha256": "0"}, "model: found another"),
-        ({"time_s": -1.0}, "time_s: found -1.0, expected seconds above 0"),
+        ({"time_s": -1.0}, "time_s: found -1.0, expected a number above 0"),
     ],
 )
 def test_a_damaged_file_is_refused(changes, reason, tmp_path):
