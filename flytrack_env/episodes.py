@@ -57,6 +57,13 @@ def _keep_types(changed: Any, state: Any) -> Any:
     return jax.tree.map(lambda leaf, old: jnp.asarray(leaf, jnp.result_type(old)), changed, state)
 
 
+def check_if_concrete(env: Any, params: Any) -> None:
+    """Check parameters where their values are known, which they are not while they are traced."""
+    if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(params)):
+        # As NumPy: comparing JAX's arrays would be traced where the reset is.
+        env.check_params(jax.tree.map(np.asarray, params))
+
+
 # Our EnvParams are not of gymnax's class, which its annotations ask for and its code does not.
 class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ignore[type-var]
     """An environment for gymnax, made of hooks for one drone; a state is any pytree.
@@ -216,9 +223,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
             raise ValueError(
                 f"params.wrappers: found {found}, expected {expected}, as in default_params"
             )
-        if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(params)):
-            # As NumPy: comparing JAX's arrays would be traced where the reset is.
-            self.check_params(jax.tree.map(np.asarray, params))
+        check_if_concrete(self, params)
         return super().reset(key, params)
 
     def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, Any]:

@@ -27,6 +27,7 @@ from baselines.purejaxrl_ppo.checkpoint import (
     save_checkpoint,
 )
 from baselines.purejaxrl_ppo.config import Config, Count
+from baselines.purejaxrl_ppo.flights import start_pose_params
 from baselines.purejaxrl_ppo.networks import ActorCritic
 from baselines.purejaxrl_ppo.ppo import Metrics, Runner, make_ppo
 from flytrack_env.model_file import model_from_json
@@ -204,9 +205,7 @@ def fly_races(
         before anyone finishes (num_races,).
     """
     flight, rules = race.default_params
-    flight = flight.replace(
-        reset=flight.reset._replace(course_fraction=0.0), max_steps_in_episode=NUM_RACE_STEPS
-    )
+    flight = start_pose_params(flight, NUM_RACE_STEPS)
     params = race.default_params._replace(flight=flight, rules=rules._replace(first_slot=slot))
 
     def act(params: Any, observations: jax.Array) -> jax.Array:

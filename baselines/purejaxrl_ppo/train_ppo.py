@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
 
 import jax
+import msgspec
 import tyro
 
 from baselines.purejaxrl_ppo.checkpoint import (
@@ -152,9 +153,7 @@ def train(words: Sequence[str]) -> None:
     trainer = make_trainer(settings, start)
     options, out = settings.run, settings.out or DEFAULT_OUT
     if settings.no_tracking:
-        options = Options(
-            options.checkpoint_every, options.evaluate_every, options.evaluation_episodes
-        )
+        options = msgspec.structs.replace(options, tracking_uri="")
     if start is not None:
         out = settings.out or start.path.parent
         print(f"seed {settings.seed}: from step {start.steps}, {start.path}")

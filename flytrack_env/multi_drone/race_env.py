@@ -15,7 +15,13 @@ import numpy as np
 from gymnax.environments import spaces
 
 from flytrack_env.auto_reset import Ended, reset_if_ended
-from flytrack_env.episodes import EpisodicEnvironment, Step, clip_action, observation_box
+from flytrack_env.episodes import (
+    EpisodicEnvironment,
+    Step,
+    check_if_concrete,
+    clip_action,
+    observation_box,
+)
 from flytrack_env.fusion import compute_once, one_kernel, vary_like
 from flytrack_env.multi_drone.collisions import Path, is_put_out
 from flytrack_env.multi_drone.ghosts import Ghost
@@ -173,8 +179,7 @@ class MultiDroneRace:
         """
         check_key(key)
         params = self.default_params if params is None else params
-        if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(params)):
-            self.check_params(jax.tree.map(np.asarray, params))
+        check_if_concrete(self, params)
         return self._reset(key, params)
 
     @partial(jax.jit, static_argnames=("self",))
@@ -205,14 +210,12 @@ class MultiDroneRace:
         words = self._words(jnp.asarray(seed, jnp.uint32)[None])
         states = jax.vmap(self._enter, (0, 0, None, 0))(drones, gate_indices, params, words)
         standings = self._standings(states)
-        others = [self._shift(standings, k) for k in self._distances]
-        states = states._replace(gap=jax.vmap(gap_of)(standings, others))
+        states = states._replace(gap=jax.vmap(gap_of)(standings, self._others(standings)))
         return self.observe(states, params), states
 
     def observe(self, states: EntrantState, params: RaceParams) -> jax.Array:
         """Return the observations of a race's state, (num_drones, size) float32."""
-        standings = self._standings(states)
-        others = [self._shift(standings, k) for k in self._distances]
+        others = self._others(self._standings(states))
         return jnp.stack(jax.vmap(self._observe, (0, 0, None))(states, others, params), axis=-1)
 
     @partial(jax.jit, static_argnames=("self",))
@@ -299,11 +302,11 @@ class MultiDroneRace:
         states, reward, info = solo.state, solo.reward, solo.info
         others: list[Standing] = []
         if self.num_drones > 1:
-            meetings = [self._shift((solo.standing.is_out, solo.path), k) for k in self._distances]
+            meetings = self._others((solo.standing.is_out, solo.path))
             meet = jax.vmap(self._meet, (0, 0, None))
             states, collision, reward = meet(solo, meetings, params)
             standings = solo.standing._replace(is_out=states.is_out)
-            others = [self._shift(standings, k) for k in self._distances]
+            others = self._others(standings)
             states, reward, standing_info = jax.vmap(self._rank, (0, 0, 0, 0, None))(
                 states, standings, others, reward, params.rules
             )
@@ -477,6 +480,10 @@ class MultiDroneRace:
             return seeds
         indices = jnp.arange(self.num_drones, dtype=jnp.uint32)
         return ((seeds & ~jnp.uint32(INDEX_BITS))[:, None] | indices).reshape(-1)
+
+    def _others(self, tree: Any) -> list[Any]:
+        """For each drone, take the leaves of each other drone of its race, in their order."""
+        return [self._shift(tree, distance) for distance in self._distances]
 
     def _shift(self, tree: Any, distance: int) -> Any:
         """For each drone, take the leaves of the drone ``distance`` places later, cyclically."""
