@@ -85,12 +85,6 @@ def test_animation_shows_the_flying_lap_beside_the_time_optimal_one(tmp_path, mo
         write_animation(short, references["flying"], tmp_path)
 
 
-def test_gates_have_the_ids_of_the_track_file():
-    env = gymnasium.make(BASE, render_mode="rgb_array").unwrapped
-    env.reset()
-    assert list(env._renderer.gate_ids) == [0, 1, 2, 3, 4, 8, 9, 10]
-
-
 def test_single_environment_renders_its_own_flight_and_record_video_every_step(tmp_path):
     pytest.importorskip("moviepy", reason="RecordVideo needs it")
     from imageio_ffmpeg import count_frames_and_secs
