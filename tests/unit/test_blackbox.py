@@ -14,16 +14,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from blackbox import acro_step_runtime, plant
 from blackbox.build import build, main
 from flytrack_env.blackbox import BlackBoxError, load
-from flytrack_env.dynamics import ModelParameters
-from flytrack_env.dynamics import step as model_step
-from flytrack_env.state import APPLIED_ACTION, RATES, pack
+from flytrack_env.state import RATES, pack
 from tests.support.black_boxes import (
     AIRLESS,
     FORBIDDEN,
     ROOT,
     SHIPPED,
     random_inputs,
-    start,
     write_artifact,
 )
 from tests.support.coasting import drone_at
@@ -46,7 +43,7 @@ REFUSALS = [
 def test_what_cannot_be_flown_is_refused(tmp_path, reason, function, options):
     path = write_artifact(tmp_path / "other.bin", function, **options)
     with pytest.raises(BlackBoxError, match=rf"other\.bin: {reason}"):
-        load(path)
+        load(path, limits=None)  # in this process; tests/integration/test_sandbox.py has the other
 
 
 # Flying
@@ -88,13 +85,14 @@ def test_artifact_of_18_components(tmp_path):
         return jnp.concatenate([x[:13], rates, u[3:] * x[16], x[17:] - 1.0])
 
     path = write_artifact(tmp_path / "reduced.bin", reduced_step, ((18,), (4,)))
-    box, (states, actions) = load(path), random_inputs(5)
+    box, (states, actions) = load(path, limits=None), random_inputs(5)
     after = jax.jit(jax.vmap(box.step_vector))(states, actions)
     thrust, battery = actions[:, 3:] * states[:, 19:20], states[:, 20:] - 1.0
     expected = np.hstack([states[:, :13], after[:, RATES], actions[:, :3], thrust, battery])
     assert box.state_size == 18
     assert_allclose(after, expected, rtol=1e-5)
-    slower = load(path, max_rate=(309.0, 618.0, 120.0)).step_vector(states[0], actions[0])
+    slow = load(path, (309.0, 618.0, 120.0), limits=None)
+    slower = slow.step_vector(states[0], actions[0])
     assert_allclose(slower[16], 2.0 * actions[0, 0], rtol=1e-5)
 
 
@@ -111,29 +109,6 @@ def test_environment_flies_the_black_box(black_box, fly_black_box):
         black_box.step(None, None, 0.02, None)
 
 
-# --- The shipped plant's physics, which the artifact's digest keeps as it is ----------------------
-
-
-def test_airless_plant_is_the_minimal_model():
-    constants = map(np.float32, (AIRLESS.lag, AIRLESS.thrust, AIRLESS.max_rate))
-    model = ModelParameters(*constants, AIRLESS.mass, AIRLESS.gravity)
-    states, actions = random_inputs(64)
-    after = jax.jit(jax.vmap(lambda x, u: plant.step(x, u, AIRLESS)))(states, actions)
-    expected = jax.jit(jax.vmap(lambda x, u: model_step(x, u, 0.01, model)))(states, actions)
-    assert_allclose(after, expected, rtol=1e-5, atol=2e-5)
-
-
-def test_lags_and_full_stick_rates(fly_black_box):
-    x = start()
-    for _ in range(100):
-        x = fly_black_box(x, [1.0, -1.0, 1.0, 0.0])
-    assert_allclose(np.rad2deg(x[RATES]), [618.0, -618.0, 120.0], rtol=1e-4)
-    first = fly_black_box(start(applied=np.zeros(4)), np.ones(4))[APPLIED_ACTION]
-    lags = -0.01 / np.log1p(-first)
-    assert (lags > 0.019).all() and (lags < 0.061).all()
-    assert len(np.unique(lags.round(3))) == 4
-
-
 # The artifact and its runtime
 
 
@@ -143,7 +118,7 @@ def test_rebuilt_artifact_is_the_committed_one_that_tells_nothing_about_its_sour
     main(["--out", str(tmp_path / "deep" / "acro_step.bin")])
     assert "acro_step.bin" in capsys.readouterr().out
     assert os.listdir(tmp_path / "deep") == ["acro_step.bin"]
-    rebuilt = load(tmp_path / "deep" / "acro_step.bin")
+    rebuilt = load(tmp_path / "deep" / "acro_step.bin", limits=None)
     states, actions = random_inputs(512)
     shipped, again = (
         jax.jit(jax.vmap(box.step_vector))(states, actions) for box in (load(SHIPPED), rebuilt)
