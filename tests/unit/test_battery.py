@@ -20,6 +20,7 @@ from flytrack_env import (
 from flytrack_env.model_file import ModelFileError
 from flytrack_env.state import unpack_action
 from flytrack_sysid.importing.flight import Craft
+from tests.support.coasting import Coasting
 from tests.support.slow import slow_but
 
 HANDOUT = Battery()
@@ -38,10 +39,10 @@ def craft_model(cells, mass_kg):
 def test_episodes_stay_within_the_battery_of_the_craft(cells):
     model = craft_model(cells, MASS_KG[cells])
     assert model.battery == Battery(4.2 * cells, 3.4 * cells, 3.4 * cells, 4.2 * cells)
-    env, params = gymnax.make("FlyTrack-v0", model=model)
+    env, params = gymnax.make("FlyTrack-v0", model=model, plant=Coasting())
     keys = jax.random.split(jax.random.key(0), NUM_STARTS)
-    observations, states = jax.vmap(env.reset, in_axes=(0, None))(keys, params)
-    volts = np.asarray(states.plant.drone.battery_v)
+    observations, states = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)
+    volts = np.asarray(states.plant.battery_v)
     lowest = model.battery.voltage(params.reset.course_charge_low)
     assert lowest <= volts.min() < lowest + 0.1 * cells
     assert model.battery.full_v - 0.1 * cells < volts.max() <= model.battery.full_v + 1e-5
@@ -50,18 +51,18 @@ def test_episodes_stay_within_the_battery_of_the_craft(cells):
 
 
 def test_an_episode_ends_at_the_empty_voltage_of_its_craft():
-    env = FlyTrack(model=craft_model(4, 0.6))
+    env = FlyTrack(model=craft_model(4, 0.6), plant=Coasting())
     params = env.default_params
     drone, gate = env.sample_start(jnp.uint32(0), params)
-    step = jax.jit(env.advance)
     for volts, is_empty in ((13.61, False), (13.59, True)):
         state = env.begin(drone._replace(battery_v=jnp.float32(volts)), gate, params)
-        info = step(state, unpack_action(jnp.zeros(4)), params)[3]
+        info = env.advance(state, unpack_action(jnp.zeros(4)), params)[3]
         assert bool(info["battery_empty"]) == is_empty
 
 
 def test_gymnasium_takes_the_voltages_of_the_craft():
-    env = gymnasium.make("flytrack_env:FlyTrack-v0", model=craft_model(1, 0.032)).unwrapped
+    craft = {"model": craft_model(1, 0.032), "plant": Coasting()}
+    env = gymnasium.make("flytrack_env:FlyTrack-v0", **craft).unwrapped
     observation, _ = env.reset(seed=0, options={"battery_v": 4.2})
     assert observation[BATTERY_ROW] == pytest.approx(1.0, abs=1e-4)
     with pytest.raises(ValueError, match=r"battery_v.*above 3.4 and up to 4.2 V"):
