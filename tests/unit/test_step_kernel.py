@@ -17,6 +17,7 @@ from flytrack_env.fusion import ATTRIBUTES, SWITCH, compute_once, one_kernel
 from flytrack_env.motion import Motion
 from flytrack_env.registration import ENVIRONMENTS, RACES
 from tests.contract.test_effects import inside_ranges
+from tests.support.compiling import QUICKLY
 from tests.support.stepping import flight, inputs
 
 
@@ -27,9 +28,7 @@ def with_all_effects():
     return flytrack_env.make("FlyTrack-v0", model=model)
 
 
-QUICKLY = {"xla_backend_optimization_level": 0}  # compiling takes all of the time
 VARIANTS = {
-    "plain": lambda: flytrack_env.make("FlyTrack-v0"),
     "all wrappers": lambda: flytrack_env.make("FlyTrackRobust-v0", missed_gate="fly_on"),
     "all effects, continuous": with_all_effects,
 }
@@ -93,15 +92,10 @@ LEAVES = {
     "bool": np.array([True, False]),
 }
 TRANSFORMS = {
-    "eager": lambda f: f,
     "jit": jax.jit,
-    "vmap": lambda f: lambda x: jax.vmap(f)(jnp.stack([x, x]))[1],
     "vmap along the last axis": lambda f: (
         lambda x: jax.vmap(f, -1, -1)(jnp.stack([x, x], -1))[..., 1]
     ),
-    "scan": lambda f: lambda x: jax.lax.scan(lambda c, _: (f(c), None), x, None, length=3)[0],
-    "cond": lambda f: lambda x: jax.lax.cond(jnp.asarray(True), f, lambda y: y, x),
-    "remat": jax.checkpoint,
 }
 
 
