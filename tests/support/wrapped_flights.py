@@ -16,6 +16,7 @@ from flytrack_env.wrappers import (
     ObservationNoise,
 )
 from tests.support.coasting import drone_at
+from tests.support.compiling import quick_jit
 from tests.support.tables import table
 
 NUM_ENVS, NUM_STEPS = 16, 60
@@ -55,13 +56,13 @@ def wrapped(*wrappers):
 @cache
 def resets_of(env):
     """Return the compiled reset of NUM_ENVS environments."""
-    return jax.jit(jax.vmap(env.reset, in_axes=(0, None)))
+    return quick_jit(jax.vmap(env.reset, in_axes=(0, None)))
 
 
 @cache
 def steps_of(env):
     """Return the compiled step, with auto-reset, of NUM_ENVS environments."""
-    return jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
+    return quick_jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
 
 
 def fly(env, params=None, actions=None, step=None, **wrappers):
@@ -106,7 +107,7 @@ def before_ends(env, params, ends, **fields):
         for position, velocity, values in zip(positions, velocities, own, strict=True)
     ]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *drones)
-    begin = jax.jit(jax.vmap(env.begin, in_axes=(0, None, None, 0)))
+    begin = quick_jit(jax.vmap(env.begin, in_axes=(0, None, None, 0)))
     states = begin(batch, 0, params, jnp.arange(len(drones), dtype=jnp.uint32))
 
     def with_time(path, leaf):

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from baselines.purejaxrl_ppo import Config, make_train, ppo
 from baselines.purejaxrl_ppo.metrics import summarize_episodes
+from tests.support.compiling import quick_jit
 
 
 @struct.dataclass
@@ -72,11 +73,7 @@ def tiny(**changes):
 def train(env, params=None, **changes):
     """Return the trained network and its parameters."""
     config, params = tiny(**changes), env.default_params if params is None else params
-    # Compiling takes all of the time, so that optimising does not pay.
-    train = jax.jit(
-        make_train(env, params, config), compiler_options={"xla_backend_optimization_level": 0}
-    )
-    runner, _ = train(jax.random.key(0))
+    runner, _ = quick_jit(make_train(env, params, config))(jax.random.key(0))
     return ppo.make_network_for(env, params, config), runner.train_state.params
 
 
