@@ -254,8 +254,8 @@ def fly_episode(
         return kept, (pack(env.drone(state)), action, ~is_over)
 
     start = begin_flight(env, policy, key, params, num_laps)
-    (*_, outcome), steps = jax.lax.scan(advance, start, None, num_steps)
-    return Rollout(*steps, outcome)
+    last, (states, actions, is_flying) = jax.lax.scan(advance, start, None, num_steps)
+    return Rollout(states, actions, is_flying, outcome=last[-1])
 
 
 def fly_many(

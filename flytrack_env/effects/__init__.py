@@ -253,10 +253,11 @@ def remember(
         rates: the same at its end.
     """
     later = []
-    for parameters, memory, *inputs_b in zip(effects, memories, first_rates, rates, strict=False):
+    each = zip(effects, memories, first_rates, rates, strict=False)
+    for parameters, memory, first_b, last_b in each:
         memory_kind = effect_of(parameters).memory
         if memory_kind and memory_kind.remember:
-            effect_context = context._replace(rate_inputs_b=tuple(inputs_b))
+            effect_context = context._replace(rate_inputs_b=(first_b, last_b))
             memory = memory_kind.remember(parameters, memory, effect_context)
         later.append(memory)
     return tuple(later)

@@ -49,7 +49,8 @@ def time_optimal_ghost(track: Track, delay_s: float = 0.0) -> Ghost:
     race = follow_race(states[:, POSITION], track, first_gate=0)
     centres = build_course(track).gates.centre
     centre, before = (
-        Vec3(*(coordinate[index] for coordinate in centres)) for index in (race.gate, race.gate - 1)
+        Vec3(*(np.asarray(coordinate)[index] for coordinate in centres))
+        for index in (race.gate, race.gate - 1)
     )
     passed = race.laps * len(track.gates) + race.gate
     progress = progress_of(passed, pos_w, centre, (centre - before).norm())
