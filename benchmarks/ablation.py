@@ -16,7 +16,16 @@ from typing import Any, NamedTuple
 
 from benchmarks import hidden
 from benchmarks.diagnosis import ROWS, Trial, make_log
-from benchmarks.report import RESULTS, append_line, command, fill_page, lines_in, progress, table
+from benchmarks.report import (
+    RESULTS,
+    append_line,
+    command,
+    commit_of_checkout,
+    fill_page,
+    lines_in,
+    progress,
+    table,
+)
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis import (
     Diagnosis,
@@ -179,10 +188,10 @@ def key(line: dict[str, Any]) -> tuple[Any, ...]:
 
 def measure(trials: list[Trial]) -> None:
     """Append the lines that are missing: first of the census, then of plants without a rule."""
-    lines = lines_in(LINES)
+    lines, commit = lines_in(LINES), {"commit": commit_of_checkout()}
     counted = {key(line): line for line in lines if not line["without"]}
     for trial in progress([one for one in trials if tuple(one) not in counted], "plants"):
-        counted[tuple(trial)] = {**trial._asdict(), "without": "", **census(trial)}
+        counted[tuple(trial)] = {**trial._asdict(), **commit, "without": "", **census(trial)}
         append_line(LINES, counted[tuple(trial)])
     done = {(key(line), line["without"]) for line in lines}
     missing = [
@@ -191,7 +200,7 @@ def measure(trials: list[Trial]) -> None:
         if name in counted[tuple(trial)]["acted"] and (tuple(trial), name) not in done
     ]
     for trial, name in progress(missing, "plants without a rule"):
-        append_line(LINES, {**trial._asdict(), "without": name, **without(trial, name)})
+        append_line(LINES, {**trial._asdict(), **commit, "without": name, **without(trial, name)})
 
 
 def write_page() -> None:
