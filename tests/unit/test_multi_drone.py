@@ -19,6 +19,7 @@ from flytrack_env.multi_drone.rules import BOTH_OUT, RAMMER_OUT, check_rules
 from flytrack_env.quaternion import Vec3
 from flytrack_env.references import shipped_reference
 from flytrack_env.tracks import GateFrame
+from tests.support.compiling import quick_jit
 
 BOTH, RAMMER = RaceRules(blame=BOTH_OUT), RaceRules(blame=RAMMER_OUT)
 coordinate = st.floats(-1.0, 1.0, width=32)
@@ -28,8 +29,8 @@ vector = st.tuples(coordinate, coordinate, coordinate)
 RACES, DRONES = 8, 3
 RACE = MultiDroneRace(flytrack_env.make("FlyTrack-v0"), DRONES)
 PARAMS = RACE.default_params
-step_all = jax.jit(jax.vmap(RACE.step_env, (0, 0, None)))
-reset_all = jax.jit(jax.vmap(RACE.reset, (0, None)))
+step_batch = quick_jit(RACE.step_batch)
+reset_all = quick_jit(jax.vmap(RACE.reset, (0, None)))
 
 
 def sticks(seed, *shape):
@@ -38,6 +39,13 @@ def sticks(seed, *shape):
 
 def starts(seed, params=PARAMS):
     return reset_all(jax.random.split(jax.random.key(seed), RACES), params)
+
+
+def step_all(states, actions, params=PARAMS):
+    """Step all races, none of which is over: every test flies the same program."""
+    flown = step_batch(jax.random.key(0), states, actions, params)
+    assert not flown[5]["race_over"].any()
+    return flown
 
 
 def with_drones(states, drones):
@@ -79,8 +87,8 @@ def test_the_order_of_drones_does_not_matter(order, seed):
     moved = reordered(states, order)
     for step in range(5):
         actions = sticks(seed + step, RACES, DRONES)
-        raced = step_all(states, actions, PARAMS)
-        raced_moved = step_all(moved, actions[:, order], PARAMS)
+        raced = step_all(states, actions)
+        raced_moved = step_all(moved, actions[:, order])
         states, moved = raced[1], raced_moved[1]
         jax.tree.map(assert_array_equal, reordered(raced, order), raced_moved)
 
@@ -94,7 +102,7 @@ def test_drones_far_apart_fly_as_alone():
     alone = states._replace(is_out=jnp.zeros((RACES, DRONES), bool).at[:, 1:].set(True))
     for n in range(40):
         actions = sticks(n, RACES, DRONES)
-        together, apart = step_all(states, actions, PARAMS), step_all(alone, actions, PARAMS)
+        together, apart = step_all(states, actions), step_all(alone, actions)
         states, alone = together[1], apart[1]
         assert_array_equal(together[0][:, 0, :size], apart[0][:, 0, :size])
         assert_array_equal(together[2][:, 0], apart[2][:, 0])
@@ -184,9 +192,10 @@ def test_a_ghost_flies_its_line_and_stops_for_nobody():
     lap_s = 0.01 * np.argmax(progress >= env.race.env.default_params.course.num_gates)
     assert abs(lap_s - shipped_reference("flytrack", "standing").time_s) < 0.03
     observation, state = env.reset(jax.random.key(0))
+    step_duel = quick_jit(env.step)
+    action = jnp.array([0.0, 0.0, 0.0, -0.2])
     for step in range(60):
-        key, action = jax.random.key(step), jnp.array([0.0, 0.0, 0.0, -0.2])
-        observation, state, *_, info = env.step(key, state, action)
+        observation, state, *_, info = step_duel(jax.random.key(step), state, action)
         assert not info["race_over"]
     assert info["gap_gates"] < -0.5 and info["rank"] == 2
     learner, gate = jax.tree.map(
@@ -197,6 +206,10 @@ def test_a_ghost_flies_its_line_and_stops_for_nobody():
     assert_allclose(observation[29:32] * 3.0, np.array(apart), atol=1e-3)
     observed = env.race.observe(state.entrants, env.race.default_params)[0]
     assert_allclose(observed, observation, atol=1e-5)
+    # The race is over with the learner, though the ghost would fly on.
+    out = state._replace(entrants=state.entrants._replace(is_out=jnp.array([True, False])))
+    _, _, reward, terminated, truncated, info = step_duel(jax.random.key(0), out, action)
+    assert info["race_over"] and terminated and not truncated and reward == 0.0
 
 
 def test_a_duel_can_be_pickled():
@@ -207,12 +220,16 @@ def test_a_duel_can_be_pickled():
 
 
 def test_drones_that_would_have_flown_on_are_truncated_when_the_race_is_over():
-    race = MultiDroneRace(RACE.env, DRONES, "first")
-    _, states = race.reset(jax.random.key(1))
-    states = states._replace(is_out=jnp.array([True, False, True]))
-    _, _, reward, terminated, truncated, info = race.step_env(states, jnp.zeros((DRONES, 4)))
-    assert info["race_over"].all() and reward[0] == 0.0
-    assert terminated.tolist() == [True, False, True] and truncated.tolist() == [False, True, False]
+    _, states = starts(1)
+    is_out = jnp.tile(jnp.array([True, False, True]), (RACES, 1))
+    params = PARAMS._replace(flight=PARAMS.flight.replace(max_steps_in_episode=1))
+    flown = step_batch(
+        jax.random.key(0), states._replace(is_out=is_out), jnp.zeros((RACES, DRONES, 4)), params
+    )
+    reward, terminated, truncated, info = flown[2:]
+    assert info["race_over"].all() and not reward[is_out].any()
+    assert_array_equal(terminated, is_out)
+    assert_array_equal(truncated, ~is_out)
 
 
 def make_view(count, size, over="first"):
@@ -251,23 +268,21 @@ def test_what_cannot_be_raced_is_refused(message):
         REFUSALS[message]()
 
 
-@pytest.mark.slow  # three programs are compiled
-def test_a_learner_meets_its_opponents_alone_and_in_a_batch():
+@pytest.mark.slow  # two programs are compiled
+def test_a_learner_meets_its_opponents_in_a_batch():
     def act(gain, seen):
         return jnp.tanh(gain * seen[..., :4])
 
     race = MultiDroneRace(RACE.env, 2, "first")
     env = Versus(race, [Opponent(act, race.observation_space().shape[0], jnp.float32(0.1))])
-    _, states = jax.vmap(env.reset, (0, None))(jax.random.split(jax.random.key(0), 4), None)
-    actions = sticks(3, 4)
-    batch = env.step_batch(jax.random.key(1), states, actions, env.default_params)
-    single = jax.vmap(env.step, (None, 0, 0, None))(jax.random.key(1), states, actions, None)
-    is_going = ~np.asarray(batch[5]["race_over"])
-    for index in (0, 2, 3, 4):
-        assert_allclose(batch[index][is_going], single[index][is_going], atol=2e-5)
+    keys = jax.random.split(jax.random.key(0), 4)
+    _, states = jax.jit(jax.vmap(env.reset, (0, None)))(keys, env.default_params)
+    actions, key = sticks(3, 4), jax.random.key(1)
+    batch = env.step_batch(key, states, actions, env.default_params)
     both = jnp.stack([actions, act(0.1, states.observations[:, 0])], axis=1)
-    by_hand = race.step_batch(jax.random.key(1), states.entrants, both, race.default_params)
-    assert_allclose(batch[0], by_hand[0][:, 0], atol=2e-5)
+    by_hand = race.step_batch(key, states.entrants, both, race.default_params)
+    for index in (0, 2, 3, 4):
+        assert_allclose(batch[index], by_hand[index][:, 0], atol=2e-5)
 
 
 @pytest.mark.filterwarnings(
@@ -296,8 +311,8 @@ def test_a_race_begins_on_the_grid_and_is_over_for_all_at_once():
     assert_allclose(distances, np.tile([np.hypot(1.0, 0.5), 1.0], (RACES, 1)), atol=1e-4)
     num_over = 0
     for step in range(150):  # without thrust none stays in the air for longer
-        thrust = jnp.full((RACES, DRONES, 4), -1.0)
-        flown = RACE.step_batch(jax.random.key(step), states, thrust, params)
+        thrust = -jnp.ones((RACES, DRONES, 4))
+        flown = step_batch(jax.random.key(step), states, thrust, params)
         over = np.asarray(flown[5]["race_over"])
         assert_array_equal(over.all(axis=1), over.any(axis=1))
         assert flown[3][over].all() and not flown[1].is_out[over].any()
