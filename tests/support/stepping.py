@@ -1,9 +1,10 @@
 """The step outside plain ``jit``: flights divided among devices, in a process of their own.
 
-``python -m tests.support.stepping ENV_ID WAY ...``, with ``XLA_FLAGS``, flies an id in some of the
-``WAYS`` and compares.
+``python -m tests.support.stepping ENV_ID EXPECTED WAY ...``, with ``XLA_FLAGS``, flies an id in
+some of the ``WAYS`` and compares with the flight on one device in the file ``EXPECTED``.
 """
 
+import hashlib
 import sys
 from functools import partial
 
@@ -15,6 +16,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 import flytrack_env  # noqa: F401, registers the ids
+from tests.support.compiling import quick_jit
 
 NUM_DEVICES, NUM_ENVS, NUM_STEPS = 4, 8, 5
 # Of the process; each program runs once, so that optimising it does not pay.
@@ -62,6 +64,18 @@ def inputs(env):
     return jax.random.split(jax.random.key(0), NUM_ENVS), actions, short_episodes(env)
 
 
+def fly(env_id):
+    """Return the flight of an id."""
+    env = gymnax.make(env_id)[0]
+    return quick_jit(flight(env))(*inputs(env))
+
+
+def digest(flown):
+    """Return a digest of every bit of a flight."""
+    leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(flown)]
+    return hashlib.sha256(b"".join(leaves)).hexdigest()
+
+
 def _by_named_sharding(fly, keys, actions, params, mesh):
     placed = jax.device_put((keys, actions), NamedSharding(mesh, PartitionSpec("batch")))
     program = jax.jit(fly).lower(*placed, params).compile()
@@ -105,16 +119,16 @@ WAYS = {
 }
 
 
-def main(env_id, *ways):
+def main(env_id, expected, *ways):
     """Fly an id in some ways; raise AssertionError if one differs from that on one device."""
     assert len(jax.devices()) == NUM_DEVICES
     mesh = Mesh(np.array(jax.devices()), ("batch",))
     env = gymnax.make(env_id)[0]
-    fly = flight(env)
-    expected = jax.jit(fly)(*inputs(env))
+    with np.load(expected) as file:
+        leaves = list(file.values())
     for way in ways:
-        flown = WAYS[way](fly, *inputs(env), mesh)
-        chex.assert_trees_all_close(flown, expected, rtol=TOLERANCE, atol=TOLERANCE)
+        flown = WAYS[way](flight(env), *inputs(env), mesh)
+        chex.assert_trees_all_close(jax.tree.leaves(flown), leaves, rtol=TOLERANCE, atol=TOLERANCE)
         print("flown by", way)
 
 
