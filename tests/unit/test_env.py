@@ -8,7 +8,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.env import FlyTrack
 from flytrack_env.episodes import clip_action
 from flytrack_env.observations import OBSERVATION, OBSERVATION_SIZE
 from flytrack_env.state import Action, pack
@@ -128,31 +127,6 @@ def test_actions_of_another_shape_are_refused(shape, env, params):
     for step in (env.step, env.step_env):
         with pytest.raises(ValueError, match=r"action: found shape .*expected \(4,\)"):
             step(jax.random.key(0), state, jnp.zeros(shape), params)
-
-
-# --- Construction -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        (
-            {"plant": "nominal"},
-            TypeError,
-            r"plant: found str, expected a subclass of plants\.Plant",
-        ),
-        ({"missed_gate": "ignore"}, ValueError, "missed_gate: found 'ignore', expected one of"),
-        ({"reward": {"speed": 1.0}}, ValueError, "reward: found 'speed', expected one of progress"),
-        (
-            {"reward": {"progress": "much"}},
-            ValueError,
-            r"reward\.progress: found 'much', expected a finite",
-        ),
-    ],
-)
-def test_wrong_arguments_say_what_was_expected(arguments, error, message):
-    with pytest.raises(error, match=message):
-        FlyTrack(**arguments)
 
 
 # --- Observation --------------------------------------------------------------------------------
