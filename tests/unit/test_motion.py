@@ -26,6 +26,16 @@ PLAIN = ModelParameters(TAU, COEFFS, FULL_RATES, MASS, GRAVITY, DRAIN, motion=Mo
 DRAGGED = PLAIN.with_effects(DRAG, effects.YawReaction(0.05))
 LOOP = DRAGGED.with_effects(effects.SecondOrderRates(*[0.02] * 3, *[0.6] * 3))
 FULL = LOOP.with_effects(effects.CommandDelay(0.013))
+# Neutral effects change nothing (tests/contract/test_effects.py), so that all models have these.
+EVERY = FULL.with_effects(
+    effects.LinearDrag(),
+    effects.YawReaction(),
+    effects.SecondOrderRates(),
+    effects.CommandDelay(),
+    effects.ImuOffset(),
+    effects.ImuLatency(),
+)
+LONGEST = 600  # steps
 START = np.array(
     [0, 0, 5, 3, -2, 1, 0, 0, 0, 0.9, 0.1, -0.3, 0.3, 0, 0, 0, 0.1, -0.2, 0.3, 0.2, 23.5]
 )
@@ -42,23 +52,28 @@ def held_commands():
 
 
 def flown(model, dt, start=START):
-    """Return states (num_steps, 21), gyro and accelerometer (num_steps, 3), at steps of ``dt``."""
+    """Return states (num_steps, 21), gyro and accelerometer (num_steps, 3), at steps of ``dt``.
+
+    All flights have one length and the same effects: one program is compiled for a motion.
+    """
     commands = np.repeat(held_commands(), round(COMMAND_S / dt), axis=0)
+    padded = np.pad(commands, ((0, LONGEST - len(commands)), (0, 0)), mode="edge")
+    full = model._replace(effects=EVERY.effects).with_effects(*model.effects)
     with jax.enable_x64(True):
-        rows = np.asarray(fly(unpack(jnp.asarray(start)), commands, model, dt))
+        rows = np.asarray(fly(unpack(jnp.asarray(start)), padded, full, dt))[: len(commands)]
     return rows[:, :21], rows[:, 21:24], rows[:, 24:27]
 
 
 def reference(model):
     """Return position, velocity, attitude and specific force, body, at every 20 ms.
 
-    Those of a hidden plant in parts of 0.05 ms; its motion is that of SciPy's integrator.
+    Those of a hidden plant in parts of 0.1 ms; its motion is that of SciPy's integrator.
     """
     laws = {effects.effect_of(law).name: law._asdict() for law in model.effects}
     arrays = (tuple(map(float, values)) for values in (TAU, COEFFS, FULL_RATES))
     truth = Truth(*arrays, DRAIN, MASS, GRAVITY, laws, motion="fine", step_s=COMMAND_S)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(drone, "MAX_SUBSTEP_S", 5e-5)
+        patched.setattr(drone, "MAX_SUBSTEP_S", 1e-4)
         flight = flown_in_floats(truth, held_commands(), LOW_START)
     return tuple(flight[name] for name in "pvqf")
 
