@@ -59,10 +59,8 @@ def test_values_are_refined_by_flights(dragged):
     assert (
         found.fit.vector[problem.names.index("accelerometer_bias.x")] == 0.3
     )  # no flight shows it
-    assert (
-        found.vector_without("accelerometer_bias")[problem.names.index("accelerometer_bias.x")]
-        == 0.0
-    )
+    without = found.vector_without("accelerometer_bias", found.fit)
+    assert without[problem.names.index("accelerometer_bias.x")] == 0.0
     assert (
         found.removal_costs["linear_drag"] > 0.1 and "accelerometer_bias" not in found.removal_costs
     )
