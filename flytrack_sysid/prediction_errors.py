@@ -207,7 +207,13 @@ def rollout_errors(prediction: Prediction, log: FlightLog, rows: np.ndarray) -> 
         rows: its rows that are scored, (num_rows,) bool. A flight stays within them, and begins and
             ends in measured rows.
     """
-    windows = make_windows(with_voltage(log, prediction.model), rows, START_EVERY_S, MAX_STARTS)
+    windows = make_windows(
+        with_voltage(log, prediction.model),
+        rows,
+        START_EVERY_S,
+        MAX_STARTS,
+        prediction.is_settled,
+    )
     if not len(windows.start):
         return tuple(Rollout(horizon_s, 0, {}) for horizon_s in HORIZONS_S)
     names = [name for name, channel in CHANNEL_OF.items() if not prediction.lacking[channel]]

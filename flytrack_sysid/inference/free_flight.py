@@ -91,7 +91,11 @@ def cut_batches(windows: Windows) -> list[Windows]:
 
 
 def make_windows(
-    log: FlightLog, scored_rows: np.ndarray, every_s: float, max_windows: int
+    log: FlightLog,
+    scored_rows: np.ndarray,
+    every_s: float,
+    max_windows: int,
+    is_settled: np.ndarray | None = None,
 ) -> Windows:
     """Return windows over the scored rows of a log.
 
@@ -102,6 +106,8 @@ def make_windows(
         scored_rows: (num_rows,) bool.
         every_s: time between the starts of windows (s).
         max_windows: largest number of windows; if there are more, they are thinned evenly.
+        is_settled: rows of the log without gaps at which a flight may start; if None, those after
+            a whole lead-in.
     """
     filled = fill_gaps(log)
     step_s = float(np.median(usual_step(filled.log)))
@@ -112,7 +118,7 @@ def make_windows(
     run = np.cumsum(begins | np.append(True, np.diff(scored_rows[filled.behind].astype(int)) != 0))
     first = np.flatnonzero(begins)[segment - 1]
     rows = np.arange(len(segment))
-    can_start = is_scored & (rows - first >= lead)
+    can_start = is_scored & (rows - first >= lead if is_settled is None else is_settled)
     starts = rows[can_start & ((rows - first - lead) % max(round(every_s / step_s), 1) == 0)]
     last = np.minimum(starts + ends[:, None], len(rows) - 1)
     is_reached = (starts + ends[:, None] < len(rows)) & (run[last] == run[starts]) & is_scored[last]

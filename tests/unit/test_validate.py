@@ -75,7 +75,7 @@ def test_truth_has_no_error(exact):
     assert set(exact.one_step.channels) == {"p", "v", "q", "w", "a"}
     assert max(nrmse(exact).values()) < 1e-6
     assert exact.one_step.channels["q"].angle_rms_deg < 1e-6
-    assert [rollout.num_starts for rollout in exact.rollouts] == [50, 45, 40, 30, 10]
+    assert [rollout.num_starts for rollout in exact.rollouts] == [60, 55, 50, 40, 20]
     for rollout in exact.rollouts:
         assert max(spread.p95 for spread in rollout.errors.values()) < 1e-5
     assert exact.thrust.total_rms_n < 1e-5
