@@ -1,9 +1,10 @@
-"""What each rule of the diagnosis changes: ``python -m benchmarks.ablation``.
+"""Ablation of the rules of the diagnosis: ``python -m benchmarks.ablation``.
 
-A census diagnoses plants (those of ``benchmarks.diagnosis``, flown for half a minute) and notes
-which rules did something. Then every plant is diagnosed again without each rule that did something
-on it, one at a time; elsewhere a rule changes nothing. Lines go to docs/results/ablation.jsonl and
-are resumed; ``--page`` writes docs/results/ablation.md from them.
+First it diagnoses plants (those of ``benchmarks.diagnosis``, flown for half a minute) and records
+which rules fire. Then it diagnoses each plant again without one rule at a time, for the rules that
+fired on it; a rule that did not fire changes nothing. Results are appended to
+docs/results/ablation.jsonl, and a later run resumes there; ``--page`` writes
+docs/results/ablation.md from them.
 """
 
 import sys
@@ -12,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from itertools import product
+from types import ModuleType
 from typing import Any, NamedTuple
 
 from benchmarks import hidden
@@ -47,29 +49,29 @@ SEED = 41  # no rule was made on it
 PACKAGE = "flytrack_sysid"
 
 
-def none_of(*_: Any) -> list[Any]:
-    """Return what a rule returns that finds nothing."""
+def empty(*_: Any) -> list[Any]:
+    """Return an empty list, whatever the arguments."""
     return []
 
 
 class Rule(NamedTuple):
-    """A rule: a function of the diagnosis, and what it would return if it did nothing.
+    """A rule of the diagnosis, and the function that stands in for it when it is disabled.
 
     Attributes:
-        owner: the module or class that defines the function.
-        name: of the function.
-        idle: returns what the function returns where it does nothing, from its arguments.
+        module: that defines the rule.
+        name: of the rule's function.
+        disabled: takes the same arguments, and returns what the rule does where it does not fire.
     """
 
-    owner: Any
+    module: ModuleType
     name: str
-    idle: Callable[..., Any]
+    disabled: Callable[..., Any]
 
 
 RULES = (
-    *(Rule(vetoes, rule.__name__, none_of) for rules in vetoes.VETOES for rule in rules),
-    Rule(model_selection, "with_lags_anew", none_of),
-    Rule(model_selection, "other_groups", none_of),
+    *(Rule(vetoes, rule.__name__, empty) for rules in vetoes.VETOES for rule in rules),
+    Rule(model_selection, "with_lags_anew", empty),
+    Rule(model_selection, "other_groups", empty),
     Rule(model_selection, "explain_base_by_effect", lambda state, *_: (state, None)),
     Rule(model_selection, "is_determined", lambda *_: True),
     Rule(model_selection, "_is_immaterial", lambda *_: False),
@@ -79,7 +81,7 @@ RULES = (
     Rule(summary, "_is_remainder", lambda *_: False),
     Rule(summary, "_as_thrust_scale", lambda cause, *_: cause),
     Rule(unexplained, "is_like_drift", lambda *_: False),
-    Rule(unexplained, "find_lines", none_of),
+    Rule(unexplained, "find_lines", empty),
     Rule(unexplained, "stochastic_shares", lambda *_: {}),
     Rule(outliers, "find_outliers", lambda *_: {}),
     Rule(size, "is_notable", lambda *_: True),
@@ -87,22 +89,22 @@ RULES = (
 BY_NAME = {rule.name: rule for rule in RULES}
 
 
-def is_idle(result: Any, idle: Any) -> bool:
-    """Return whether a rule's result is that of a rule that does nothing."""
-    if result is idle:
-        return True
-    if type(idle) is tuple:
-        return len(result) == len(idle) and (not idle or result[-1] is idle[-1])
-    return isinstance(idle, bool | list | dict) and bool(result == idle)
+def has_fired(result: Any, disabled: Any) -> bool:
+    """Return whether a rule's result differs from the one it has when it is disabled."""
+    if result is disabled:
+        return False
+    if type(disabled) is tuple:
+        return len(result) != len(disabled) or (disabled != () and result[-1] is not disabled[-1])
+    return not isinstance(disabled, bool | list | dict) or bool(result != disabled)
 
 
 @contextmanager
 def replaced(rule: Rule, function: Callable[..., Any]) -> Iterator[None]:
     """Have the package call another function in place of a rule's, wherever it is imported."""
-    original = getattr(rule.owner, rule.name)
+    original = getattr(rule.module, rule.name)
     loaded = [module for name, module in sys.modules.items() if name.startswith(PACKAGE)]
     places = [
-        place for place in (rule.owner, *loaded) if getattr(place, rule.name, None) is original
+        place for place in (rule.module, *loaded) if getattr(place, rule.name, None) is original
     ]
     kept_vetoes = vetoes.VETOES
     for place in places:
@@ -119,7 +121,7 @@ def replaced(rule: Rule, function: Callable[..., Any]) -> Iterator[None]:
 
 
 def outcome(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return what a reader is told: names, what cannot be told from them, what is unexplained."""
+    """Return what is compared: verdict, causes with their equivalents, and what is unexplained."""
     return {
         "verdict": diagnosis.verdict,
         "causes": {one.effect: sorted(one.equivalent) for one in diagnosis.causes},
@@ -136,17 +138,17 @@ def flown(trial: Trial) -> tuple[hidden.Truth, FlightLog, ModelParameters]:
 
 
 def census(trial: Trial) -> dict[str, Any]:
-    """Return the outcome on a plant, and which rules did something, by number of times."""
+    """Return the outcome on a plant, and how often each rule fired."""
     truth, log, model = flown(trial)
-    acted: Counter[str] = Counter()
+    fired: Counter[str] = Counter()
 
     def watched(rule: Rule) -> Callable[..., Any]:
-        original = getattr(rule.owner, rule.name)
+        original = getattr(rule.module, rule.name)
 
         @wraps(original)
         def call(*args: Any) -> Any:
             result = original(*args)
-            acted[rule.name] += not is_idle(result, rule.idle(*args))
+            fired[rule.name] += has_fired(result, rule.disabled(*args))
             return result
 
         return call
@@ -158,19 +160,22 @@ def census(trial: Trial) -> dict[str, Any]:
             return with_all_watched(rules[1:])
 
     result = outcome(with_all_watched(RULES))
-    acted_rules = {name: number for name, number in acted.items() if number}
-    return {"truth": sorted(truth.effects), "acted": acted_rules, "outcome": result}
+    names = sorted(truth.effects) + ["mocap_latency"] * (truth.mocap_late_s > 0.0)
+    return {"truth": names, "fired": +fired, "outcome": result}
 
 
 def without(trial: Trial, name: str) -> dict[str, Any]:
     """Return the outcome on a plant without a rule."""
     _, log, model = flown(trial)
-    with replaced(BY_NAME[name], BY_NAME[name].idle):
+    with replaced(BY_NAME[name], BY_NAME[name].disabled):
         return {"outcome": outcome(diagnose(log, model))}
 
 
 def score(line: dict[str, Any], truth: list[str]) -> int:
-    """Return true names less false ones; a name that cannot be told from a true one is true."""
+    """Return the number of true effects named minus the number of false ones.
+
+    A cause with a true effect among its equivalents is true.
+    """
     causes = line["outcome"]["causes"]
     false = [name for name, equivalent in causes.items() if {name, *equivalent}.isdisjoint(truth)]
     found = [
@@ -181,23 +186,23 @@ def score(line: dict[str, Any], truth: list[str]) -> int:
     return len(found) - len(false)
 
 
-def key(line: dict[str, Any]) -> tuple[Any, ...]:
-    """Return what identifies the plant of a line."""
+def plant_of(line: dict[str, Any]) -> tuple[Any, ...]:
+    """Return the fields of a line that identify its plant."""
     return tuple(line[field] for field in Trial._fields)
 
 
 def measure(trials: list[Trial]) -> None:
-    """Append the lines that are missing: first of the census, then of plants without a rule."""
+    """Append the missing lines: first with all rules, then without one rule at a time."""
     lines, commit = lines_in(LINES), {"commit": commit_of_checkout()}
-    counted = {key(line): line for line in lines if not line["without"]}
+    counted = {plant_of(line): line for line in lines if not line["without"]}
     for trial in progress([one for one in trials if tuple(one) not in counted], "plants"):
         counted[tuple(trial)] = {**trial._asdict(), **commit, "without": "", **census(trial)}
         append_line(LINES, counted[tuple(trial)])
-    done = {(key(line), line["without"]) for line in lines}
+    done = {(plant_of(line), line["without"]) for line in lines}
     missing = [
         (trial, name)
         for trial, name in product(trials, BY_NAME)
-        if name in counted[tuple(trial)]["acted"] and (tuple(trial), name) not in done
+        if name in counted[tuple(trial)]["fired"] and (tuple(trial), name) not in done
     ]
     for trial, name in progress(missing, "plants without a rule"):
         append_line(LINES, {**trial._asdict(), **commit, "without": name, **without(trial, name)})
@@ -206,21 +211,20 @@ def measure(trials: list[Trial]) -> None:
 def write_page() -> None:
     """Write docs/results/ablation.md from the lines."""
     lines = lines_in(LINES)
-    counted = {key(line): line for line in lines if not line["without"]}
+    counted = {plant_of(line): line for line in lines if not line["without"]}
     rows = []
     for rule in RULES:
-        acted = [plant for plant, line in counted.items() if rule.name in line["acted"]]
+        fired = [plant for plant, line in counted.items() if rule.name in line["fired"]]
         removed = [line for line in lines if line["without"] == rule.name]
-        changed = [line for line in removed if line["outcome"] != counted[key(line)]["outcome"]]
+        pairs = [(line, counted[plant_of(line)]) for line in removed]
+        changed = [(line, whole) for line, whole in pairs if line["outcome"] != whole["outcome"]]
         gains = [
-            score(line, counted[key(line)]["truth"])
-            - score(counted[key(line)], counted[key(line)]["truth"])
-            for line in changed
+            score(line, whole["truth"]) - score(whole, whole["truth"]) for line, whole in changed
         ]
         rows.append(
             [
                 f"`{rule.name}`",
-                len(acted),
+                len(fired),
                 f"{len(changed)} of {len(removed)}",
                 sum(gain < 0 for gain in gains),
                 sum(gain > 0 for gain in gains),
@@ -228,14 +232,14 @@ def write_page() -> None:
         )
     header = [
         "rule",
-        "plants on which it acts",
-        "outcomes that change without it, of those tried",
-        "names get worse without it",
-        "names get better",
+        "plants on which it fires",
+        "outcomes that differ without it",
+        "score lower without it",
+        "score higher",
     ]
     fill_page(
         RESULTS / "ablation.md",
-        "ablation.md",
+        "ablation",
         plants=len(counted),
         seconds=f"{SECONDS:g}",
         seed=SEED,
@@ -249,7 +253,7 @@ def main(
     motion: str = ",".join(hidden.MOTIONS),
     page: bool = False,
 ) -> None:
-    """Measure what each rule changes.
+    """Diagnose plants with all rules, and without one rule at a time.
 
     plants: of each row and motion, up to this number.
     rows: kinds of plants.

@@ -11,7 +11,7 @@ from flytrack_sysid.inference.free_flight import (
     CHANNEL_OF,
     HORIZONS_S,
     QUANTITIES,
-    errors_of,
+    evaluate_windows,
     make_windows,
 )
 from flytrack_sysid.inference.free_flight import UNITS as FLIGHT_UNITS
@@ -218,7 +218,7 @@ def rollout_errors(prediction: Prediction, log: FlightLog, rows: np.ndarray) -> 
         return tuple(Rollout(horizon_s, 0, {}) for horizon_s in HORIZONS_S)
     names = [name for name, channel in CHANNEL_OF.items() if not prediction.lacking[channel]]
     with np.errstate(over="ignore", invalid="ignore"):  # a model may diverge
-        distances = np.linalg.norm(errors_of(prediction.model, windows), axis=-1)
+        distances = np.linalg.norm(evaluate_windows(prediction.model, windows), axis=-1)
     distances[..., QUANTITIES.index("attitude")] *= 180.0 / np.pi
     rollouts = []
     for horizon_s, by_window, counts in zip(HORIZONS_S, distances, windows.counts, strict=True):

@@ -30,7 +30,12 @@ from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_sysid import FlightLog, import_log
 from flytrack_sysid.diagnosis import joined
 from flytrack_sysid.diagnosis.refinement import FlightErrors, sample_windows
-from flytrack_sysid.inference.free_flight import HORIZONS_S, QUANTITIES, errors_of, make_windows
+from flytrack_sysid.inference.free_flight import (
+    HORIZONS_S,
+    QUANTITIES,
+    evaluate_windows,
+    make_windows,
+)
 from flytrack_sysid.log import usual_step
 
 BETAFLIGHT = "betaflight_acro_log"
@@ -143,7 +148,7 @@ def nanobench(data: Path) -> Record:
         with jax.enable_x64(True):
             windows = make_windows(log, held_out, SPACING_S, MAX_WINDOWS)
             base, extended = (
-                FlightErrors(errors_of(model, windows)[None], windows)
+                FlightErrors(evaluate_windows(model, windows)[None], windows)
                 for model in (diagnosis.base, diagnosis.extended)
             )
         ratios = error_ratios(base, extended, log.segment[windows.start])

@@ -105,7 +105,8 @@ def make_windows(
         log: the flight log.
         scored_rows: (num_rows,) bool.
         every_s: time between the starts of windows (s).
-        max_windows: largest number of windows; if there are more, they are thinned evenly.
+        max_windows: largest number of windows; more than a batch are thinned evenly to whole
+            batches.
         is_settled: rows of the log without gaps at which a flight may start; if None, those after
             a whole lead-in.
     """
@@ -246,14 +247,14 @@ def prediction_errors(model: ModelParameters, windows: Windows) -> jax.Array:
     )
 
 
-_errors_of_batch = fast_jit(prediction_errors)
+_batch_errors = fast_jit(prediction_errors)
 
 
-def errors_of(model: ModelParameters, windows: Windows) -> np.ndarray:
+def evaluate_windows(model: ModelParameters, windows: Windows) -> np.ndarray:
     """Return the errors of one model, (horizons, windows, quantities, 3) float64."""
     with jax.enable_x64(True):
         batches = [
-            np.asarray(_errors_of_batch(in_float64(model), batch)) for batch in cut_batches(windows)
+            np.asarray(_batch_errors(in_float64(model), batch)) for batch in cut_batches(windows)
         ]
     errors = np.concatenate(batches, axis=1)[:, : len(windows.start)]
     return errors.reshape(*errors.shape[:-1], len(QUANTITIES), 3)
