@@ -1,7 +1,5 @@
 """A model's battery: where episodes start and end, what the policy sees, and what is warned of."""
 
-import json
-
 import gymnasium
 import gymnax
 import jax
@@ -9,15 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from flytrack_env import (
-    Battery,
-    BatteryWarning,
-    FlyTrack,
-    load_model,
-    nominal_parameters,
-    save_model,
-)
-from flytrack_env.model_file import ModelFileError
+from flytrack_env import Battery, BatteryWarning, FlyTrack
 from flytrack_env.state import unpack_action
 from flytrack_sysid.importing.flight import Craft
 from tests.support.coasting import Coasting
@@ -67,37 +57,6 @@ def test_gymnasium_takes_the_voltages_of_the_craft():
     assert observation[BATTERY_ROW] == pytest.approx(1.0, abs=1e-4)
     with pytest.raises(ValueError, match=r"battery_v.*above 3.4 and up to 4.2 V"):
         env.reset(options={"battery_v": 23.0})
-
-
-def write(path, **fields):
-    save_model(path, nominal_parameters(), {})
-    document = json.loads(path.read_text(encoding="utf-8"))
-    del document["battery"]
-    path.write_text(json.dumps(document | fields), encoding="utf-8")
-    return path
-
-
-def test_a_model_file_without_a_battery_is_warned_of(tmp_path):
-    with pytest.warns(BatteryWarning, match=r"m\.json: battery: missing.*handout's 22 to 24 V"):
-        assert load_model(write(tmp_path / "m.json")).battery == HANDOUT
-
-
-@pytest.mark.parametrize(
-    ("battery", "reason"),
-    [
-        ([1], "battery: found .*expected a table of fields"),
-        ({"full": 4.2}, r"battery\.full: unknown; expected one of full_v"),
-        ({"full_v": "4.2"}, r"battery\.full_v: found .*expected a number"),
-        ({"full_v": 3.4, "empty_v": 4.2}, "model.battery: found empty_v 4.2, full_v 3.4, expected"),
-        (
-            {"full_v": 24, "empty_v": 22, "fitted_low_v": 14, "fitted_high_v": 16.8},
-            "14 to 16.8 V.*22 to 24",
-        ),
-    ],
-)
-def test_bad_batteries_are_refused(battery, reason, tmp_path):
-    with pytest.raises(ModelFileError, match=reason):
-        load_model(write(tmp_path / "m.json", battery=battery))
 
 
 def test_a_battery_beyond_the_fit_is_warned_of_or_refused():

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from flytrack_env.battery import Battery
+from flytrack_env.battery import Battery, BatteryWarning
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import CommandDelay, LinearDrag, QuadraticDrag
 from flytrack_env.env import FlyTrack
@@ -63,6 +63,13 @@ def test_minimal_file_by_hand(tmp_path):
     assert_same_model(load_model(nested), model)
 
 
+def test_a_file_without_a_battery_is_warned_of(tmp_path):
+    path = tmp_path / "m.json"
+    path.write_text(json.dumps({n: FIELDS[n] for n in FIELDS if n != "battery"}), encoding="utf-8")
+    with pytest.warns(BatteryWarning, match=r"m\.json: battery: missing.*handout's 22 to 24 V"):
+        assert load_model(path).battery == Battery()
+
+
 def test_effects_by_hand_beside_or_among_the_parameters(tmp_path):
     path = tmp_path / "model.json"
     some = {"quadratic_drag": {"k_x": 0.1}, "command_delay": {"delay_s": 0.02}}
@@ -85,7 +92,18 @@ BAD_VALUES = [
     ("m", [["x" * 5000]], "a number"),
     ("m", 1e-300, "a number above"),
 ]
+BATTERIES = [
+    ([1], "battery: found .*expected a table of fields"),
+    ({"full": 4.2}, r"battery\.full: unknown; expected one of full_v"),
+    ({"full_v": "4.2"}, r"battery\.full_v: found .*expected a number"),
+    ({"full_v": 3.4, "empty_v": 4.2}, "model.battery: found empty_v 4.2, full_v 3.4, expected"),
+    (
+        {"full_v": 24, "empty_v": 22, "fitted_low_v": 14, "fitted_high_v": 16.8},
+        ".*14 to 16.8 V.*22 to 24",
+    ),
+]
 BAD_FILES = [
+    *((FIELDS | {"battery": battery}, reason) for battery, reason in BATTERIES),
     *(
         (FIELDS | {name: bad}, rf"{name}(\[\d\])?: found .{{1,300}}, expected .*{what}")
         for name, bad, what in BAD_VALUES
