@@ -27,14 +27,15 @@ SEED, COUNT = 5, 200
 MAX_ERROR, MAX_LAG_ERROR, MAX_FLOAT64_ERROR = 1e-5, 1e-6, 1e-7
 CHAMPIONS = ROOT / "baselines" / "purejaxrl_ppo" / "champion"
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
-# Environment id, track and hidden layers.
+# Environment id, track, hidden layers, and flags of the ONNX file.
 CASES = {
-    "perfect sensors": ("FlyTrack-v0", "flytrack", (8, 5)),
-    "noise and earlier actions": ("FlyTrackRobust-v0", "figure_eight", (8,)),
+    "perfect sensors": ("FlyTrack-v0", "flytrack", (8, 5), []),
+    "float64": ("FlyTrack-v0", "flytrack", (8, 5), ["--float64"]),
+    "noise and earlier actions": ("FlyTrackRobust-v0", "figure_eight", (8,), []),
 }
 
 
-def act_in_python(env, checkpoint, dtype=np.float32):
+def act_in_python(env, checkpoint, dtype):
     """Return states, gates, past actions, and the policy's actions given the observations."""
     params = env.default_params
     if ObservationNoise.key in params.wrappers:
@@ -63,10 +64,12 @@ def act_in_python(env, checkpoint, dtype=np.float32):
 
 @pytest.mark.parametrize("case", CASES)
 def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
-    env_id, track, hidden_sizes = CASES[case]
+    env_id, track, hidden_sizes, flags = CASES[case]
     path, header = tmp_path / "a.safetensors", tmp_path / "policy.h"
     checkpoint = load_checkpoint(write_checkpoint(path, env_id, track, hidden_sizes))
-    inputs, actions = act_in_python(make(env_id, track=track), checkpoint)
+    env = make(env_id, track=track)
+    with jax.enable_x64("--float64" in flags):
+        inputs, actions = act_in_python(env, checkpoint, np.float64 if flags else np.float32)
     assert np.ptp(actions, axis=0).min() > 0.01, "actions that differ"
 
     header.write_text("old")
@@ -77,8 +80,8 @@ def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
         compiled = CompiledPolicy(header)
         assert_allclose(compiled.act(states, *others), actions, rtol=0.0, atol=MAX_ERROR)
         assert np.isnan(compiled.act(states * np.nan, *others)).all()
-    onnx_actions = act_by_onnx(path, [], inputs)
-    assert_allclose(onnx_actions, actions, rtol=0.0, atol=MAX_ERROR)
+    max_error = MAX_FLOAT64_ERROR if flags else MAX_ERROR
+    assert_allclose(act_by_onnx(path, flags, inputs), actions, rtol=0.0, atol=max_error)
 
 
 def act_by_onnx(checkpoint, flags, inputs):
@@ -91,15 +94,6 @@ def act_by_onnx(checkpoint, flags, inputs):
     main(["export", str(checkpoint), "--onnx", path, *flags])
     session = onnxruntime.InferenceSession(path)
     return session.run(None, {given.name: inputs[given.name] for given in session.get_inputs()})[0]
-
-
-def test_a_float64_file_acts_as_the_policy_in_float64(tmp_path):
-    path = write_checkpoint(tmp_path / "a.safetensors", "FlyTrack-v0", "flytrack", (8, 5))
-    checkpoint, env = load_checkpoint(path), make("FlyTrack-v0")
-    with jax.enable_x64(True):
-        inputs, actions = act_in_python(env, checkpoint, np.float64)
-    onnx_actions = act_by_onnx(path, ["--float64"], inputs)
-    assert_allclose(onnx_actions, actions, rtol=0.0, atol=MAX_FLOAT64_ERROR)
 
 
 @pytest.mark.slow
