@@ -9,7 +9,6 @@ from functools import partial
 
 import gymnasium
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -85,19 +84,18 @@ def test_ids_are_registered_once_and_without_a_second_time_limit(env_id):
 
 
 def test_single_environment_agrees_with_gymnax(env, still):
-    key, (_, state) = jax.random.key(0), env.reset(jax.random.key(0), still)
+    step = jax.jit(env.step_env)
+    _, state = env.reset(jax.random.key(0), still)
     single = gymnasium.make(BASE, params=still)
     single.reset()
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (12, 4)).astype(np.float32)
     actions[:, 3] = 0.5  # off the ground
     for index, action in enumerate(actions):
-        _, state, reward, terminated, truncated, info = env.step(
-            key, state, jnp.asarray(action), still
-        )
+        expected, state, reward, terminated, info = step(None, state, action, still)
         observation, *outcome, own_info = single.step(action)
-        assert_allclose(observation, info["final_observation"], atol=2e-5)
+        assert_allclose(observation, expected, atol=2e-5)
         assert_allclose(outcome[0], reward, atol=2e-5)
-        assert outcome[1:] == [terminated, truncated] == [False, index == 11]
+        assert outcome[1:] == [terminated, env.is_truncated(state, still)] == [False, index == 11]
         for name, value in own_info.items():
             assert_allclose(value, info[name], atol=2e-5)
 
@@ -278,7 +276,7 @@ def test_wrong_use_is_refused():
 
 
 def test_integers_and_numbers_of_numpy_are_as_good_as_pythons(params):
-    assert make_vector(num_envs=np.int64(4)).reset()[0].shape[0] == 4
+    assert make_vector(num_envs=np.int64(3)).reset()[0].shape[0] == 3
     with pytest.raises(ValueError, match=r"num_envs: found 2\.0, expected an integer"):
         make_vector(num_envs=2.0)
     compiled = []
