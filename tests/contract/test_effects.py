@@ -23,6 +23,7 @@ from flytrack_env.effects import (
     check_parameters,
 )
 from flytrack_env.state import RATES, Action, pack
+from tests.support.compiling import quick_jit
 from tests.support.simulated_flights import (
     ALL_NEUTRAL,
     DT,
@@ -143,7 +144,7 @@ def test_changes_what_its_stages_may_and_nothing_else(effect):
     assert changed <= allowed
 
 
-@jax.jit
+@quick_jit
 def final_and_slope(effects, change):
     """Return a short flight's last row, (37,), and its derivative along a parameter change."""
     drone, commands = random_drone(1), 0.9 * random_commands(1, 14)
