@@ -208,13 +208,6 @@ def test_course_of_a_seed_stays_the_same():
     assert track.start_position == (7.26, 12.08, 0.1)
 
 
-UNMET = {
-    "spacing": {"num_gates": 60},
-    "turn": {"limits": tracks.Limits(max_turn_deg=1.0)},
-    "start": {"limits": tracks.Limits(min_start_distance=20.0)},
-}
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -229,11 +222,10 @@ UNMET = {
             {"key": jnp.zeros((3, 2), jnp.uint32)},
             r"key: found uint32 of shape \(3, 2\), expected one key",
         ),
-        *(
-            pytest.param(
-                one, rf"in 300 attempts; .* most often: {demand} \(", marks=pytest.mark.slow
-            )
-            for demand, one in UNMET.items()
+        pytest.param(
+            {"num_gates": 60},
+            r"in 300 attempts; .* most often: spacing \(",
+            marks=pytest.mark.slow,
         ),
     ],
 )
