@@ -1,0 +1,239 @@
+"""Benchmark of the check of conventions: ``python -m benchmarks.check``.
+
+Logs are those of ``benchmarks.seams``: clean ones, ones with a fault, ones with two, and plants
+with the conventions of ten simulators. Results are appended to docs/results/check.jsonl, and a
+later run of the same commit resumes there; ``--page`` writes docs/results/check.md from them.
+"""
+
+from collections import Counter
+from collections.abc import Iterable
+from functools import lru_cache
+from typing import Any, Literal, NamedTuple
+from zlib import crc32
+
+import numpy as np
+from scipy.stats import beta
+
+from benchmarks.report import RESULTS, command, fill_page, lines_of_commit, record_trials, table
+from benchmarks.seams.faults import FAULTS, Change, Truth, draw_pair, inject, is_shown
+from benchmarks.seams.flight import Flight, make_flight
+from benchmarks.seams.simulators import SIMULATORS
+from flytrack_env.dynamics import nominal_parameters
+from flytrack_sysid.check import check_log, check_plant
+
+LINES = RESULTS / "check.jsonl"
+Part = Literal["clean", "faults", "pairs", "simulators"]
+PARTS: tuple[Part, ...] = ("clean", "faults", "pairs", "simulators")
+MAX_ALTERNATIVES = 4
+SCALE_TOLERANCE, DELAY_TOLERANCE, DELAY_TOLERANCE_S = 0.05, 0.1, 0.003
+COMMAND_TOLERANCE_S = 0.02  # the lag of the craft is not known better
+FRACTION_TOLERANCE = 0.2  # of the fraction of repeated rows
+LOGS_A_FAULT = 0.1  # of the number of clean logs
+
+
+class Trial(NamedTuple):
+    """What is checked.
+
+    Attributes:
+        part: of ``PARTS``.
+        name: of the fault or the simulator, "" otherwise.
+        number: of the flight.
+        seed: of flights and faults.
+        model: whether the check is given the craft's full rates and lags.
+    """
+
+    part: Part
+    name: str
+    number: int
+    seed: int
+    model: bool
+
+
+@lru_cache(1)
+def flight_of(seed: int, number: int) -> Flight:
+    """Return a flight; trials of a number follow each other."""
+    return make_flight(100_000 * seed + number)
+
+
+def measure(trial: Trial) -> dict[str, Any]:
+    """Check a log or a plant and compare what is found with the truth."""
+    if trial.part == "simulators":
+        simulator = next(one for one in SIMULATORS if one.name == trial.name)
+        check = check_plant(simulator.step, simulator.layout)
+        result = {"shown": True, **compare(check, simulator.expected)}
+        return {"truth": sorted(simulator.expected), **result}
+    flight = flight_of(trial.seed, trial.number)
+    rng = np.random.default_rng([trial.seed, trial.number, crc32(trial.name.encode())])
+    dt, name, truth = float(np.median(np.diff(flight.log.time))), trial.name, Truth()
+    if trial.part == "faults":
+        truth = FAULTS[name](rng, dt)
+    elif trial.part == "pairs":
+        name, truth = draw_pair(rng, dt)
+    faulty, craft, model = inject(rng, flight, truth), flight.craft, None
+    if trial.model:
+        model = nominal_parameters()._replace(
+            max_rate=np.array(craft.max_rate), tau=np.array(craft.lags)
+        )
+    check = check_log(faulty.log, model, faulty.motors)
+    result = {"kind": flight.kind, "faults": name, "shown": is_shown(flight, truth)}
+    return {"truth": sorted(truth), **result, **compare(check, truth)}
+
+
+def compare(check: Any, truth: Iterable[Change]) -> dict[str, Any]:
+    """Compare a check with the truth.
+
+    Returns:
+        Names of contradicted pairs, alternatives, and the outcome: "exact" if one of at most four
+        alternatives is the truth; "partial" if one has only true changes, or if more than four
+        have the truth among them; "unexplained" if there is a contradiction without alternatives;
+        "false"; "missed" if there is neither.
+    """
+    contradicted = [pair.name for pair in check.pairs if pair.verdict == "contradicts"]
+    alternatives = [tuple(changes) for changes in check.explanations if changes]
+    true_changes = tuple(truth)
+    only_true = [
+        changes
+        for changes in alternatives
+        if all(any(is_same(change, true) for true in true_changes) for change in changes)
+    ]
+    if not alternatives:
+        outcome = "unexplained" if contradicted else "missed" if true_changes else "exact"
+    elif not only_true:
+        outcome = "false"
+    elif len(alternatives) <= MAX_ALTERNATIVES and len(true_changes) in map(len, only_true):
+        outcome = "exact"
+    else:
+        outcome = "partial"
+    return {"contradicted": contradicted, "alternatives": alternatives, "outcome": outcome}
+
+
+def is_same(change: Any, true: Change) -> bool:
+    """Return whether a change is a true one, within tolerances."""
+    if (change.channel, change.kind) != (true.channel, true.kind):
+        return False
+    if isinstance(true.value, str | bool):
+        return bool(change.value == true.value)
+    tolerance = {
+        "scale": SCALE_TOLERANCE * abs(true.value),
+        "delay": max(
+            DELAY_TOLERANCE * abs(true.value),
+            COMMAND_TOLERANCE_S if true.channel == "u" else DELAY_TOLERANCE_S,
+        ),
+        "repeated": FRACTION_TOLERANCE * true.value,
+    }.get(true.kind, 0.0)
+    return abs(float(change.value) - true.value) <= tolerance
+
+
+def upper_bound(count: int, total: int) -> float:
+    """Return the one-sided 95 % upper bound of a share, by Clopper and Pearson."""
+    return 1.0 if count == total else float(beta.ppf(0.95, count + 1, total - count))
+
+
+def plan_trials(parts: Iterable[Part], logs: int, seed: int, model: bool) -> list[Trial]:
+    """Return the trials; those of a flight follow each other."""
+    trials = []
+    for number in range(logs):
+        if "clean" in parts:
+            trials.append(Trial("clean", "", number, seed, model))
+        if "pairs" in parts:
+            trials.append(Trial("pairs", "", number, seed, model))
+        if "faults" in parts and number < LOGS_A_FAULT * logs:
+            trials += [Trial("faults", name, number, seed, model) for name in FAULTS]
+    if "simulators" in parts:
+        trials += [Trial("simulators", simulator.name, 0, seed, False) for simulator in SIMULATORS]
+    return trials
+
+
+def outcomes(name: str, lines: list[dict[str, Any]]) -> list[Any]:
+    """Return a row of the page: how often each outcome was, of the faults that motion shows."""
+    shown = [line for line in lines if line["shown"]]
+    count = Counter(line["outcome"] for line in shown)
+    hidden = [line for line in lines if not line["shown"]]
+    kinds = ("exact", "partial", "unexplained", "false", "missed")
+    false = f"{sum(line['outcome'] == 'false' for line in hidden)} of {len(hidden)}"
+    return [name, len(shown), *(count[kind] for kind in kinds), false]
+
+
+def describe(changes: Iterable[Iterable[Any]]) -> str:
+    """Return changes as text."""
+    return "; ".join(" ".join(map(str, change)) for change in changes) or "none"
+
+
+def write_page() -> None:
+    """Write docs/results/check.md from the lines of the last commit."""
+    lines = lines_of_commit(LINES)
+    done = [line for line in lines if "error" not in line]
+    by_part = {part: [line for line in done if line["part"] == part] for part in PARTS}
+    clean = []
+    for kind in [*sorted({line["kind"] for line in by_part["clean"]}), "all"]:
+        flown = [line for line in by_part["clean"] if kind in (line["kind"], "all")]
+        wrong = [line for line in flown if line["contradicted"] or line["alternatives"]]
+        pairs = Counter(
+            f"{channel} {kind}"
+            for line in wrong
+            for channel, kind, _ in (line["alternatives"] or [[]])[0]
+        )
+        named = ", ".join(f"{name} ({count})" for name, count in pairs.most_common())
+        bound = f"{100.0 * upper_bound(len(wrong), len(flown)):.1f} %" if flown else ""
+        clean.append([kind, len(flown), len(wrong), bound, named])
+    faults = [
+        outcomes(name, [line for line in by_part["faults"] if line["name"] == name])
+        for name in FAULTS
+    ]
+    two = [
+        outcomes(name, [line for line in by_part["pairs"] if is_on_one(line) == on_one])
+        for name, on_one in (("on one channel", True), ("on two channels", False))
+    ]
+    simulators = [
+        [
+            line["name"],
+            describe(line["truth"]),
+            line["outcome"] if line["truth"] or line["contradicted"] else "no contradiction",
+            describe(line["alternatives"][0]) if line["alternatives"] else "none",
+        ]
+        for line in by_part["simulators"]
+    ]
+    columns = "shown | exact | partial | unexplained | false | missed | false where not shown"
+    fill_page(
+        RESULTS / "check.md",
+        "check",
+        clean=table("flight | logs | contradicted | 95 % upper bound | what", clean),
+        faults=table(f"fault | {columns}", [*faults, outcomes("all", by_part["faults"])]),
+        pairs=table(f"two faults | {columns}", [*two, outcomes("all", by_part["pairs"])]),
+        simulators=table("simulator | expected | outcome | first explanation", simulators),
+        errors=len(lines) - len(done),
+        seeds=", ".join(sorted({str(line["seed"]) for line in lines})),
+        model="with" if any(line["model"] for line in lines) else "without",
+    )
+
+
+def is_on_one(line: dict[str, Any]) -> bool:
+    """Return whether both faults of a line are on one channel."""
+    return len({channel.split("_")[0] for channel, *_ in line["truth"]}) == 1
+
+
+def main(
+    logs: int = 200,
+    part: Part | None = None,
+    seed: int = 53,
+    model: bool = False,
+    page: bool = False,
+) -> None:
+    """Check logs and plants.
+
+    logs: clean ones and ones with two faults; each single fault is on a tenth of them.
+    part: only this one.
+    seed: of flights and faults; 7 is for development.
+    model: give the check the craft's full rates and lags.
+    page: write the page from the lines instead.
+    """
+    if page:
+        write_page()
+        return
+    record_trials(
+        LINES, plan_trials(PARTS if part is None else (part,), logs, seed, model), measure
+    )
+
+
+if __name__ == "__main__":
+    command(main)

@@ -1,0 +1,241 @@
+"""The check of a log: what its channels contradict, and how they were logged instead."""
+
+from dataclasses import dataclass, replace
+from itertools import islice, product
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid.check.commands import curve_changes, mean_delay, responses, thinned
+from flytrack_sysid.check.explain import Change, Explanation, explain
+from flytrack_sysid.check.frames import FRAMES, IDENTITY, READINGS
+from flytrack_sysid.check.motion import MARGIN, RATE_FLOOR, compare
+from flytrack_sysid.check.pairs import CONTRADICTS, Compared, Pair, compare_pairs
+from flytrack_sysid.check.samples import sample_changes
+from flytrack_sysid.check.scales import scale_changes
+from flytrack_sysid.check.thrust import motor_changes, thrust_changes
+from flytrack_sysid.check.timing import late_sensors
+from flytrack_sysid.kinematics import read_at, summed_turns
+from flytrack_sysid.log import FlightLog
+
+MAX_ALTERNATIVES = 8
+NO_SCALES: list[tuple[Change, ...]] = [()]
+ALIKE = 0.8  # of the log-likelihood of another reading
+# Mean delay of the rates behind a command: with a model, beyond its lag; without, at most what
+# radios, filters and motors take (measured flights: up to 90 ms).
+LATE_S, LATEST_S = 0.018, 0.15
+STICKS = ("roll", "pitch", "yaw")
+CLEAR, MAX_RATE_ERROR = 0.98, 0.06  # correlation, and relative error, of a full-stick rate
+LIKELY_BATTERY_V, HIGHEST_BATTERY_V = (2.5, 70.0), 100.0
+BATTERY_UNITS = (1000.0, 100.0, 10.0)
+
+
+@dataclass(frozen=True)
+class Check:
+    """The check of a log.
+
+    Attributes:
+        source: the log.
+        pairs: of channels that were compared.
+        explanations: alternatives by which all pairs would agree, simplest first; each lists the
+            changes of the log. Empty if nothing contradicts; one empty explanation if something
+            does that no known change explains.
+        corrected: the log by the first explanation's axes, scales and clocks.
+        after: the pairs of the corrected log; empty if nothing contradicts.
+        remarks: on constants of the model that the log contradicts.
+    """
+
+    source: str
+    pairs: tuple[Pair, ...]
+    explanations: tuple[tuple[Change, ...], ...]
+    corrected: FlightLog
+    after: tuple[Pair, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether something in the log contradicts something else."""
+        return bool(self.explanations)
+
+
+def corrected(log: FlightLog, found: Explanation) -> FlightLog:
+    """Return a log with the axes that an explanation says it should have."""
+    channels = dict(log.channels)
+    if "q" in log:
+        quat = READINGS[found.reading].correct(log["q"])
+        world = Rotation.from_matrix(FRAMES[found.world].T)
+        body = Rotation.from_matrix(FRAMES[found.body])
+        attitude = world * Rotation.from_quat(quat, scalar_first=True) * body
+        channels["q"] = attitude.as_quat(scalar_first=True, canonical=False)
+    for name, frame in found.frames.items():
+        if name == "u_rates":
+            rates = log["u"][:, :3] @ FRAMES[frame]
+            channels["u"] = np.column_stack([rates, log["u"][:, 3]])
+        elif name in log:
+            channels[name] = log[name] @ FRAMES[frame]
+    return replace(log, channels=channels)
+
+
+def rescaled(log: FlightLog, changes: tuple[Change, ...]) -> FlightLog:
+    """Return a log with the scales that changes say it should have."""
+    channels = dict(log.channels)
+    for channel, _, factor in changes:
+        name, _, axis = channel.partition("_")
+        if channel == "v_bat":
+            name, axis = channel, ""
+        scale = np.ones(channels[name].shape[1])
+        scale["xyz".index(axis) if axis else slice(None)] = float(factor)
+        channels[name] = channels[name] / scale
+    return replace(log, channels=channels)
+
+
+def battery_changes(log: FlightLog) -> list[Change]:
+    """Return the battery's wrong unit."""
+    median_v = float(np.median(log["v_bat"])) if "v_bat" in log else 0.0
+    if median_v <= HIGHEST_BATTERY_V:
+        return []
+    low, high = LIKELY_BATTERY_V
+    units = [unit for unit in BATTERY_UNITS if low <= median_v / unit <= high]
+    return [Change("v_bat", "scale", unit) for unit in units[:1]]
+
+
+def command_changes(log: FlightLog, model: ModelParameters | None) -> list[tuple[Change, ...]]:
+    """Return what differs in the rate commands, as alternatives; [()] if nothing does.
+
+    Args:
+        log: with right axes and scales.
+        model: whose lags and full-stick rates are expected; None if they are unknown.
+    """
+    if "w" not in log or not np.ptp(log["u"][:, :3], axis=0).any():
+        return [()]
+    log = thinned(log)
+    found = responses(log)
+    curves = curve_changes(log, found)
+    expected = np.zeros(3) if model is None else np.asarray(model.tau, float)[:3]
+    delay_s = mean_delay(log, found, expected)
+    if delay_s:  # a late command is as late in both halves
+        half = np.arange(len(log)) < len(log) // 2
+        halves = [log.select(half), log.select(~half)]
+        by_half = [mean_delay(part, responses(part), expected) for part in halves]
+        delay_s *= all(abs(one - delay_s) < max(LATE_S, 0.3 * abs(delay_s)) for one in by_half)
+    # Rates that come before their command were not caused by it: the command was logged late.
+    is_late = delay_s > (LATEST_S if model is None else LATE_S) or -delay_s > LATE_S
+    late = [Change("u", "delay", -delay_s)] * is_late
+    return [(curve, *late) for curve in curves] or [tuple(late)]
+
+
+def check_log(
+    log: FlightLog, model: ModelParameters | None = None, motors: np.ndarray | None = None
+) -> Check:
+    """Return whether the channels of a log agree, and the conventions under which they would.
+
+    Args:
+        log: a flight.
+        model: whose lags are expected between commands and rates; None if they are unknown.
+        motors: outputs of four motors in Betaflight's order, (num_rows, 4).
+    """
+    samples = sample_changes(log)
+    held = {change.channel for change in samples if change.kind == "held"}
+    # Rates about the world's axes also look like an inverted attitude: the simpler one counts.
+    readings = [((), log), *with_body_rates(log)]
+    found = [(turned, one, *explain_frames(one)) for turned, one in readings]
+    explained = [one for one in found if one[3]]
+    if not explained:
+        return Check(log.source, found[0][2].pairs, ((),), log)
+    turned, right, compared, frames, scales = min(
+        explained, key=lambda one: len(one[0]) + len(one[3][0].changes())
+    )
+    right = rescaled(corrected(right, frames[0]), scales[0])
+    late = [change for change in late_sensors(right) if change.channel not in held]
+    right = on_time(right, late)
+    others = [*turned, *samples, *battery_changes(log), *late, *thrust_changes(right)]
+    parts = product(
+        [one.changes() for one in frames],
+        scales,
+        [()] if "w" in held else command_changes(right, model),
+        [()] if motors is None else motor_changes(right, motors),
+    )
+    explanations = [
+        (*(change for part in one for change in part), *others)
+        for one in islice(parts, MAX_ALTERNATIVES)
+    ]
+    contradicted = any(pair.verdict == CONTRADICTS for pair in compared.pairs)
+    remarks = () if model is None else constants_that_differ(right, model)
+    if not any(explanations) and not contradicted:
+        return Check(log.source, compared.pairs, (), right, (), remarks)
+    pairs = found[0][2].pairs
+    after = compare_pairs(right).pairs
+    return Check(log.source, pairs, tuple(dict.fromkeys(explanations)), right, after, remarks)
+
+
+def constants_that_differ(log: FlightLog, model: ModelParameters) -> tuple[str, ...]:
+    """Return sentences on the constants of a model that a log contradicts.
+
+    Args:
+        log: with right axes and scales.
+        model: a model of the craft.
+    """
+    if "w" not in log or not np.ptp(log["u"][:, :3], axis=0).any():
+        return ()
+    sentences = []
+    for name, response, stated in zip(
+        STICKS, responses(thinned(log)), np.asarray(model.max_rate, float), strict=True
+    ):
+        found = float(np.rad2deg(response.full_stick))
+        if response.correlation > CLEAR and abs(found / stated - 1.0) > MAX_RATE_ERROR:
+            sentences.append(
+                f"full stick of {name} gives {found:.0f} deg/s in this log, the model says "
+                f"{stated:.0f}"
+            )
+    return tuple(sentences)
+
+
+def explain_frames(
+    log: FlightLog,
+) -> tuple[Compared, list[Explanation], list[tuple[Change, ...]]]:
+    """Return the pairs of a log, the frames that explain them, and the scales with these frames.
+
+    Motion that is slower than a sensor's errors shows nothing. This depends on the scales, so pairs
+    are compared again where scales are wrong.
+    """
+    channels = frozenset(log.channels) | {"u_rates"}
+    compared = compare_pairs(log)
+    frames = explain(channels, compared.edges)
+    scales = scale_changes(corrected(log, frames[0])) if frames else NO_SCALES
+    whole = tuple(change for change in scales[0] if "_" not in change.channel)
+    if whole:
+        compared = compare_pairs(rescaled(log, whole))
+        frames = explain(channels, compared.edges)
+        scales = scale_changes(corrected(log, frames[0])) if frames else NO_SCALES
+    return compared, frames, scales
+
+
+def with_body_rates(log: FlightLog) -> list[tuple[tuple[Change, ...], FlightLog]]:
+    """Return what changed, and the log with body rates, if its rates may be about world axes."""
+    if "q" not in log or "w" not in log:
+        return []
+    nats, readings = [], []
+    for reading in READINGS:
+        attitude = Rotation.from_quat(reading.correct(log["q"]), scalar_first=True)
+        turns, body_rates = summed_turns(attitude), attitude.inv().apply(log["w"])
+        as_body = compare(log, turns, log["w"], RATE_FLOOR)
+        as_world = compare(log, turns, body_rates, RATE_FLOOR)
+        if as_body is None or as_world is None:
+            return []
+        nats.append(as_body.values.sum(axis=0))
+        readings.append((float(as_world.values.sum(axis=0)[IDENTITY]), body_rates))
+    after, rates = max(readings, key=lambda one: one[0])
+    # An inverted attitude with opposite rates is as likely but for how samples are integrated.
+    if after - nats[0][IDENTITY] < MARGIN or after < ALIKE * np.max(nats):
+        return []
+    changed = replace(log, channels={**log.channels, "w": rates})
+    return [((Change("w", "frame", "world"),), changed)]
+
+
+def on_time(log: FlightLog, late: list[Change]) -> FlightLog:
+    """Return a log with late sensors read later."""
+    channels = dict(log.channels)
+    for channel, _, seconds in late:
+        channels[channel] = read_at(log, log[channel], float(seconds))
+    return replace(log, channels=channels)

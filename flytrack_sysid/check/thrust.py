@@ -1,0 +1,110 @@
+"""The thrust command against the force along the body's z axis, and motors against the rotation."""
+
+import itertools
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flytrack_sysid.check.commands import GRID_S, follow
+from flytrack_sysid.check.explain import Change
+from flytrack_sysid.check.motion import MARGIN, MAX_CORRELATION, useful_windows, weight_of
+from flytrack_sysid.kinematics import GRAVITY, WINDOWS_S, Windows, cut_windows
+from flytrack_sysid.log import FlightLog
+
+DELAYS_S = np.arange(0.0, 0.15, GRID_S)  # of the force behind the command
+MIN_CORRELATION = 0.5  # of the force with the command, on either side of 0
+MIN_SPREAD = 0.5  # m/s^2, rms of the force about its mean: less is drag and noise
+PWM = (900.0, 2200.0)  # us, all that flight controllers use
+# Command of no thrust: -1 in a range of -1 to 1, 0 in one of 0 to 1. Idling motors make it lower.
+NO_THRUST_AT = -0.5
+MIN_TORQUE = 0.3  # correlation of the rotation with a motor's torque
+MOTOR_LAG_S = 0.03
+UP = np.array([0.0, 0.0, 1.0])
+# Signs of the moments about body x, y, z by motors 1 to 4 of Betaflight's "Quad X": rear right,
+# front right, rear left, front left. Yaw is not compared: propellers turn in or out.
+MOMENTS = np.array([[-1.0, -1.0, 1.0, 1.0], [1.0, -1.0, 1.0, -1.0]])
+
+
+def force_along_z(log: FlightLog, windows: Windows) -> np.ndarray | None:
+    """Return the specific force along the body's z axis, (num_windows,), or None if unknown.
+
+    It is measured, or follows from velocity and attitude; the log has right axes and scales.
+    """
+    if "f" in log:
+        return windows.mean_of(log, log["f"][:, 2:])[:, 0]
+    if "q" not in log or "v" not in log:
+        return None
+    up_w = Rotation.from_quat(log["q"], scalar_first=True).apply(UP)
+    changes = windows.change_of(log["v"]) / windows.durations[:, None]
+    return np.sum((changes + UP * GRAVITY) * windows.mean_of(log, up_w), axis=1)
+
+
+def thrust_changes(log: FlightLog) -> list[Change]:
+    """Return what differs in the thrust command: its range or its sign."""
+    thrust = log["u"][:, 3:]
+    low, high = np.min(thrust), np.max(thrust)
+    if low >= PWM[0] and high <= PWM[1]:
+        return [Change("u_thrust", "range", "pwm")]
+    windows = cut_windows(log, WINDOWS_S[0])
+    force = force_along_z(log, windows) if len(windows.starts) else None
+    if force is None or np.std(force) < MIN_SPREAD or not np.ptp(thrust):
+        return []
+    best, follows = 0.0, thrust[:, 0]
+    for delay_s in DELAYS_S:
+        followed = windows.mean_of(log, follow(log, thrust, delay_s, 0.0))[:, 0]
+        correlation = float(np.corrcoef(followed, force)[0, 1])
+        if abs(correlation) > abs(best):
+            best, follows = correlation, followed
+    if best < -MIN_CORRELATION:
+        return [Change("u_thrust", "axes", "-")]
+    if best < MIN_CORRELATION:
+        return []
+    # Thrust is between linear and quadratic in the command above that of no thrust.
+    errors = {}
+    for zero in (-1.0, 0.0):
+        above = np.maximum(follows - zero, 0.0)
+        design = np.stack([above, above**2], axis=1)
+        weights = np.maximum(np.linalg.lstsq(design, force, rcond=None)[0], 0.0)
+        errors[zero] = float(np.sum((force - design @ weights) ** 2))
+    nats = 0.5 * weight_of(WINDOWS_S[0]) * len(force) * np.log(errors[-1.0] / errors[0.0])
+    return [Change("u_thrust", "range", "0..1")] * bool(nats > MARGIN)
+
+
+def motor_changes(log: FlightLog, motors: np.ndarray) -> list[tuple[Change, ...]]:
+    """Return orders of the motors by which their torques turn the craft; [()] if theirs does.
+
+    Args:
+        log: with right axes.
+        motors: outputs of four motors, (num_rows, 4).
+    """
+    if "w" not in log or motors.shape[1] != 4:
+        return [()]
+    found = []
+    for length_s, windows in useful_windows(log):
+        turned = windows.change_of(log["w"]) / windows.durations[:, None]
+        pushed = windows.mean_of(log, follow(log, motors, 0.0, MOTOR_LAG_S))
+        pushed = pushed - pushed.mean(axis=0)
+        nats = {}
+        for order in itertools.permutations(range(4)):
+            # The column of motor order[k] holds motor k: moments in the order of the columns.
+            moments = pushed @ MOMENTS[:, order].T
+            total = 0.0
+            for axis in range(2):
+                size = np.linalg.norm(moments[:, axis]) * np.linalg.norm(turned[:, axis])
+                correlation = moments[:, axis] @ turned[:, axis] / max(size, 1e-12)
+                total -= np.log1p(-(np.clip(correlation, 0.0, MAX_CORRELATION) ** 2))
+            nats[order] = 0.5 * weight_of(length_s) * len(turned) * total
+        found.append(nats)
+    if not found:
+        return [()]
+    best = max(found, key=lambda nats: max(nats.values()))
+    highest = max(best.values())
+    if highest - best[0, 1, 2, 3] < MARGIN:
+        return [()]
+    alike = [order for order, value in best.items() if value > highest - MARGIN]
+    fewest = min(sum(k != motor for k, motor in enumerate(order)) for order in alike)
+    return [
+        (Change("motors", "order", " ".join(str(motor + 1) for motor in order)),)
+        for order in alike
+        if sum(k != motor for k, motor in enumerate(order)) == fewest
+    ]

@@ -1,0 +1,74 @@
+"""What connects the channels of one motion: gravity, turns, and windows to compare them over."""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flytrack_env.dynamics import nominal_parameters
+from flytrack_sysid.log import FlightLog
+
+GRAVITY = float(nominal_parameters().g)  # m/s^2
+WINDOWS_S = (0.1, 0.3, 1.0)  # long against the noise of a sample; short ones for fast manoeuvres
+
+
+class Windows(NamedTuple):
+    """Windows of about the same length, none across segments or long gaps.
+
+    Attributes:
+        starts: first row, (num_windows,).
+        ends: row after the last step, (num_windows,).
+        durations: (num_windows,) s.
+    """
+
+    starts: np.ndarray
+    ends: np.ndarray
+    durations: np.ndarray
+
+    def change_of(self, values: np.ndarray) -> np.ndarray:
+        """Return the change of values, (num_rows, ...), over each window."""
+        return values[self.ends] - values[self.starts]
+
+    def mean_of(self, log: FlightLog, values: np.ndarray) -> np.ndarray:
+        """Return the mean of values, (num_rows, n), over each window; linear between rows."""
+        steps = np.diff(log.time)[:, None] * 0.5 * (values[1:] + values[:-1])
+        integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
+        return self.change_of(integral) / self.durations[:, None]
+
+
+def cut_windows(log: FlightLog, length_s: float) -> Windows:
+    """Return the windows of a log, without those that a gap makes more than twice as long."""
+    is_start = log.is_start()
+    flight = np.cumsum(is_start) - 1
+    since_start = log.time - log.time[is_start][flight]
+    window = np.floor(since_start / length_s)
+    edges = np.flatnonzero(is_start | np.append(True, np.diff(window) > 0))
+    starts, ends = edges[:-1], edges[1:]
+    durations = log.time[ends] - log.time[starts]
+    steps = np.diff(log.time)[~is_start[1:]]
+    max_duration = 2.0 * max(length_s, np.median(steps)) if len(steps) else 0.0
+    keep = (flight[starts] == flight[ends]) & (durations <= max_duration)
+    return Windows(starts[keep], ends[keep], durations[keep])
+
+
+def summed_turns(attitude: Rotation) -> np.ndarray:
+    """Return the sum of the rotations between rows about the body's axes, (num_rows, 3) rad."""
+    turns_b = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(turns_b, axis=0)])
+
+
+def segments_of(log: FlightLog) -> list[slice]:
+    """Return the rows of each segment of a log."""
+    edges = [*np.flatnonzero(log.is_start()), len(log)]
+    return [slice(start, end) for start, end in pairwise(edges)]
+
+
+def read_at(log: FlightLog, values: np.ndarray, later_s: float) -> np.ndarray:
+    """Return values, (num_rows, n), read some seconds later within each segment; ends are held."""
+    result = np.empty_like(values)
+    for rows in segments_of(log):
+        time = log.time[rows]
+        for column in range(values.shape[1]):
+            result[rows, column] = np.interp(time + later_s, time, values[rows, column])
+    return result
