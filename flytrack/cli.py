@@ -76,6 +76,7 @@ COMMANDS = {
     ),
     "diagnose": _own("diagnose", *IDENTIFICATION, "Name what a model gets wrong, and extend it"),
     "plan": _own("plan", *IDENTIFICATION, "Plan flights that settle what a log left open"),
+    "check": _own("check", *IDENTIFICATION, "Find units, signs, frames and clocks that contradict"),
     "import": _own("import", *IDENTIFICATION, "Convert logs of real flights into a flight log"),
     "loop": _own(
         "loop", "train", "loop", "loop", "Train, fly, diagnose, extend the model, train again"

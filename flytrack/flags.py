@@ -96,6 +96,28 @@ class Import:
 
 
 @dataclass(frozen=True)
+class Check:
+    """Flags of ``flytrack check``."""
+
+    log: Annotated[Positional[Path | None], arg(metavar="LOG", help_behavior_hint=NO_HINT)] = None
+    """The flight log; with --map, a file of another format."""
+    map: Annotated[str | None, arg(metavar="MAPPING", help_behavior_hint=NO_HINT)] = None
+    """A mapping file, .toml, or the name of a shipped one, to import the log with."""
+    format: Literal["csv", "ulog", "betaflight", "dataflash", "usd", "bag"] = "csv"
+    """The format of a log with --map."""
+    model: OptionalPath = None
+    """A model of the craft, whose lags and full-stick rates are compared with the log."""
+    plant: Annotated[str | None, arg(metavar="MODULE:NAME", help_behavior_hint=NO_HINT)] = None
+    """Check a simulator instead: a function step(x, u), or an acro_step.bin."""
+    layout: OptionalPath = None
+    """What the numbers of the plant's state are, .toml; default: the handout's state."""
+    out: OptionalPath = None
+    """Folder for a report with pictures."""
+    fix: OptionalPath = None
+    """Write the mapping by which the log agrees, .toml; needs --map."""
+
+
+@dataclass(frozen=True)
 class Fit:
     """Flags of ``flytrack fit``."""
 
@@ -116,6 +138,8 @@ class Fit:
     motion: MotionName = "auto"
     """How the craft moves within a step: as drones do (continuous), or by a simulator's step; auto:
     as drones do if the log is measured, else what the log shows."""
+    accept: bool = False
+    """Fit a log although its channels contradict each other."""
 
 
 @dataclass(frozen=True)
@@ -128,6 +152,8 @@ class Validate:
     """The flight log."""
     out: Path
     """The folder of the report."""
+    accept: bool = False
+    """Judge a log although its channels contradict each other."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +176,8 @@ class Diagnose:
     motion: MotionName = "auto"
     """How the craft moves within a step: as drones do (continuous), or by a simulator's step; auto:
     as drones do if the logs are measured, else what the logs show."""
+    accept: bool = False
+    """Diagnose logs although their channels contradict each other."""
 
 
 @dataclass(frozen=True)

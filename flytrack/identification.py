@@ -6,13 +6,19 @@ from typing import Any
 
 import numpy as np
 
-from flytrack.flags import Collect, Diagnose, Fit, Import, Plan, Validate
+from flytrack.flags import Check, Collect, Diagnose, Fit, Import, Plan, Validate
 from flytrack_env import Motion, blackbox, load_model, load_provenance, save_model
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.extras import import_object
+from flytrack_env.files import write_atomically
 from flytrack_env.model_file import ModelFileError
 from flytrack_env.plants import Plant
 from flytrack_env.progress import ProgressBar
+from flytrack_sysid.check import Check as CheckOfLog
+from flytrack_sysid.check import check_environment, check_log, check_plant, write_check
+from flytrack_sysid.check import text_of as text_of_check
+from flytrack_sysid.check.fix import fix_mapping, text_of_fix
+from flytrack_sysid.check.plant import load_layout
 from flytrack_sysid.collect import CollectError, collect
 from flytrack_sysid.diagnosis import (
     NOT_CHECKED,
@@ -29,6 +35,7 @@ from flytrack_sysid.diagnosis.report import collect_traces
 from flytrack_sysid.fit import fit, what_is_fitted
 from flytrack_sysid.flight_recording import write_flight_recording
 from flytrack_sysid.importing import import_log
+from flytrack_sysid.importing.mapping import SHIPPED
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_file import check_name, describe, load_log, save_log
 from flytrack_sysid.log_motion import required_motion
@@ -40,6 +47,7 @@ from flytrack_sysid.validate import validate
 from flytrack_sysid.validation_report import text_of, write_validation
 
 RECORDING_NAME = "flight.rrd"
+PLANT_MINUTES = 1.0  # of excitation, to check a plant
 
 
 def load_plant(where: str) -> Any:
@@ -87,20 +95,75 @@ def run_import(flags: Import) -> None:
     print_written(written)
 
 
+def run_check(flags: Check) -> int:
+    """Check a log or a plant; the exit status is 1 if something contradicts."""
+    if (flags.log is None) == (flags.plant is None):
+        raise ValueError("LOG or --plant: expected one of the two")
+    if flags.fix is not None and flags.map is None:
+        raise ValueError("--fix: found without --map, expected the mapping to correct")
+    model = None if flags.model is None else load_model(flags.model)
+    if flags.plant is not None:
+        found, log = check_of_plant(flags.plant, flags.layout), None
+    else:
+        assert flags.log is not None
+        log = (
+            load_log(flags.log)
+            if flags.map is None
+            else import_log(flags.log, flags.format, flags.map).log
+        )
+        found = check_log(log, model)
+    print(text_of_check(found))
+    if flags.out is not None:
+        print_written(write_check(flags.out, found, found.corrected if log is None else log))
+    if flags.fix is not None and any(found.explanations):
+        write_fix(str(flags.map), flags.fix, found)
+    return int(found.contradicts)
+
+
+def check_of_plant(where: str, layout: Path | None) -> CheckOfLog:
+    """Return the check of a plant, a function or an environment that ``where`` names."""
+    plant = import_object(where, "--plant", CollectError) if ":" in where else load_plant(where)
+    if isinstance(plant, Plant):
+        return check_log(collect(plant, PLANT_MINUTES, 0))
+    if hasattr(plant, "action_space"):
+        if layout is None:
+            raise ValueError("--layout: missing, expected what an observation's numbers are")
+        return check_environment(plant, load_layout(layout))
+    if not callable(plant):
+        found = type(plant).__name__
+        raise CollectError(f"--plant {where}: found {found}, expected step(x, u) or an environment")
+    return check_plant(plant, None if layout is None else load_layout(layout))
+
+
+def write_fix(mapping: str, out: Path, found: CheckOfLog) -> None:
+    """Write the mapping by which a log agrees; what several explanations say is left."""
+    certain = [
+        change
+        for change in found.explanations[0]
+        if all(change in one for one in found.explanations)
+    ]
+    path = Path(mapping) if Path(mapping).exists() else SHIPPED / f"{mapping}.toml"
+    fix = fix_mapping(path.read_text(encoding="utf-8"), certain)
+    write_atomically(out, fix.text.encode())
+    if len(found.explanations) > 1:
+        print("left: what only some of the explanations say")
+    print(text_of_fix(fix))
+    print_written([out])
+
+
 def run_fit(flags: Fit) -> None:
     """Fit the model and write it."""
     check_model_name(flags.out)  # before the work
     fixed = fixed_values(flags.fix)
     start = nominal_parameters() if flags.start is None else load_model(flags.start)
     log = load_log(flags.log)
-    what_is_fitted(log, start, fixed, flags.effect, flags.hold_out_every)  # refuses before the work
+    what_is_fitted(log, start, fixed, flags.effect, flags.hold_out_every, accept=flags.accept)
     requested = None if flags.motion == "auto" else Motion(flags.motion)
     told = start.motion
     if required_motion(log, requested) is None:
         start = start._replace(motion=motion_of(log, start))
-    found = fit(
-        log, start, fixed, flags.effect, flags.hold_out_every, ProgressBar("rounds"), requested
-    )
+    every, bar = flags.hold_out_every, ProgressBar("rounds")
+    found = fit(log, start, fixed, flags.effect, every, bar, requested, accept=True)  # checked
     provenance = found.provenance()
     provenance["started_from"] = (
         "nominal parameters" if flags.start is None else Path(flags.start).name
@@ -119,7 +182,7 @@ def run_validate(flags: Validate) -> None:
     """Validate the model and write the report."""
     model = load_model(flags.model)
     log = load_log(flags.log)
-    check_plausible(log)
+    check_plausible(log, flags.accept)
     rows, note = judged_rows(flags.model, log)
     found = validate(model, log, rows)
     found = found._replace(notes=(note, *found.notes))
@@ -138,7 +201,7 @@ def run_diagnose(flags: Diagnose) -> None:
     )
     logs, before = [*train, *test], [load_log(path) for path in flags.before]
     for one in (*logs, *before):
-        check_plausible(one)
+        check_plausible(one, flags.accept)
         print(describe(one), flush=True)  # what follows takes a while
     log = joined(logs)
     held_out = np.arange(len(log)) >= sum(map(len, train)) if test else None

@@ -21,11 +21,12 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid.kinematics import GRAVITY, summed_turns
 from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
-from flytrack_sysid.plausibility import GRAVITY, MIN_CORRELATION, summed_turns
 from flytrack_sysid.resample import interpolate, interpolate_quaternions
 
 MAX_OFFSET_S = 0.25  # above, a logger is broken rather than late
+MIN_CORRELATION = 0.9  # below, the slope may be that of noise
 WINDOW_S = 0.1  # long against the noise of a sample, short against manoeuvres
 GRID_S = 0.01  # within one step the cost has one minimum: motion of a drone is slower
 ROUNDS = 5  # of Gauss-Newton; it converges in two

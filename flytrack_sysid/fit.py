@@ -246,12 +246,13 @@ def what_is_fitted(
     effects: Iterable[str] = (),
     every: int = HELD_OUT_EVERY,
     motion: Motion | None = None,
+    accept: bool = False,
 ) -> tuple[ModelParameters, tuple[str, ...], np.ndarray]:
     """Return the model a fit starts from, the names that it estimates and the rows that it uses.
 
     Arguments and exceptions are those of ``fit``, which calls this first.
     """
-    check_plausible(log)
+    check_plausible(log, accept)
     fixed, effects = dict(fixed or {}), tuple(effects)
     try:
         model = with_neutral_effects(nominal_parameters() if start is None else start, effects)
@@ -278,6 +279,7 @@ def fit(
     every: int = HELD_OUT_EVERY,
     report: Callable[[int, int], None] = lambda done, rounds: None,
     motion: Motion | None = None,
+    accept: bool = False,
 ) -> Fit:
     """Identify lags, thrust map and battery drain from a log.
 
@@ -293,12 +295,13 @@ def fit(
         report: called with the number of finished rounds and of all rounds.
         motion: motion of the drone within a step. If None, it is continuous for a measured log, and
             that of ``start`` otherwise.
+        accept: fit the log although its channels contradict each other (``flytrack_sysid.check``).
 
     Raises:
         LogError: the log is implausible.
         FitError: channels or motion are missing, or the fit diverged.
     """
-    model, free, scored_rows = what_is_fitted(log, start, fixed, effects, every, motion)
+    model, free, scored_rows = what_is_fitted(log, start, fixed, effects, every, motion, accept)
     notes = motion_notes(log, start, motion, f"replayed as {model.motion.value}")
     given = model.battery
     notes += voltage_notes(log, given)

@@ -50,23 +50,28 @@ def thinned(log: FlightLog) -> FlightLog:
     return replace(log, time=mean(log.time), channels=channels, segment=log.segment[first])
 
 
-def follow(log: FlightLog, values: np.ndarray, delay_s: float, lag_s: float) -> np.ndarray:
-    """Return values as a first-order lag with a dead time follows them, (num_rows, n).
+def lagged(log: FlightLog, values: np.ndarray, lag_s: float) -> np.ndarray:
+    """Return values as a first-order lag follows them, (num_rows, n).
+
+    A row's command acts from its time on, so the lag sees it one step later.
 
     Args:
         log: the log that holds the rows.
         values: (num_rows, n).
-        delay_s: dead time; negative values lead.
         lag_s: time constant.
     """
     step_s = float(np.median(usual_step(log)))
     decay = float(np.exp(-step_s / lag_s)) if lag_s > 0.0 else 0.0
-    # A row's command acts from its time on: the lag sees it one step later.
-    lagged = [
+    parts = [
         lfilter([0.0, 1.0 - decay], [1.0, -decay], values[rows], axis=0, zi=values[rows][:1])[0]
         for rows in segments_of(log)
     ]
-    return read_at(log, np.concatenate(lagged), -delay_s)
+    return np.concatenate(parts)
+
+
+def follow(log: FlightLog, values: np.ndarray, delay_s: float, lag_s: float) -> np.ndarray:
+    """Return values as a lag with a dead time follows them; a negative one leads."""
+    return read_at(log, lagged(log, values, lag_s), -delay_s)
 
 
 class Followed(NamedTuple):
@@ -92,8 +97,9 @@ def compare_commands(log: FlightLog) -> Followed | None:
         return None
     rates = windows.mean_of(log, log["w"])
     found = []
+    by_lag = {lag_s: lagged(log, log["u"][:, :3], lag_s) for lag_s in LAGS_S}
     for lag_s, delay_s in product(LAGS_S, DELAYS_S):
-        commands = windows.mean_of(log, follow(log, log["u"][:, :3], delay_s, lag_s))
+        commands = windows.mean_of(log, read_at(log, by_lag[lag_s], -delay_s))
         values = weight_of(WINDOWS_S[0]) * np.array(
             [by_frame(rates[part], commands[part], RATE_FLOOR) for part in parts_of(count)]
         )
@@ -135,8 +141,10 @@ def response_to(log: FlightLog, stick: np.ndarray, axis: int) -> Response:
     shown = windows.mean_of(log, log["w"][:, axis : axis + 1])[:, 0]
     size = max(float(np.linalg.norm(shown)), 1e-12)
 
+    by_lag = {lag_s: lagged(log, stick[:, None], lag_s) for lag_s in LAGS_S}
+
     def fit(delay_s: float, lag_s: float) -> Response:
-        followed = windows.mean_of(log, follow(log, stick[:, None], delay_s, lag_s))[:, 0]
+        followed = windows.mean_of(log, read_at(log, by_lag[lag_s], -delay_s))[:, 0]
         product_, square = float(followed @ shown), max(float(followed @ followed), 1e-12)
         return Response(delay_s, lag_s, product_ / square, product_ / (size * np.sqrt(square)))
 
@@ -205,9 +213,10 @@ def _quick(stick: np.ndarray, super_rate: float, expo: float) -> np.ndarray:
 
 # Rate curves of Betaflight's firmware (src/main/fc/rc.c), over the rate at full stick.
 CURVES = {"actual": _actual, "betaflight": _betaflight, "quick": _quick}
-FIRST_SETTINGS = {"actual": (0.3, 0.5), "betaflight": (0.6, 0.2), "quick": (0.6, 0.2)}
+FIRST_SETTINGS = ((0.3, 0.5), (0.65, 0.2))
 HIGHEST_SETTING = 0.95
 MIN_STICK = 0.4  # deflection that shows a curve
+MIN_BENT = 1.3  # times: the residual variance of the stick over that of the stick and its cube
 MIN_BETTER = 2.0  # times: the residual variance without a curve over that with it
 MIN_FOLLOWED = 0.9  # correlation of rates with commands that are understood
 
@@ -225,14 +234,28 @@ def curve_changes(log: FlightLog, found: list[Response]) -> list[Change]:
         stick = log["u"][:, axis]
         if response.correlation < MIN_FOLLOWED or np.abs(stick).max() < MIN_STICK:
             continue
-        left = {name: _unexplained(log, axis, stick, response, name) for name in CURVES}
         straight = 1.0 - min(response.correlation, MAX_CORRELATION) ** 2
+        if straight < MIN_BENT * _unexplained_by_cubic(log, axis, stick, response):
+            continue
+        left = {name: _unexplained(log, axis, stick, response, name) for name in CURVES}
         if straight > MIN_BETTER * min(left.values()):
             for name, value in left.items():
                 nats[name] += 0.5 * count * float(np.log(straight / value))
     best = max(nats.values())
     alike = sorted((-value, name) for name, value in nats.items() if value > best - MARGIN)
     return [] if best < MARGIN else [Change("u_rates", "curve", name) for _, name in alike]
+
+
+def _unexplained_by_cubic(
+    log: FlightLog, axis: int, stick: np.ndarray, response: Response
+) -> float:
+    """Return the share of an axis's rates that the stick and its cube leave."""
+    windows = cut_windows(log, WINDOWS_S[0])
+    shown = windows.mean_of(log, log["w"][:, axis : axis + 1])[:, 0]
+    bent = follow(log, np.stack([stick, stick**3], axis=1), response.delay_s, response.lag_s)
+    design = windows.mean_of(log, bent)
+    left = shown - design @ np.linalg.lstsq(design, shown)[0]
+    return max(float(left @ left) / max(float(shown @ shown), 1e-12), 1.0 - MAX_CORRELATION**2)
 
 
 def _unexplained(
@@ -257,6 +280,6 @@ def _unexplained(
             options={"xatol": 0.01, "fatol": 1e-5, "maxfev": 60},
         ).x
 
-    shape = settings(FIRST_SETTINGS[name])
+    shape = min(map(settings, FIRST_SETTINGS), key=left)
     response = response_to(log, CURVES[name](stick, *shape), axis)  # its lag was that of sticks
     return left(settings(tuple(shape)))

@@ -76,33 +76,13 @@ HALF_TURN = Rotation.from_rotvec([np.pi, 0.0, 0.0])  # about x: between FLU and 
 _ROLLS = {"wxyz": 0, "xyzw": 1, "zwxy": -1}  # places to roll the columns by
 
 
-def _turned(quat: np.ndarray, is_body_turned: bool, is_world_turned: bool) -> np.ndarray:
-    attitude = Rotation.from_quat(quat, scalar_first=True)
-    attitude = HALF_TURN * attitude if is_world_turned else attitude
-    attitude = attitude * HALF_TURN if is_body_turned else attitude
-    return attitude.as_quat(scalar_first=True, canonical=False)
-
-
-def _reading(order: str, is_conjugate: bool, body: bool, world: bool) -> QuaternionReading:
-    def correct(quat: np.ndarray) -> np.ndarray:
-        # An import may have turned body or world of columns that it had read in a wrong order.
-        as_read = _turned(quat, body, world) if body or world else quat
-        rolled = np.roll(as_read, _ROLLS[order], axis=1)
-        if is_conjugate:
-            rolled = rolled * np.array([1.0, -1.0, -1.0, -1.0])
-        return _turned(rolled, body, world) if body or world else rolled
-
-    return QuaternionReading(order, is_conjugate, correct)
-
-
-def readings_of(
-    is_body_turned: bool = False, is_world_turned: bool = False
-) -> tuple[QuaternionReading, ...]:
-    """Return the readings of a quaternion, right first, if an import turned its frames so."""
-    return tuple(
-        _reading(order, is_conjugate, is_body_turned, is_world_turned)
-        for order, is_conjugate in product(_ROLLS, (False, True))
+def _reading(order: str, is_conjugate: bool) -> QuaternionReading:
+    signs = np.array([1.0, -1.0, -1.0, -1.0]) if is_conjugate else np.ones(4)
+    return QuaternionReading(
+        order, is_conjugate, lambda quat: np.roll(quat, _ROLLS[order], axis=1) * signs
     )
 
 
-READINGS = readings_of()
+# The first is right. An import may have turned body or world of columns that it had read in a wrong
+# order; then the other wrong order is right up to the signs of all columns.
+READINGS = tuple(_reading(*how) for how in product(_ROLLS, (False, True)))

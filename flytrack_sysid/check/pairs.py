@@ -151,7 +151,8 @@ def _compare_forces(log: FlightLog, rates: np.ndarray) -> tuple[Pair | None, np.
         return None, forces
     name, function = ("v, f and q", compare_forces) if "f" in log else ("v and q", compare_thrust)
     attitudes = _attitudes(log)
-    tried = [number for number in range(len(READINGS)) if rates[number].any()]
+    # The reading of the log is compared too, to say that it contradicts.
+    tried = [number for number in range(len(READINGS)) if number == 0 or rates[number].any()]
     by_reading = {number: function(log, attitudes[number], GRAVITY) for number in tried}
     known = {number: one for number, one in by_reading.items() if one is not None}
     if not known:
@@ -160,8 +161,6 @@ def _compare_forces(log: FlightLog, rates: np.ndarray) -> tuple[Pair | None, np.
     is_allowed = allowed(values)
     forces[:] = False
     forces[list(known)] = is_allowed
-    if 0 not in known:  # the attitude is misread: it says nothing about the others as it is
-        return Pair(name, STILL, (float("nan"),) * len(AXES), AXES, 0.0), forces
     flips = [bool(is_allowed[0, 0, flip, IDENTITY]) for flip in MIRRORS]
     return _pair(name, known[0]._replace(values=values), is_allowed, flips), forces
 

@@ -77,7 +77,8 @@ def draw_pair(name: str, before: Signals, after: Signals) -> Figure:
                 panel.set_ylabel(f"{'xyz'[axis]} ({unit})")
         panels[0, column].set_title(title)
         panels[2, column].set_xlabel("time (s)")
-    panels[0, 0].legend(fontsize="small", frameon=False)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
     figure.suptitle(name, fontweight="bold")
     return figure
 

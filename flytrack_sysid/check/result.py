@@ -90,14 +90,14 @@ def rescaled(log: FlightLog, changes: tuple[Change, ...]) -> FlightLog:
     return replace(log, channels=channels)
 
 
-def battery_changes(log: FlightLog) -> list[Change]:
-    """Return the battery's wrong unit."""
+def battery_changes(log: FlightLog) -> list[tuple[Change, ...]]:
+    """Return units of the battery's voltage that a pack may have, as alternatives."""
     median_v = float(np.median(log["v_bat"])) if "v_bat" in log else 0.0
-    if median_v <= HIGHEST_BATTERY_V:
-        return []
     low, high = LIKELY_BATTERY_V
     units = [unit for unit in BATTERY_UNITS if low <= median_v / unit <= high]
-    return [Change("v_bat", "scale", unit) for unit in units[:1]]
+    if median_v <= HIGHEST_BATTERY_V or not units:
+        return [()]
+    return [(Change("v_bat", "scale", unit),) for unit in units]
 
 
 def command_changes(log: FlightLog, model: ModelParameters | None) -> list[tuple[Change, ...]]:
@@ -112,6 +112,8 @@ def command_changes(log: FlightLog, model: ModelParameters | None) -> list[tuple
     log = thinned(log)
     found = responses(log)
     curves = curve_changes(log, found)
+    if curves:  # what the rates follow, and so how late they are, is not known then
+        return [(curve,) for curve in curves]
     expected = np.zeros(3) if model is None else np.asarray(model.tau, float)[:3]
     delay_s = mean_delay(log, found, expected)
     if delay_s:  # a late command is as late in both halves
@@ -122,7 +124,7 @@ def command_changes(log: FlightLog, model: ModelParameters | None) -> list[tuple
     # Rates that come before their command were not caused by it: the command was logged late.
     is_late = delay_s > (LATEST_S if model is None else LATE_S) or -delay_s > LATE_S
     late = [Change("u", "delay", -delay_s)] * is_late
-    return [(curve, *late) for curve in curves] or [tuple(late)]
+    return [tuple(late)]
 
 
 def check_log(
@@ -149,10 +151,11 @@ def check_log(
     right = rescaled(corrected(right, frames[0]), scales[0])
     late = [change for change in late_sensors(right) if change.channel not in held]
     right = on_time(right, late)
-    others = [*turned, *samples, *battery_changes(log), *late, *thrust_changes(right)]
+    others = [*turned, *samples, *late, *thrust_changes(right)]
     parts = product(
         [one.changes() for one in frames],
         scales,
+        battery_changes(log),
         [()] if "w" in held else command_changes(right, model),
         [()] if motors is None else motor_changes(right, motors),
     )

@@ -14,6 +14,8 @@ MIN_CORRELATION = 0.9  # below, the slope may be that of noise
 # Scales within this factor of 1 are those of sensors and estimators: measured flights have 0.73 to
 # 1.25 (Crazyflies whose velocity is a slow estimate).
 LIKELY = 1.4
+FAST_PERCENTILE = 99.0  # of the rates: an isolated spike does not show a wrong unit
+FASTEST_RATE = float(np.deg2rad(4000.0))  # rad/s, the widest range among common gyroscopes
 UNIT_TOLERANCE = 0.15  # relative, of a unit's factor
 UNITS = {  # logged numbers for 1 in SI units
     "w": {"deg/s": 180.0 / np.pi, "gyro counts of 2000 deg/s": 16.4 * 180.0 / np.pi},
@@ -96,17 +98,24 @@ def scales_of_forces(log: FlightLog) -> tuple[float, float]:
 
 
 def unit_of(channel: str, factor: float) -> str:
-    """Return the unit that a factor looks like; "" for none."""
-    for name, size in UNITS.get(channel[:1] if channel != "v_bat" else channel, {}).items():
+    """Return the unit that a factor looks like, or that SI units were read as; "" for neither."""
+    for name, size in _units_of(channel).items():
         if abs(factor / size - 1.0) < UNIT_TOLERANCE:
             return name
+        if abs(factor * size - 1.0) < UNIT_TOLERANCE:
+            return f"SI units, read as {name}"
     return ""
+
+
+def _units_of(channel: str) -> dict[str, float]:
+    return UNITS.get(channel if channel == "v_bat" else channel[:1], {})
 
 
 def snapped(channel: str, factor: float) -> float:
     """Return the factor of the unit that a factor looks like, or itself."""
-    unit = unit_of(channel, factor)
-    return UNITS[channel if channel == "v_bat" else channel[:1]][unit] if unit else factor
+    sizes = _units_of(channel).values()
+    factors = [*sizes, *(1.0 / size for size in sizes)]
+    return next((one for one in factors if abs(factor / one - 1.0) < UNIT_TOLERANCE), factor)
 
 
 def is_unlikely(factor: float) -> bool:
@@ -125,6 +134,9 @@ def scale_changes(log: FlightLog) -> list[tuple[Change, ...]]:
     if "q" in log and "w" in log:
         turns = summed_turns(Rotation.from_quat(log["q"], scalar_first=True))
         found += _by_axis("w", slope_between(log, turns, log["w"]))
+    elif "w" in log:
+        fast = float(np.percentile(np.linalg.norm(log["w"], axis=1), FAST_PERCENTILE))
+        found += [Change("w", "scale", UNITS["w"]["deg/s"])] * (fast > FASTEST_RATE)
     if all(name in log for name in ("q", "v", "f")):
         speed, force = scales_of_forces(log)
     if "f" in log and np.isnan(force):

@@ -16,7 +16,7 @@ from flytrack_sysid.check.explain import Change
 from flytrack_sysid.check.motion import MARGIN, useful_windows, weight_of
 from flytrack_sysid.clocks import offset_between
 from flytrack_sysid.kinematics import GRAVITY, read_at, summed_turns
-from flytrack_sysid.log import FlightLog
+from flytrack_sysid.log import FlightLog, usual_step
 
 LATE_S = 0.006  # smaller offsets are those of filters and of the log's step
 MAX_LATE_S, GRID_S = 0.1, 0.005
@@ -60,6 +60,9 @@ def best_shift(
         is_rate: whether positive seconds mean that the derivative is late, not the quantity.
     """
     best = NOTHING
+    # A simulator's rates may be those of half a step before.
+    half_step_s = 0.5 * float(np.median(usual_step(log))) if log.origin == "simulated" else 0.0
+    least_s = LATE_S + half_step_s
     grid = np.arange(-MAX_LATE_S, MAX_LATE_S + GRID_S / 2, GRID_S)
     features = [rates(seconds).reshape(len(log), -1) for seconds in grid]
     for length_s, windows in useful_windows(log):
@@ -84,7 +87,7 @@ def best_shift(
         sigma_s = np.sqrt((count - 1) / count * np.sum((jackknife - jackknife.mean()) ** 2))
         at_zero = float(np.log(totals[len(grid) // 2] + TINY).sum())
         nats = 0.5 * weight_of(length_s) * len(shown) * (at_zero - least)
-        if nats > best.nats and abs(seconds) > max(LATE_S, LATE_ERRORS * sigma_s):
+        if nats > best.nats and abs(seconds) > max(least_s, LATE_ERRORS * sigma_s):
             best = Shift(seconds, nats)
     if best.nats < MARGIN:
         return NOTHING
@@ -105,7 +108,8 @@ def _residuals(shown: np.ndarray, means: np.ndarray, block: np.ndarray) -> np.nd
     left = shown - means[:, :, 0]
     errors = means[:, :, 1:].reshape(left.size, -1)
     if errors.size:
-        left = left - (errors @ np.linalg.lstsq(errors, left.ravel())[0]).reshape(left.shape)
+        weights = np.linalg.pinv(errors.T @ errors) @ (errors.T @ left.ravel())
+        left = left - (errors @ weights).reshape(left.shape)
     return np.stack([np.bincount(block, axis**2) for axis in left.T], axis=1)
 
 

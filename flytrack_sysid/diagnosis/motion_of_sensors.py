@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import PAIRS, offset_between
 from flytrack_sysid.inference.score_test import solve
+from flytrack_sysid.kinematics import GRAVITY
 from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
-from flytrack_sysid.plausibility import GRAVITY
 
 # The attitude that rotates the force of a step, as a share of the turn from the attitude before the
 # step to that after it. The sensors identify a motion if their share is more than SURE_ERRORS

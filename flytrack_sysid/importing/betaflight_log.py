@@ -23,9 +23,9 @@ from flytrack_sysid.importing.flight import (
 )
 from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS
+from flytrack_sysid.kinematics import GRAVITY
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import Table, columns_of, log_of_table
-from flytrack_sysid.plausibility import GRAVITY
 from flytrack_sysid.timestamps import number_segments, put_on_one_line, read_clock
 
 FIRMWARE = "Betaflight"

@@ -17,8 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flytrack_sysid.kinematics import GRAVITY, summed_turns
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.plausibility import GRAVITY, MIN_ROWS, MIN_S, summed_turns
+from flytrack_sysid.plausibility import MIN_ROWS, MIN_S
 
 # Length of a block of rows: an idle propeller turns tens of times in it, and a drone in flight does
 # not stay motionless for it.

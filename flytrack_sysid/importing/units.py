@@ -8,7 +8,10 @@ heading at the start).
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_sysid.plausibility import GRAVITY, HALF_TURN, TURN_SIGNS
+from flytrack_sysid.check.frames import HALF_TURN
+from flytrack_sysid.kinematics import GRAVITY
+
+TURN_SIGNS = np.array([1.0, -1.0, -1.0])  # of half a turn about x
 
 PER_DEGREE = float(np.deg2rad(1.0))
 UNITS: dict[str, dict[str, float]] = {

@@ -8,7 +8,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid import diagnose, import_log
-from flytrack_sysid.plausibility import GRAVITY, cut_windows, summed_turns
+from flytrack_sysid.kinematics import GRAVITY, cut_windows, summed_turns
 from tests.support.real_logs import CRAZYFLIE, import_shared, shared
 from tests.support.tables import table
 

@@ -7,18 +7,22 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from flytrack_sysid.kinematics import GRAVITY
 from flytrack_sysid.log import CHANNELS, LogError
-from flytrack_sysid.plausibility import GRAVITY, MIN_ROWS, check_plausible, find_problems
+from flytrack_sysid.plausibility import MIN_ROWS, check_plausible, find_problems
 from flytrack_sysid.sensors import measure, specific_force_b
 from tests.support.handout_plant import HandoutPlant, excited
 from tests.support.made_flight import noisy
 from tests.support.tables import table
+
+NUM_SEGMENTS = 8  # of the excitation, 2.5 s each
 
 
 @pytest.fixture(scope="module")
 def logs():
     """The same flights as they are, and as sensors measure them."""
     exact = excited(HandoutPlant())
+    exact = exact.select(exact.segment < NUM_SEGMENTS)
     clean = replace(exact, channels={**exact.channels, "f": specific_force_b(exact, GRAVITY)})
     return {"clean": clean, "noisy": measure(exact, 1.0, GRAVITY, np.random.default_rng(9))}
 
@@ -51,16 +55,26 @@ WRONG, MISREAD = (
 )
 
 
-@pytest.mark.parametrize("name", ["clean", "noisy"])
 @pytest.mark.parametrize("wrong", WRONG)
-def test_wrong_log_is_named_and_only_that(logs, name, wrong):
-    log, change = replace(logs[name], source="flight.csv"), WRONG[wrong]
-    if change.channel == "a" and "a" not in log:
-        pytest.skip("no accelerations are measured")
+def test_what_no_flight_has_is_named_and_only_that(logs, wrong):
+    change = WRONG[wrong]
+    log = replace(logs["clean" if change.channel == "a" else "noisy"], source="flight.csv")
     with pytest.raises(LogError, match=change.text) as error:
         check_plausible(change.apply(log))
     (problem,) = str(error.value).splitlines()
     assert problem.startswith(f"flight.csv: {change.named()}: found ")
+
+
+@pytest.mark.parametrize("misread", MISREAD)
+def test_channel_that_contradicts_others_is_named_and_only_that(logs, misread):
+    change = MISREAD[misread]
+    log = change.apply(logs["noisy"])
+    (problem,) = find_problems(log)
+    before, wanted, after = problem.partition(f"{change.named()}: ")
+    assert wanted and change.text in after
+    others = {", ".join(columns) for columns in CHANNELS.values()} - {change.named()}
+    assert not any(f"{columns}: " in before + after for columns in others)
+    assert find_problems(log, accept=True) == []
 
 
 @pytest.mark.parametrize("name", ["clean", "noisy"])
@@ -79,17 +93,6 @@ def test_too_little_is_no_log(logs, name):
         assert re.search(f": t: {found}", problem)
 
 
-@pytest.mark.parametrize("noise", [False, True])
-@pytest.mark.parametrize("name", MISREAD)
-def test_channels_that_contradict_each_other_are_read_right(name, noise, truth):
-    change, right = MISREAD[name], noisy(truth, 3) if noise else truth
-    log = replace(right, channels={**right.channels, "u": np.clip(right["u"], -1.0, 1.0)})
-    assert find_problems(log) == []
-    (problem,) = find_problems(change.apply(log))
-    assert f": {change.named()}: found motion that contradicts itself" in problem
-    assert change.text in problem
-
-
 @pytest.mark.slow
 def test_right_logs_of_any_noise_contradict_nothing(truth):
     """210 logs of 10 s: 7 parts of a flight with 30 noises each, of 0.1 to 10 times the usual."""
@@ -100,17 +103,16 @@ def test_right_logs_of_any_noise_contradict_nothing(truth):
         shaken = noisy(log, seed)
         channels = {name: log[name] + factor * (shaken[name] - log[name]) for name in log.channels}
         channels["q"] /= np.linalg.norm(channels["q"], axis=1, keepdims=True)
-        problems = find_problems(replace(log, channels=channels))
-        assert "contradict" not in " ".join(problems), seed
+        assert find_problems(replace(log, channels=channels)) == [], seed
 
 
 def test_all_problems_are_listed(logs):
-    log = logs["noisy"]
-    for wrong in ("t in ms", "w in deg/s", "v_bat in mV", "f in g"):
-        log = WRONG[wrong].apply(log)
+    log = logs["clean"]
+    wrong = ("t in ms", "commands stuck", "q stuck", "a with gravity")
+    for name in wrong:
+        log = WRONG[name].apply(log)
     problems = find_problems(log)
-    named = [WRONG[wrong].named() for wrong in ("t in ms", "w in deg/s", "f in g", "v_bat in mV")]
-    assert [problem.split(": ")[1] for problem in problems] == named
+    assert [problem.split(": ")[1] for problem in problems] == [WRONG[n].named() for n in wrong]
     with pytest.raises(LogError) as error:
         check_plausible(log)
     assert str(error.value).splitlines() == problems
@@ -126,8 +128,10 @@ def test_drone_that_stands_while_commands_move(logs, measured):
 
 
 def test_batteries_of_one_to_fourteen_cells_raise_no_problem(logs):
+    log = logs["noisy"]
+    log = replace(log, channels={name: log[name] for name in ("u", "v_bat")})
     for volts in (3.0, 16.8, 60.0):
         battery = Change("v_bat", scale=0.0, offset=volts)
-        assert find_problems(battery.apply(logs["clean"])) == []
-    (problem,) = find_problems(battery._replace(offset=420.0).apply(logs["clean"]))
-    assert problem.endswith("this looks like hundredths of V or tenths of V")
+        assert find_problems(battery.apply(log)) == []
+    (problem,) = find_problems(battery._replace(offset=420.0).apply(log))
+    assert "hundredths of V" in problem and "tenths of V" in problem
