@@ -241,6 +241,7 @@ def write_page() -> None:
         RESULTS / "ablation.md",
         "ablation",
         plants=len(counted),
+        commits=", ".join(sorted({line["commit"] for line in lines})),
         seconds=f"{SECONDS:g}",
         seed=SEED,
         table=table(header, rows),

@@ -8,22 +8,26 @@ later run of the same commit resumes there; ``--page`` writes docs/results/check
 from collections import Counter
 from collections.abc import Iterable
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 from zlib import crc32
 
 import numpy as np
 from scipy.stats import beta
 
+from benchmarks.real.crazyflie import DATA
 from benchmarks.report import RESULTS, command, fill_page, lines_of_commit, record_trials, table
 from benchmarks.seams.faults import FAULTS, Change, Truth, draw_pair, inject, is_shown
 from benchmarks.seams.flight import Flight, make_flight
+from benchmarks.seams.measured import measured_flights
 from benchmarks.seams.simulators import SIMULATORS
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid.check import check_log, check_plant
+from flytrack_sysid.log import FlightLog
 
 LINES = RESULTS / "check.jsonl"
-Part = Literal["clean", "faults", "pairs", "simulators"]
-PARTS: tuple[Part, ...] = ("clean", "faults", "pairs", "simulators")
+Part = Literal["clean", "faults", "pairs", "simulators", "measured"]
+PARTS: tuple[Part, ...] = ("clean", "faults", "pairs", "simulators", "measured")
 MAX_ALTERNATIVES = 4
 SCALE_TOLERANCE, DELAY_TOLERANCE, DELAY_TOLERANCE_S = 0.05, 0.1, 0.003
 COMMAND_TOLERANCE_S = 0.02  # the lag of the craft is not known better
@@ -55,8 +59,17 @@ def flight_of(seed: int, number: int) -> Flight:
     return make_flight(100_000 * seed + number)
 
 
+@lru_cache(1)
+def flights_at(data: Path) -> dict[str, FlightLog]:
+    """Return the measured flights below a folder, by name; empty if there is none."""
+    return dict(measured_flights(data)) if data.is_dir() else {}
+
+
 def measure(trial: Trial) -> dict[str, Any]:
     """Check a log or a plant and compare what is found with the truth."""
+    if trial.part == "measured":
+        log = flights_at(DATA)[trial.name]
+        return {"truth": [], "shown": True, **compare(check_log(log), ())}
     if trial.part == "simulators":
         simulator = next(one for one in SIMULATORS if one.name == trial.name)
         check = check_plant(simulator.step, simulator.layout)
@@ -141,6 +154,8 @@ def plan_trials(parts: Iterable[Part], logs: int, seed: int, model: bool) -> lis
             trials += [Trial("faults", name, number, seed, model) for name in FAULTS]
     if "simulators" in parts:
         trials += [Trial("simulators", simulator.name, 0, seed, False) for simulator in SIMULATORS]
+    if "measured" in parts:
+        trials += [Trial("measured", name, 0, seed, False) for name in flights_at(DATA)]
     return trials
 
 
@@ -197,6 +212,13 @@ def write_page() -> None:
     fill_page(
         RESULTS / "check.md",
         "check",
+        measured=table(
+            "folder | logs | contradicted",
+            [
+                [folder, len(flown), sum(line["outcome"] != "exact" for line in flown)]
+                for folder, flown in by_folder(by_part["measured"]).items()
+            ],
+        ),
         clean=table("flight | logs | contradicted | 95 % upper bound | what", clean),
         faults=table(f"fault | {columns}", [*faults, outcomes("all", by_part["faults"])]),
         pairs=table(f"two faults | {columns}", [*two, outcomes("all", by_part["pairs"])]),
@@ -205,6 +227,14 @@ def write_page() -> None:
         seeds=", ".join(sorted({str(line["seed"]) for line in lines})),
         model="with" if any(line["model"] for line in lines) else "without",
     )
+
+
+def by_folder(lines: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """Return the lines of measured flights by their folder."""
+    folders: dict[str, list[dict[str, Any]]] = {}
+    for line in lines:
+        folders.setdefault(line["name"].partition("/")[0], []).append(line)
+    return folders
 
 
 def is_on_one(line: dict[str, Any]) -> bool:

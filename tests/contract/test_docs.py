@@ -29,6 +29,7 @@ RUN = (
     "pictures.md",
     "identification.md",
     "real_logs.md",
+    "check.md",
 )
 RUN = (FAST, *RUN, "diagnosis.md", "quick_start.md", "faq.md")
 

@@ -30,6 +30,7 @@ from flytrack_env.references import ReferenceFileError, load_reference, shipped_
 from flytrack_env.rollout import RolloutError, load_rollout, save_rollout
 from flytrack_env.tracks.track import TRACK_FOLDER
 from flytrack_sysid import LogError, import_log, log_file
+from flytrack_sysid.check import load_layout
 from flytrack_sysid.importing import load_mapping
 from flytrack_sysid.log import log_of_states
 from flytrack_sysid.manoeuvres import MANOEUVRES
@@ -53,6 +54,7 @@ TOKENS = (
     b"9" * 5000,
 )
 SETTINGS = b"total_timesteps = 2e6\nhidden_sizes = [64, 64]\nlearning_rate = 3e-4\n"
+LAYOUT = b"x0 = [0, 0, 5, 1, 0, 0, 0, 0, 0, 0, 0]\ndt = 0.01\nq = [3, 4, 5, 6]\nw = [7, 8, 9]\n"
 STATES = np.tile(black_boxes.start(), (12, 1))
 ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (12, 4))
 
@@ -181,6 +183,7 @@ KINDS = {
     "imported ArduPilot log": imported("DataFlash", ".bin"),
     "imported uSD log": imported("uSD", "", False),
     "imported bag": imported("bag", ".mcap"),
+    "layout": Kind(".toml", LAYOUT, load_layout, LogError, hostile_texts),
     "training settings": Kind(".toml", SETTINGS, read_config_file, ConfigError, hostile_texts),
     "checkpoint": Kind(CHAMPION.suffix, POLICY, load_checkpoint, CheckpointError),
     "black box": Kind(".bin", BLACK_BOX, blackbox.load, blackbox.BlackBoxError, is_slow=True),

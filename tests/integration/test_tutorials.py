@@ -41,6 +41,11 @@ def test_black_box(tmp_path, monkeypatch):
     assert names["rewards"].shape == (8,) and len(names["log"]) > 4000
 
 
+def test_contradiction_is_found_and_corrected(tmp_path, monkeypatch):
+    names = run_examples(tutorial("contradiction"), tmp_path, monkeypatch)
+    assert not names["fixed"].problems
+
+
 def test_flight_log(tmp_path, monkeypatch):
     names = run_examples(tutorial("flight_log"), tmp_path, monkeypatch)
     assert len(names["log"]) > 2500 and set(names["log"].channels) == {

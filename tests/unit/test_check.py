@@ -1,0 +1,475 @@
+"""The check of conventions: each changed channel is named, and right logs contradict nothing."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.check import is_same
+from benchmarks.seams.faults import FAULTS, Change, inject
+from benchmarks.seams.flight import make_flight
+from benchmarks.seams.simulators import SIMULATORS
+from flytrack_env.dynamics import nominal_parameters
+from flytrack_sysid.check import (
+    check_log,
+    check_plant,
+    plant,
+    problems_of,
+    text_of,
+    write_check,
+)
+from flytrack_sysid.check.explain import Edges, explain
+from flytrack_sysid.check.frames import (
+    FRAMES,
+    IDENTITY,
+    INVERSE,
+    NUM_FRAMES,
+    PRODUCT,
+    READINGS,
+    UP_OF,
+    name_of,
+    number_of,
+)
+from flytrack_sysid.check.pairs import AGREES, CONTRADICTS, MANOEUVRES, STILL, compare_pairs
+from flytrack_sysid.check.samples import sample_changes
+from flytrack_sysid.check.thrust import motor_changes, thrust_changes
+from flytrack_sysid.log import FlightLog
+
+KINDS = ("race", "excitation", "gentle", "hover")
+FRD, NED = "x -y -z", "y x -z"
+SEED, LENGTH_S = 0, 20.0  # logged at 100 Hz
+
+
+@pytest.fixture(scope="module")
+def flights():
+    """A flight of each kind."""
+    return {kind: make_flight(SEED, LENGTH_S, kind) for kind in KINDS}
+
+
+@pytest.fixture(scope="module")
+def checks(flights):
+    """The checks of these flights."""
+    return {kind: check_log(flight.log, None, flight.motors) for kind, flight in flights.items()}
+
+
+@pytest.fixture(scope="module")
+def turned_gyro(flights):
+    """A race whose gyroscope is FRD, and its check."""
+    log = changed(flights["race"], Change("w", "axes", FRD)).log
+    return log, check_log(log)
+
+
+def changed(flight, *changes):
+    """Return a flight with changes of its log."""
+    return inject(np.random.default_rng(1), flight, frozenset(changes))
+
+
+def with_channels(log, **channels):
+    """Return a log with some channels replaced."""
+    return replace(log, channels={**log.channels, **channels})
+
+
+def model_of(craft):
+    """Return a model with a craft's lags and full rates."""
+    return nominal_parameters()._replace(
+        max_rate=np.array(craft.max_rate), tau=np.array(craft.lags)
+    )
+
+
+def verdicts(check):
+    """Return the verdict on each pair."""
+    return {pair.name: pair.verdict for pair in check.pairs}
+
+
+# --- frames ---------------------------------------------------------------------------------------
+
+
+def test_frames_are_the_signed_permutations():
+    assert len({frame.tobytes() for frame in FRAMES + 0.0}) == NUM_FRAMES == 48
+    np.testing.assert_array_equal(np.abs(FRAMES).sum(axis=1), 1.0)
+    np.testing.assert_array_equal(np.abs(FRAMES).sum(axis=2), 1.0)
+    np.testing.assert_array_equal(FRAMES[IDENTITY], np.eye(3))
+
+
+def test_frames_are_a_group():
+    products = np.einsum("aij,bjk->abik", FRAMES, FRAMES)
+    np.testing.assert_array_equal(FRAMES[PRODUCT], products)
+    np.testing.assert_array_equal(PRODUCT[np.arange(NUM_FRAMES), INVERSE], IDENTITY)
+
+
+def test_name_of_a_frame_lists_the_true_axis_in_each_column():
+    true = np.array([1.0, 2.0, 3.0])
+    names = [name_of(number) for number in range(NUM_FRAMES)]
+    assert len(set(names)) == NUM_FRAMES
+    for name, logged in zip(names, FRAMES @ true, strict=True):
+        signed = [
+            (-1.0 if "-" in axis else 1.0) * (1 + "xyz".index(axis[-1])) for axis in name.split()
+        ]
+        np.testing.assert_array_equal(logged, signed)
+
+
+@pytest.mark.parametrize("number", range(len(READINGS)))
+def test_reading_of_a_quaternion_undoes_how_it_was_logged(number):
+    reading, right = READINGS[number], np.array([[0.1, 0.2, 0.3, 0.4], [0.5, 0.6, 0.7, 0.8]])
+    signs = [1.0, -1.0, -1.0, -1.0] if reading.is_conjugate else 1.0
+    logged = (right * signs)[:, ["wxyz".index(letter) for letter in reading.order]]
+    np.testing.assert_allclose(reading.correct(logged), right)
+
+
+# --- likelihoods ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def planar():
+    """Position and velocity of a motion along x and y, with noise."""
+    rng, time = np.random.default_rng(3), 0.01 * np.arange(2000)
+    vel = np.stack([2.0 * np.sin(1.3 * time), 1.5 * np.cos(0.9 * time), 0.0 * time], axis=1)
+    pos = np.cumsum(0.01 * vel, axis=0)
+    channels = {
+        "u": np.zeros((len(time), 4)),
+        "p": pos + rng.normal(0.0, 0.005, pos.shape),
+        "v": vel + rng.normal(0.0, 0.02, vel.shape),
+    }
+    return FlightLog(time, channels, np.zeros(len(time), int))
+
+
+def position_pair(log):
+    """Return the pair of position and velocity, and the frames it allows."""
+    compared = compare_pairs(log)
+    return next(pair for pair in compared.pairs if pair.name == "p and v"), compared.edges.positions
+
+
+def test_sign_of_an_axis_without_motion_is_unseen(planar):
+    pair, is_allowed = position_pair(planar)
+    assert (pair.verdict, pair.unseen) == (AGREES, ("z",))
+    assert is_allowed[IDENTITY] and is_allowed[number_of(np.diag([1.0, 1.0, -1.0]))]
+    assert sum(is_allowed) == 2
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_mirrored_axis_is_excluded(planar, axis):
+    signs = np.where(np.arange(3) == axis, -1.0, 1.0)
+    pair, is_allowed = position_pair(with_channels(planar, v=signs * planar["v"]))
+    assert pair.verdict == CONTRADICTS and pair.evidence > 10.0
+    assert not is_allowed[IDENTITY] and is_allowed[number_of(np.diag(signs))]
+    assert pair.correlations[axis] < -0.9
+
+
+def test_without_any_motion_nothing_is_compared(planar):
+    rng = np.random.default_rng(4)
+    noise = {name: rng.normal(0.0, 0.005, planar[name].shape) for name in ("p", "v")}
+    pair, is_allowed = position_pair(with_channels(planar, **noise))
+    assert (pair.verdict, pair.unseen) == (STILL, ("x", "y", "z"))
+    assert is_allowed.all()
+
+
+def test_fault_of_half_a_log_is_no_convention(planar):
+    is_first = np.arange(len(planar))[:, None] < len(planar) // 2
+    log = with_channels(planar, v=np.where(is_first, -planar["v"], planar["v"]))
+    pair, is_allowed = position_pair(log)
+    assert pair.verdict != CONTRADICTS and is_allowed[IDENTITY]
+    assert not check_log(log).contradicts
+
+
+# --- explanations ---------------------------------------------------------------------------------
+
+
+def edges_of(**logged):
+    """Return what pairs allow if channels were logged in such frames, and the motion shows all.
+
+    Attitudes are of "body" and "world"; other names are channels.
+    """
+    number = dict.fromkeys(("body", "world", "u_rates", "w", "f", "v", "p"), IDENTITY)
+    number |= {name: index_of(frame) for name, frame in logged.items()}
+
+    def only(shape, *where):
+        values = np.zeros(shape, bool)
+        values[where] = True
+        return values
+
+    def relative(one, other):
+        return PRODUCT[number[one], INVERSE[number[other]]]
+
+    count = len(READINGS)
+    world, body = relative("world", "v"), relative("body", "f")
+    return Edges(
+        rates=only((count, NUM_FRAMES), 0, relative("body", "w")),
+        forces=only((count, 6, NUM_FRAMES, NUM_FRAMES), 0, UP_OF[number["world"]], world, body),
+        positions=only(NUM_FRAMES, relative("p", "v")),
+        commands=only(NUM_FRAMES, relative("w", "u_rates")),
+        force_up=only(6, UP_OF[number["f"]]),
+    )
+
+
+def index_of(name):
+    """Return the number of a frame by its name."""
+    return [name_of(number) for number in range(NUM_FRAMES)].index(name)
+
+
+ALL = frozenset({"q", "u_rates", "w", "f", "v", "p"})
+ALONE = [
+    *[(name, frame) for name in ("w", "v") for frame in ("-x y z", "y x z", FRD)],
+    *[("f", "y x z"), ("p", NED), ("u_rates", "x y -z"), ("body", FRD), ("world", NED)],
+]
+
+
+@pytest.mark.parametrize(("name", "frame"), ALONE)
+def test_one_changed_channel_is_named_alone(name, frame):
+    """Velocity and gyroscope are in two pairs each, attitude too."""
+    is_attitude = name in ("body", "world")
+    change = Change("q", name, frame) if is_attitude else Change(name, "axes", frame)
+    simplest, *others = explain(ALL, edges_of(**{name: frame}))
+    assert simplest.changes() == (change,)
+    assert all(len(one.changes()) == 1 for one in others)
+
+
+def test_right_channels_have_no_changes():
+    assert [one.changes() for one in explain(ALL, edges_of())] == [()]
+
+
+def test_two_changed_channels_are_named():
+    simplest, *_ = explain(ALL, edges_of(w="x y -z", p="y x z"))
+    assert set(simplest.changes()) == {Change("w", "axes", "x y -z"), Change("p", "axes", "y x z")}
+
+
+@pytest.mark.parametrize("world", [FRD, NED])
+def test_log_that_is_all_frd_and_ned_is_named_so(world):
+    bodies = dict.fromkeys(("body", "w", "f", "u_rates"), FRD)
+    worlds = dict.fromkeys(("world", "v", "p"), world)
+    # A world that is turned about z as a whole shows in no pair: NED may be north, west, down.
+    everything = [set(one.changes()) for one in explain(ALL, edges_of(**bodies, **worlds))]
+    assert all(len(changes) == 7 for changes in everything[:2])
+    assert {
+        *[Change("q", "body", FRD), Change("q", "world", world)],
+        *[Change(name, "axes", FRD) for name in ("w", "f", "u_rates")],
+        *[Change(name, "axes", world) for name in ("v", "p")],
+    } in everything
+
+
+def test_channels_that_cannot_be_told_apart_are_alternatives():
+    free = edges_of(w=FRD)
+    everything = {name: np.ones_like(getattr(free, name)) for name in Edges._fields}
+    edges = Edges(**{**everything, "rates": free.rates})
+    changes = [one.changes() for one in explain(frozenset({"q", "w"}), edges)]
+    assert sorted(changes) == [(Change("q", "body", FRD),), (Change("w", "axes", FRD),)]
+
+
+# --- faults of flights ----------------------------------------------------------------------------
+
+REPRESENTATIVE = {  # and how many explanations are alike
+    **dict.fromkeys(("w in deg/s", "f in g", "p in mm", "v in km/h", "v_bat in mV"), 1),
+    **dict.fromkeys(("w sign", "f frame", "v swapped", "p frame", "u_rates frame"), 1),
+    **dict.fromkeys(("q order", "q conjugate", "q body", "q world"), 1),
+    **dict.fromkeys(("u delay", "q delay", "v delay", "w held", "rows repeated"), 1),
+    "all NED and FRD": 2,
+    "u_rates curve": 3,
+}
+
+
+@pytest.mark.parametrize("fault", REPRESENTATIVE)
+def test_fault_gives_its_change_and_no_other(flights, fault):
+    race = flights["race"]
+    truth = FAULTS[fault](np.random.default_rng(0), float(race.log.time[1]))
+    faulty = changed(race, *truth)
+    found = check_log(faulty.log, model_of(race.craft), faulty.motors)
+    assert 1 <= len(found.explanations) <= REPRESENTATIVE[fault]
+    right = [
+        changes
+        for changes in found.explanations
+        if len(changes) == len(truth)
+        and all(any(is_same(change, true) for change in changes) for true in truth)
+    ]
+    assert len(right) == 1, found.explanations
+
+
+@pytest.mark.parametrize("faults", [("w in deg/s", "v frame"), ("q order", "u_rates sign")])
+def test_two_faults_give_both_changes(flights, faults):
+    rng = np.random.default_rng(2)
+    truth = frozenset().union(*(FAULTS[fault](rng, 0.01) for fault in faults))
+    (changes,) = check_log(changed(flights["race"], *truth).log).explanations
+    assert len(changes) == len(truth) == 2
+    assert all(any(is_same(change, true) for change in changes) for true in truth)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_right_flight_contradicts_nothing(checks, kind):
+    check = checks[kind]
+    assert check.explanations == () and not check.contradicts and problems_of(check) == []
+    assert CONTRADICTS not in verdicts(check).values()
+
+
+def test_race_shows_all_pairs(checks):
+    assert set(verdicts(checks["race"]).values()) == {AGREES}
+    assert len(checks["race"].pairs) == 5
+
+
+def test_hover_says_what_to_fly(checks):
+    still = [pair.name for pair in checks["hover"].pairs if pair.verdict == STILL]
+    assert {"v, f and q", "u and w"} <= set(still)
+    text = text_of(checks["hover"])
+    assert all(MANOEUVRES[name] in text for name in still)
+    assert not any(MANOEUVRES[name] in text_of(checks["race"]) for name in still)
+
+
+def test_corrected_log_is_the_right_one(flights, turned_gyro):
+    _, check = turned_gyro
+    np.testing.assert_array_equal(check.corrected["w"], flights["race"].log["w"])
+    assert {pair.verdict for pair in check.after} == {AGREES}
+
+
+def test_model_with_other_full_rates_is_remarked(flights):
+    race = flights["race"]
+    model = model_of(race.craft)
+    assert check_log(race.log, model).remarks == ()
+    doubled = model._replace(max_rate=2.0 * model.max_rate)
+    check = check_log(race.log, doubled)
+    assert check.remarks and not check.contradicts
+
+
+# --- samples --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("channel", ["w", "f", "q", "v", "p"])
+@pytest.mark.parametrize("rows", [3, 10])
+def test_held_samples(flights, channel, rows):
+    log = changed(flights["race"], Change(channel, "held", rows)).log
+    assert sample_changes(log) == [Change(channel, "held", rows)]
+
+
+@pytest.mark.parametrize("share", [0.05, 0.1])
+def test_repeated_rows(flights, share):
+    (change,) = sample_changes(changed(flights["race"], Change("rows", "repeated", share)).log)
+    assert change[:2] == ("rows", "repeated") and abs(change.value / share - 1.0) < 0.3
+
+
+@pytest.mark.parametrize("every", [2, 3])
+def test_log_faster_than_its_sensors_repeats_no_rows(flights, every):
+    log = flights["race"].log
+    rows = np.arange(len(log))
+    slow = replace(log.select(rows - rows % every), time=log.time)
+    assert "repeated" not in [change.kind for change in sample_changes(slow)]
+
+
+def test_heading_interpolated_across_its_wrap(flights):
+    wrapped = Change("q", "wrapped", True)
+    assert sample_changes(changed(flights["race"], wrapped).log) == [wrapped]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_samples_of_right_flights(flights, kind):
+    assert sample_changes(flights[kind].log) == []
+
+
+# --- thrust and motors ----------------------------------------------------------------------------
+
+THRUSTS = [("range", "pwm"), ("range", "0..1"), ("axes", "-")]
+
+
+@pytest.mark.parametrize("has_force", [True, False])
+@pytest.mark.parametrize("kind", ["race", "excitation"])
+def test_range_and_sign_of_thrust(flights, kind, has_force):
+    def found(log):
+        return thrust_changes(log if has_force else log.without("f"))
+
+    assert found(flights[kind].log) == []
+    for how, value in THRUSTS:
+        change = Change("u_thrust", how, value)
+        assert found(changed(flights[kind], change).log) == [change]
+
+
+@pytest.mark.parametrize("kind", ["race", "excitation"])
+def test_order_of_motors(flights, kind):
+    flight = flights[kind]
+    assert motor_changes(flight.log, flight.motors) == [()]
+    for order in ("2 1 3 4", "4 2 3 1", "1 3 2 4"):
+        swapped = Change("motors", "order", order)
+        motors = changed(flight, swapped).motors
+        assert motor_changes(flight.log, motors) == [(swapped,)]
+
+
+# --- plants ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["the handout", "crazyflow", "AirSim"])
+def test_conventions_of_a_plant(name, monkeypatch):
+    monkeypatch.setattr(plant, "NUM_EPISODES", 20)  # a third, for these plants are slow
+    (simulator,) = (one for one in SIMULATORS if one.name == name)
+    found = check_plant(simulator.step, simulator.layout).explanations
+    if not simulator.expected:
+        assert found == ()
+    else:
+        assert set(simulator.expected) in [set(changes) for changes in found]
+
+
+# --- reports --------------------------------------------------------------------------------------
+
+
+def refuse(constant):
+    """Fail on NaN and infinities, which JSON does not have."""
+    raise AssertionError(constant)
+
+
+def test_files_of_a_contradiction(tmp_path, turned_gyro):
+    log, check = turned_gyro
+    contradicting = {name for name, verdict in verdicts(check).items() if verdict == CONTRADICTS}
+    assert contradicting == {"q and w", "u and w"}
+    paths = write_check(tmp_path, check, log)
+    assert sorted(paths) == sorted(tmp_path.iterdir())
+    content = json.loads((tmp_path / "check.json").read_text(), parse_constant=refuse)
+    assert content["contradicts"] is True
+    assert {pair["name"]: pair["verdict"] for pair in content["pairs"]} == verdicts(check)
+    ((change,),) = content["explanations"]
+    assert (change["channel"], change["kind"], change["value"]) == ("w", "axes", FRD)
+    assert (tmp_path / "check.txt").read_text() == text_of(check) + "\n"
+    html = (tmp_path / "check.html").read_text()
+    assert all(pair.name in html for pair in check.pairs) and change["text"] in html
+    pictures = {path.stem: path.read_bytes() for path in tmp_path.glob("*.png")}
+    assert set(pictures) == {"q_and_w", "u_and_w"}
+    assert all(picture.startswith(b"\x89PNG") for picture in pictures.values())
+
+
+def test_files_of_a_flight_that_shows_little(tmp_path, flights, checks):
+    write_check(tmp_path, checks["hover"], flights["hover"].log)
+    content = json.loads((tmp_path / "check.json").read_text(), parse_constant=refuse)
+    assert content["contradicts"] is False and content["explanations"] == []
+    assert {path.name for path in tmp_path.iterdir()} == {"check.json", "check.txt", "check.html"}
+
+
+def test_text_names_pairs_verdicts_and_the_channel(turned_gyro):
+    _, check = turned_gyro
+    lines = text_of(check).splitlines()
+    for pair in check.pairs:
+        (line,) = (line for line in lines if line.startswith(f"{pair.name}  "))
+        assert pair.verdict in line
+    assert any("w_x, w_y, w_z: " in line for line in lines)
+    (problem,) = problems_of(check)
+    assert "w_x, w_y, w_z: " in problem
+
+
+# --- logs that show less --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("missing", ["p", "v", "q", "f", "w", "p v q", "p v q w f v_bat"])
+def test_missing_channels_are_not_compared(flights, missing):
+    log = flights["race"].log
+    for channel in missing.split():
+        log = log.without(channel)
+    check = check_log(log)
+    assert check.explanations == ()
+    compared = {name for pair in check.pairs for name in pair.name.replace(",", "").split()}
+    assert not compared & set(missing.split())
+
+
+@pytest.mark.parametrize("constant", ["p", "v", "q", "w", "f", "u", "p v q w f u v_bat"])
+def test_constant_channels_name_nothing(flights, constant):
+    log = flights["race"].log
+    first = {name: np.tile(log[name][:1], (len(log), 1)) for name in constant.split()}
+    assert check_log(with_channels(log, **first)).explanations == ()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_short_logs_name_nothing(flights, kind):
+    log = flights[kind].log
+    for length_s in (0.5, 3.0):
+        assert check_log(log.select(log.time < length_s)).explanations == ()
