@@ -197,18 +197,18 @@ def offset_between(
         return *unknown, f"not compared: less than {MIN_BLOCKS * BLOCK_S:g} s without a gap"
     if any(not np.ptp(values, axis=0).any() for values in (sums, rates)):
         # All offsets fit a constant signal equally well, so rounding would choose the reason.
-        return *unknown, "not compared: correlation 0.00: they do not show one motion clearly"
+        return *unknown, "offset unknown: correlation 0.00: they do not show one motion clearly"
     # Windows keep the largest offset away from the ends of the data; the grid stays within it.
     grid = np.arange(-MAX_OFFSET_S + GRID_S, MAX_OFFSET_S - GRID_S / 2, GRID_S)
     best = int(np.argmin(_costs(stretches, grid)))
     if best in (0, len(grid) - 1):
-        return *unknown, f"not compared: they agree at no offset within {MAX_OFFSET_S:g} s"
+        return *unknown, f"offset unknown: they agree at no offset within {MAX_OFFSET_S:g} s"
     offset = float(grid[best])
     for _ in range(ROUNDS):
         numerator, denominator, correlation = _sums(stretches, offset)
         if denominator.sum() == 0.0 or correlation < MIN_CORRELATION:
             reason = f"correlation {correlation:.2f}: they do not show one motion clearly"
-            return *unknown, f"not compared: {reason}"
+            return *unknown, f"offset unknown: {reason}"
         offset = float(np.clip(offset + numerator.sum() / denominator.sum(), grid[0], grid[-1]))
     numerator, denominator, correlation = _sums(stretches, offset)
     if np.any(denominator.sum() - denominator <= 0.0):

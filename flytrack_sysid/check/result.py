@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
+from flytrack_env.thrust import hover_action
 from flytrack_sysid.check.commands import curve_changes, mean_delay, responses, thinned
 from flytrack_sysid.check.explain import Change, Explanation, explain
 from flytrack_sysid.check.frames import FRAMES, IDENTITY, READINGS
@@ -14,9 +15,9 @@ from flytrack_sysid.check.motion import MARGIN, RATE_FLOOR, compare
 from flytrack_sysid.check.pairs import CONTRADICTS, Compared, Pair, compare_pairs
 from flytrack_sysid.check.samples import sample_changes
 from flytrack_sysid.check.scales import scale_changes
-from flytrack_sysid.check.thrust import motor_changes, thrust_changes
+from flytrack_sysid.check.thrust import hover_command, motor_changes, thrust_changes
 from flytrack_sysid.check.timing import late_sensors
-from flytrack_sysid.kinematics import read_at, summed_turns
+from flytrack_sysid.kinematics import GRAVITY, read_at, summed_turns
 from flytrack_sysid.log import FlightLog
 
 MAX_ALTERNATIVES = 8
@@ -26,7 +27,8 @@ ALIKE = 0.8  # of the log-likelihood of another reading
 # radios, filters and motors take (measured flights: up to 90 ms).
 LATE_S, LATEST_S = 0.018, 0.15
 STICKS = ("roll", "pitch", "yaw")
-CLEAR, MAX_RATE_ERROR = 0.98, 0.06  # correlation, and relative error, of a full-stick rate
+MAX_HOVER_ERROR = 0.15  # thrust command: voltage and drag move it by less
+CLEAR, MAX_RATE_ERROR = 0.995, 0.1  # correlation, and relative error, of a full-stick rate
 LIKELY_BATTERY_V, HIGHEST_BATTERY_V = (2.5, 70.0), 100.0
 BATTERY_UNITS = (1000.0, 100.0, 10.0)
 
@@ -179,18 +181,31 @@ def constants_that_differ(log: FlightLog, model: ModelParameters) -> tuple[str, 
         log: with right axes and scales.
         model: a model of the craft.
     """
-    if "w" not in log or not np.ptp(log["u"][:, :3], axis=0).any():
-        return ()
     sentences = []
-    for name, response, stated in zip(
-        STICKS, responses(thinned(log)), np.asarray(model.max_rate, float), strict=True
-    ):
+    is_turning = "w" in log and np.ptp(log["u"][:, :3], axis=0).any()
+    found_rates = responses(thinned(log)) if is_turning else []
+    for name, response, stated in zip(STICKS, found_rates, model.max_rate, strict=False):
         found = float(np.rad2deg(response.full_stick))
-        if response.correlation > CLEAR and abs(found / stated - 1.0) > MAX_RATE_ERROR:
+        if response.correlation > CLEAR and abs(found / float(stated) - 1.0) > MAX_RATE_ERROR:
             sentences.append(
                 f"full stick of {name} gives {found:.0f} deg/s in this log, the model says "
-                f"{stated:.0f}"
+                f"{float(stated):.0f}"
             )
+    battery = model.battery
+    middle_v = 0.5 * (battery.empty_v + battery.full_v)
+    volts = float(np.median(log["v_bat"])) if "v_bat" in log else float(middle_v)
+    expected = hover_action(model.thrust_coeffs, float(model.m) * GRAVITY, volts)
+    hover = hover_command(log)
+    if hover is not None and abs(hover - expected) > MAX_HOVER_ERROR:
+        sentences.append(
+            f"the hover is at a thrust command of {hover:+.2f} in this log, the model says "
+            f"{expected:+.2f} at {volts:.1f} V"
+        )
+    if "v_bat" in log and not battery.empty_v * 0.9 < volts < battery.full_v * 1.1:
+        sentences.append(
+            f"the battery has {volts:.1f} V in this log, the model's {battery.empty_v:.1f} to "
+            f"{battery.full_v:.1f}"
+        )
     return tuple(sentences)
 
 

@@ -1,6 +1,7 @@
 """The thrust command against the force along the body's z axis, and motors against the rotation."""
 
 import itertools
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,6 +14,7 @@ from flytrack_sysid.log import FlightLog
 
 DELAYS_S = np.arange(0.0, 0.15, GRID_S)  # of the force behind the command
 MIN_CORRELATION = 0.5  # of the force with the command, on either side of 0
+CLEAR, FLOWN = 0.9, (0.02, 0.98)  # correlation, and quantiles of the commands, for the hover
 MIN_SPREAD = 0.5  # m/s^2, rms of the force about its mean: less is drag and noise
 PWM = (900.0, 2200.0)  # us, all that flight controllers use
 # Command of no thrust: -1 in a range of -1 to 1, 0 in one of 0 to 1. Idling motors make it lower.
@@ -39,35 +41,71 @@ def force_along_z(log: FlightLog, windows: Windows) -> np.ndarray | None:
     return np.sum((changes + UP * GRAVITY) * windows.mean_of(log, up_w), axis=1)
 
 
-def thrust_changes(log: FlightLog) -> list[Change]:
-    """Return what differs in the thrust command: its range or its sign."""
+class Followed(NamedTuple):
+    """The force along the body's z axis, and the thrust command that it follows.
+
+    Attributes:
+        commands: with the dead time that fits best, (num_windows,).
+        force: specific, (num_windows,) m/s^2.
+        correlation: of both; negative for a command that is upside down.
+    """
+
+    commands: np.ndarray
+    force: np.ndarray
+    correlation: float
+
+
+def follow_thrust(log: FlightLog) -> Followed | None:
+    """Return how the force follows the thrust command; None if the log does not show it."""
     thrust = log["u"][:, 3:]
-    low, high = np.min(thrust), np.max(thrust)
-    if low >= PWM[0] and high <= PWM[1]:
-        return [Change("u_thrust", "range", "pwm")]
     windows = cut_windows(log, WINDOWS_S[0])
     force = force_along_z(log, windows) if len(windows.starts) else None
     if force is None or np.std(force) < MIN_SPREAD or not np.ptp(thrust):
-        return []
-    best, follows = 0.0, thrust[:, 0]
+        return None
+    found = []
     for delay_s in DELAYS_S:
-        followed = windows.mean_of(log, follow(log, thrust, delay_s, 0.0))[:, 0]
-        correlation = float(np.corrcoef(followed, force)[0, 1])
-        if abs(correlation) > abs(best):
-            best, follows = correlation, followed
-    if best < -MIN_CORRELATION:
-        return [Change("u_thrust", "axes", "-")]
-    if best < MIN_CORRELATION:
+        commands = windows.mean_of(log, follow(log, thrust, delay_s, 0.0))[:, 0]
+        correlation = float(np.corrcoef(commands, force)[0, 1])
+        found.append(Followed(commands, force, correlation))
+    return max(found, key=lambda one: abs(one.correlation))
+
+
+def thrust_changes(log: FlightLog) -> list[Change]:
+    """Return what differs in the thrust command: its range or its sign."""
+    low, high = np.min(log["u"][:, 3]), np.max(log["u"][:, 3])
+    if low >= PWM[0] and high <= PWM[1]:
+        return [Change("u_thrust", "range", "pwm")]
+    found = follow_thrust(log)
+    if found is None or abs(found.correlation) < MIN_CORRELATION:
         return []
+    if found.correlation < 0.0:
+        return [Change("u_thrust", "axes", "-")]
     # Thrust is between linear and quadratic in the command above that of no thrust.
     errors = {}
     for zero in (-1.0, 0.0):
-        above = np.maximum(follows - zero, 0.0)
+        above = np.maximum(found.commands - zero, 0.0)
         design = np.stack([above, above**2], axis=1)
-        weights = np.maximum(np.linalg.lstsq(design, force, rcond=None)[0], 0.0)
-        errors[zero] = float(np.sum((force - design @ weights) ** 2))
-    nats = 0.5 * weight_of(WINDOWS_S[0]) * len(force) * np.log(errors[-1.0] / errors[0.0])
+        weights = np.maximum(np.linalg.lstsq(design, found.force, rcond=None)[0], 0.0)
+        errors[zero] = float(np.sum((found.force - design @ weights) ** 2))
+    nats = 0.5 * weight_of(WINDOWS_S[0]) * len(found.force) * np.log(errors[-1.0] / errors[0.0])
     return [Change("u_thrust", "range", "0..1")] * bool(nats > MARGIN)
+
+
+def hover_command(log: FlightLog) -> float | None:
+    """Return the thrust command whose mean force is the weight; None where it is not flown.
+
+    The log has right axes, scales and commands.
+    """
+    found = follow_thrust(log)
+    if found is None or found.correlation < CLEAR:
+        return None
+    curve = np.polyfit(found.commands, found.force, 2)
+    low, high = np.quantile(found.commands, FLOWN)
+    tried = np.linspace(low, high, 201)
+    forces = np.maximum.accumulate(np.polyval(curve, tried))
+    if not forces[0] < GRAVITY < forces[-1]:
+        return None
+    return float(np.interp(GRAVITY, forces, tried))
 
 
 def motor_changes(log: FlightLog, motors: np.ndarray) -> list[tuple[Change, ...]]:
