@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
+from time import process_time
 from typing import Any, Literal, NamedTuple
 from zlib import crc32
 
@@ -224,9 +225,23 @@ def write_page() -> None:
         pairs=table(f"two faults | {columns}", [*two, outcomes("all", by_part["pairs"])]),
         simulators=table("simulator | expected | outcome | first explanation", simulators),
         errors=len(lines) - len(done),
+        seconds=", ".join(f"{one:.1f}" for one in cpu_seconds()),
         seeds=", ".join(sorted({str(line["seed"]) for line in lines})),
         model="with" if any(line["model"] for line in lines) else "without",
     )
+
+
+def cpu_seconds() -> list[float]:
+    """Return the CPU seconds of checks of a flight, clean and with its gyroscope in FRD, twice."""
+    flight = make_flight(100_000 * 53)
+    frd = Truth({Change("w", "axes", "x -y -z")})
+    logs = [flight.log, inject(np.random.default_rng(0), flight, frd).log]
+    seconds = []
+    for log in logs * 2:
+        start = process_time()
+        check_log(log)
+        seconds.append(process_time() - start)
+    return seconds
 
 
 def by_folder(lines: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:

@@ -26,6 +26,7 @@ NUM_PARTS = 2  # of a log: a convention is the same in both, a crash is not
 # bias of an accelerometer; of an attitude of 3 degrees, and drag), rad/s and m/s.
 FORCE_FLOOR, THRUST_FLOOR = 0.5, 1.0
 RATE_FLOOR, SPEED_FLOOR = 0.03, 0.03
+CONSTANT = 1e-6  # relative: a smaller change is rounding
 STILL = 1e-12  # in any unit squared: a smaller variance is none
 NOT_FLYING = -1e9  # nats of a frame in which the thrust does not hold the weight
 MAX_CORRELATION = 0.99999  # a better one has rounding for its noise
@@ -76,7 +77,7 @@ def useful_windows(log: FlightLog) -> Iterator[tuple[float, Windows]]:
 
 
 def correlations_of(shown: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Return the uncentred correlation of each axis with each, (3, 3); 0 without motion.
+    """Return the uncentred correlation of each axis with each, (3, 3); 0 for what never changes.
 
     Args:
         shown: (num_windows, 3).
@@ -84,7 +85,11 @@ def correlations_of(shown: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """
     sizes = np.sqrt(np.outer(np.sum(shown**2, axis=0), np.sum(measured**2, axis=0)))
     products = shown.T @ measured
-    return np.where(sizes > STILL, products / np.maximum(sizes, STILL), 0.0)
+    changes = [
+        np.ptp(one, axis=0) > CONSTANT * np.abs(one).max(axis=0) for one in (shown, measured)
+    ]
+    is_known = (sizes > STILL) & np.outer(*changes)
+    return np.where(is_known, products / np.maximum(sizes, STILL), 0.0)
 
 
 def by_frame(shown: np.ndarray, measured: np.ndarray, floor: float) -> np.ndarray:

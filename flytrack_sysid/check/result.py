@@ -12,7 +12,7 @@ from flytrack_sysid.check.commands import curve_changes, mean_delay, responses, 
 from flytrack_sysid.check.explain import Change, Explanation, explain
 from flytrack_sysid.check.frames import FRAMES, IDENTITY, READINGS
 from flytrack_sysid.check.motion import MARGIN, RATE_FLOOR, compare
-from flytrack_sysid.check.pairs import CONTRADICTS, Compared, Pair, compare_pairs
+from flytrack_sysid.check.pairs import CONTRADICTS, STILL, Compared, Pair, compare_pairs
 from flytrack_sysid.check.samples import sample_changes
 from flytrack_sysid.check.scales import scale_changes
 from flytrack_sysid.check.thrust import hover_command, motor_changes, thrust_changes
@@ -26,6 +26,12 @@ ALIKE = 0.8  # of the log-likelihood of another reading
 # Mean delay of the rates behind a command: with a model, beyond its lag; without, at most what
 # radios, filters and motors take (measured flights: up to 90 ms).
 LATE_S, LATEST_S = 0.018, 0.15
+PAIRS_OF = {  # that compare the size of a channel
+    "w": ("q and w",),
+    "f": ("v, f and q",),
+    "v": ("v, f and q", "p and v"),
+    "p": ("p and v",),
+}
 STICKS = ("roll", "pitch", "yaw")
 MAX_HOVER_ERROR = 0.15  # thrust command: voltage and drag move it by less
 CLEAR, MAX_RATE_ERROR = 0.995, 0.1  # correlation, and relative error, of a full-stick rate
@@ -169,9 +175,23 @@ def check_log(
     remarks = () if model is None else constants_that_differ(right, model)
     if not any(explanations) and not contradicted:
         return Check(log.source, compared.pairs, (), right, (), remarks)
-    pairs = found[0][2].pairs
+    pairs = with_wrong_sizes(found[0][2].pairs, explanations[0])
     after = compare_pairs(right).pairs
     return Check(log.source, pairs, tuple(dict.fromkeys(explanations)), right, after, remarks)
+
+
+def with_wrong_sizes(pairs: tuple[Pair, ...], changes: tuple[Change, ...]) -> tuple[Pair, ...]:
+    """Return pairs, of which those with a channel of wrong size contradict."""
+    wrong = {
+        name
+        for change in changes
+        if change.kind == "scale"
+        for name in PAIRS_OF.get(change.channel[:1], ())
+    }
+    return tuple(
+        pair._replace(verdict=CONTRADICTS) if pair.name in wrong and pair.verdict != STILL else pair
+        for pair in pairs
+    )
 
 
 def constants_that_differ(log: FlightLog, model: ModelParameters) -> tuple[str, ...]:

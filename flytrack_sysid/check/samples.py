@@ -13,7 +13,8 @@ MIN_REGULAR = 0.9  # share of the runs of equal values that are as long; slow mo
 MIN_REPEATED = 0.02  # share of rows that repeat all sensors between rows in which all move
 PERIODS, MAX_PERIODIC = (2, 3, 4), 0.8  # rows; share of such rows at a multiple from the one before
 MIN_JUMP = 0.2  # rad of a row more than the gyroscope turned by
-MIN_JUMPS = 2
+MIN_TURN, MIN_JUMPS = 2.0, 2  # rad in such rows together: almost a full turn; number of turns
+MAX_JUMPING = 0.1  # share of such rows: more are noise
 NEAR_WRAP = np.deg2rad(120.0)  # a heading that is interpolated across the wrap jumps from there
 
 
@@ -69,8 +70,11 @@ def is_wrapped(log: FlightLog) -> bool:
     measured = log["w"][1:] * usual_step(log)[1:, None]
     excess = np.linalg.norm(turns, axis=1) - np.linalg.norm(measured, axis=1)
     is_jump = (excess > MIN_JUMP) & ~log.is_start()[1:]
-    starts = np.flatnonzero(np.diff(is_jump.astype(int), prepend=0) == 1)
-    if len(starts) < MIN_JUMPS:
+    edges = np.diff(is_jump.astype(int), prepend=0, append=0)
+    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    summed = np.concatenate([[0.0], np.cumsum(excess)])
+    starts = starts[summed[ends] - summed[starts] > MIN_TURN]
+    if len(starts) < MIN_JUMPS or is_jump.mean() > MAX_JUMPING:
         return False
     w, x, y, z = log["q"][starts].T  # the row before each jump
     heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from flytrack_sysid.check.explain import Change
+from flytrack_sysid.check.motion import MARGIN
 from flytrack_sysid.check.pairs import CONTRADICTS, STILL, Pair
 from flytrack_sysid.check.result import Check
 from flytrack_sysid.check.scales import unit_of
@@ -83,8 +84,10 @@ def row_of(pair: Pair) -> list[str]:
     remark = ""
     if pair.verdict == STILL:
         remark = f"fly: {pair.manoeuvre}"
-    elif pair.verdict == CONTRADICTS and pair.evidence == pair.evidence:
+    elif pair.verdict == CONTRADICTS and pair.evidence > MARGIN:
         remark = f"another reading is e^{pair.evidence:.0f} times as likely"
+    elif pair.verdict == CONTRADICTS and pair.correlations:
+        remark = "sizes differ"
     elif pair.unseen:
         remark = f"the sign of {', '.join(pair.unseen)} does not show"
     return [pair.name, pair.verdict, numbers, remark]

@@ -8,6 +8,7 @@ from flytrack_sysid import import_log
 from flytrack_sysid.check import Change, check_log
 from flytrack_sysid.check.fix import fix_mapping
 from flytrack_sysid.log import CHANNELS, LogError
+from tests.support.slow import slow_but
 
 CHANNELS_USED = ("u", "p", "v", "q", "w", "f", "v_bat")
 MAPPING = """[time]
@@ -83,7 +84,7 @@ def read(csv_file, folder, text):
     return import_log(csv_file, "csv", mapping, align=False).log
 
 
-@pytest.mark.parametrize("wrong", WRONG)
+@pytest.mark.parametrize("wrong", slow_but(["order", "force in g", "gyro and velocity"], WRONG))
 def test_a_wrong_word_is_corrected(tmp_path, csv_file, right, wrong):
     text = MAPPING
     for right_word, wrong_word in WRONG[wrong]:
