@@ -218,6 +218,7 @@ HIGHEST_SETTING = 0.95
 MIN_STICK = 0.4  # deflection that shows a curve
 MIN_BENT = 1.3  # times: the residual variance of the stick over that of the stick and its cube
 MIN_BETTER = 2.0  # times: the residual variance without a curve over that with it
+ALIKE = 0.1  # of the log-likelihood that a curve gains: the lag is not known better
 MIN_FOLLOWED = 0.9  # correlation of rates with commands that are understood
 
 
@@ -242,7 +243,9 @@ def curve_changes(log: FlightLog, found: list[Response]) -> list[Change]:
             for name, value in left.items():
                 nats[name] += 0.5 * count * float(np.log(straight / value))
     best = max(nats.values())
-    alike = sorted((-value, name) for name, value in nats.items() if value > best - MARGIN)
+    alike = sorted(
+        (-value, name) for name, value in nats.items() if value > best - max(MARGIN, ALIKE * best)
+    )
     return [] if best < MARGIN else [Change("u_rates", "curve", name) for _, name in alike]
 
 

@@ -23,9 +23,11 @@ from flytrack_sysid.log import FlightLog
 MAX_ALTERNATIVES = 8
 NO_SCALES: list[tuple[Change, ...]] = [()]
 ALIKE = 0.8  # of the log-likelihood of another reading
-# Mean delay of the rates behind a command: with a model, beyond its lag; without, at most what
-# radios, filters and motors take (measured flights: up to 90 ms).
-LATE_S, LATEST_S = 0.018, 0.15
+# Rates that come before their command by more than this were not caused by it: it was logged late.
+LATE_S = 0.018  # beyond a model's lag; the lag of a craft is known to some 15 ms
+# Rates that follow later: with a model, beyond its lag (a dead time below is a matter for the
+# diagnosis); without, beyond what radios, filters and motors take (measured flights: 90 ms).
+LATER_S, LATEST_S = 0.05, 0.15
 PAIRS_OF = {  # that compare the size of a channel
     "w": ("q and w",),
     "f": ("v, f and q",),
@@ -129,8 +131,7 @@ def command_changes(log: FlightLog, model: ModelParameters | None) -> list[tuple
         halves = [log.select(half), log.select(~half)]
         by_half = [mean_delay(part, responses(part), expected) for part in halves]
         delay_s *= all(abs(one - delay_s) < max(LATE_S, 0.3 * abs(delay_s)) for one in by_half)
-    # Rates that come before their command were not caused by it: the command was logged late.
-    is_late = delay_s > (LATEST_S if model is None else LATE_S) or -delay_s > LATE_S
+    is_late = delay_s > (LATEST_S if model is None else LATER_S) or -delay_s > LATE_S
     late = [Change("u", "delay", -delay_s)] * is_late
     return [tuple(late)]
 

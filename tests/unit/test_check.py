@@ -402,15 +402,12 @@ def test_order_of_motors(flights, kind):
 # --- plants ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "episodes"),
-    slow_but(
-        [("crazyflow", 20)],
-        [("the handout", 20), ("crazyflow", 20), ("AirSim", plant.NUM_EPISODES)],
-    ),
-)
-def test_conventions_of_a_plant(name, episodes, monkeypatch):
-    monkeypatch.setattr(plant, "NUM_EPISODES", episodes)
+EPISODES = {"the handout": 20, "crazyflow": 20, "AirSim": plant.NUM_EPISODES}
+
+
+@pytest.mark.parametrize("name", slow_but(["crazyflow"], EPISODES))
+def test_conventions_of_a_plant(name, monkeypatch):
+    monkeypatch.setattr(plant, "NUM_EPISODES", EPISODES[name])
     (simulator,) = (one for one in SIMULATORS if one.name == name)
     found = check_plant(simulator.step, simulator.layout).explanations
     if not simulator.expected:
