@@ -5,6 +5,7 @@ and taken back, with a turn about z, under some thrust.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +19,7 @@ from flytrack_env.state import BATTERY, POSITION, QUATERNION, RATES, STATE_SIZE,
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
 from flytrack_env.validation import Fields, Finite, Positive, convert
 from flytrack_sysid.check.result import Check, check_log
+from flytrack_sysid.check.thrust import hover_command
 from flytrack_sysid.log import FlightLog, LogError
 
 Step = Callable[[np.ndarray, np.ndarray], np.ndarray | None]
@@ -151,7 +153,7 @@ def check_plant(
         layout: of the state, or a dictionary of its fields; the handout's if None.
         seed: of the excitation.
     """
-    return check_log(fly(step, _layout(layout), seed))
+    return _with_hover(check_log(fly(step, _layout(layout), seed)))
 
 
 def check_environment(environment: Any, layout: Layout | dict[str, Any], seed: int = SEED) -> Check:
@@ -172,7 +174,15 @@ def check_environment(environment: Any, layout: Layout | dict[str, Any], seed: i
     def start() -> np.ndarray:
         return np.asarray(environment.reset(seed=seed)[0])
 
-    return check_log(fly(step, _layout(layout), seed, start))
+    return _with_hover(check_log(fly(step, _layout(layout), seed, start)))
+
+
+def _with_hover(check: Check) -> Check:
+    """Return a check of a plant with a remark on the thrust command at which it hovers."""
+    hover = hover_command(check.corrected)
+    if hover is None:
+        return check
+    return replace(check, remarks=(f"The plant hovers at a thrust command of {hover:+.2f}.",))
 
 
 def _layout(given: Layout | dict[str, Any] | None) -> Layout:

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from benchmarks.seams.flight import make_flight
 from benchmarks.seams.simulators import SIMULATORS
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid.check import (
+    check_environment,
     check_log,
     check_plant,
     plant,
@@ -414,6 +416,32 @@ def test_conventions_of_a_plant(name, monkeypatch):
         assert found == ()
     else:
         assert set(simulator.expected) in [set(changes) for changes in found]
+
+
+class Environment:
+    """A simulator as a Gymnasium environment; an episode is cut after a second."""
+
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
+
+    def __init__(self, simulator):
+        self.simulator = simulator
+
+    def reset(self, seed):
+        self.x, self.steps = self.simulator.layout["x0"], 0
+        return self.x, {}
+
+    def step(self, action):
+        self.x, self.steps = self.simulator.step(self.x, action), self.steps + 1
+        return self.x, 0.0, False, self.steps == 100, {}
+
+
+@pytest.mark.slow
+def test_environment_is_checked_through_its_observations(monkeypatch):
+    monkeypatch.setattr(plant, "NUM_EPISODES", 20)
+    simulator = next(one for one in SIMULATORS if one.name == "crazyflow")
+    check = check_environment(Environment(simulator), simulator.layout)
+    assert set(simulator.expected) in [set(one) for one in check.explanations]
+    assert any("hovers" in remark for remark in check.remarks)
 
 
 # --- reports --------------------------------------------------------------------------------------
