@@ -58,6 +58,17 @@ def summed_turns(attitude: Rotation) -> np.ndarray:
     return np.concatenate([np.zeros((1, 3)), np.cumsum(turns_b, axis=0)])
 
 
+def continuous(quat: np.ndarray) -> np.ndarray:
+    """Return quaternions, (num_rows, 4), with signs such that neighbours are close.
+
+    The first has w >= 0.
+    """
+    flips = np.sum(quat[1:] * quat[:-1], axis=1) < 0.0
+    first = quat[:1, 0] < 0.0
+    signs = np.where(np.cumsum(np.concatenate([first, flips])) % 2 == 1, -1.0, 1.0)
+    return quat * signs[:, None]
+
+
 def segments_of(log: FlightLog) -> list[slice]:
     """Return the rows of each segment of a log."""
     edges = [*np.flatnonzero(log.is_start()), len(log)]

@@ -17,7 +17,7 @@ from flytrack_sysid.check.samples import sample_changes
 from flytrack_sysid.check.scales import scale_changes
 from flytrack_sysid.check.thrust import hover_command, motor_changes, thrust_changes
 from flytrack_sysid.check.timing import late_sensors
-from flytrack_sysid.kinematics import GRAVITY, read_at, summed_turns
+from flytrack_sysid.kinematics import GRAVITY, continuous, read_at, summed_turns
 from flytrack_sysid.log import FlightLog
 
 MAX_ALTERNATIVES = 8
@@ -77,7 +77,7 @@ def corrected(log: FlightLog, found: Explanation) -> FlightLog:
         world = Rotation.from_matrix(FRAMES[found.world].T)
         body = Rotation.from_matrix(FRAMES[found.body])
         attitude = world * Rotation.from_quat(quat, scalar_first=True) * body
-        channels["q"] = attitude.as_quat(scalar_first=True, canonical=False)
+        channels["q"] = continuous(attitude.as_quat(scalar_first=True))
     for name, frame in found.frames.items():
         if name == "u_rates":
             rates = log["u"][:, :3] @ FRAMES[frame]

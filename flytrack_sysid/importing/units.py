@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.check.frames import HALF_TURN
-from flytrack_sysid.kinematics import GRAVITY
+from flytrack_sysid.kinematics import GRAVITY, continuous
 
 TURN_SIGNS = np.array([1.0, -1.0, -1.0])  # of half a turn about x
 
@@ -49,9 +49,4 @@ def quaternion_from(attitude: Rotation, is_body_turned: bool, is_world_turned: b
         attitude = HALF_TURN * attitude
     if is_body_turned:
         attitude = attitude * HALF_TURN
-    quat = attitude.as_quat(scalar_first=True)
-    # Choose signs such that neighbours are close and the first has w >= 0.
-    flips = np.sum(quat[1:] * quat[:-1], axis=1) < 0.0
-    first = quat[:1, 0] < 0.0
-    signs = np.where(np.cumsum(np.concatenate([first, flips])) % 2 == 1, -1.0, 1.0)
-    return quat * signs[:, None]
+    return continuous(attitude.as_quat(scalar_first=True))
