@@ -158,7 +158,7 @@ def check_log(
         explained, key=lambda one: len(one[0]) + len(one[3][0].changes())
     )
     right = rescaled(corrected(right, frames[0]), scales[0])
-    late = [change for change in late_sensors(right) if change.channel not in held]
+    late = late_sensors(right.without(*held))
     right = on_time(right, late)
     others = [*turned, *samples, *late, *thrust_changes(right)]
     parts = product(
