@@ -225,6 +225,7 @@ def write_page() -> None:
         pairs=table(f"two faults | {columns}", [*two, outcomes("all", by_part["pairs"])]),
         simulators=table("simulator | expected | outcome | first explanation", simulators),
         errors=len(lines) - len(done),
+        commit=lines[-1]["commit"],
         seconds=", ".join(f"{one:.1f}" for one in cpu_seconds()),
         seeds=", ".join(sorted({str(line["seed"]) for line in lines})),
         model="with" if any(line["model"] for line in lines) else "without",
