@@ -34,9 +34,9 @@ def sentence(docstring: str | None) -> str:
 def field_texts(record: Any) -> dict[str, str]:
     """Return what a class's docstring says of its fields.
 
-    Its body describes them as "name: text." or "name, name: text.".
+    The list of attributes describes them as "name: text." or "name, name: text.".
     """
-    body = one_line(record.__doc__.partition("\n\n")[2])
+    body = one_line(record.__doc__.rpartition("Attributes:")[2]).strip()
     parts = re.split(r"(?:^|(?<=[.;] ))((?:[a-z_*/]+(?:, )?)+): ", body)
     return {
         name: text.strip().rstrip(".;") for name, text in zip(parts[1::2], parts[2::2], strict=True)

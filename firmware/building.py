@@ -74,10 +74,13 @@ def find_executable() -> Path:
 def build(say: Say = print, sdist: Path | None = None) -> Path:
     """Build the firmware unless it is built, and return its program.
 
-    say: called with a line per step. sdist: the source distribution, if it is there already.
+    Args:
+        say: called with a line per step.
+        sdist: the source distribution, if it is there already.
 
-    Raises: FirmwareError: no gcc or make, no network, a download of another hash, or a compiler's
-        error.
+    Raises:
+        FirmwareError: no gcc or make, no network, a download of another hash, or a compiler's
+            error.
     """
     final = cache_folder()
     if (final / NAME).is_file():

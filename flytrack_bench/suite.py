@@ -81,8 +81,9 @@ def digest_of(content: dict[str, Any]) -> str:
 def load_suite(name_or_path: str | Path) -> Suite:
     """Return a shipped suite by name, or that of a ``.json`` file.
 
-    Raises: SuiteError: an unknown name, a file that cannot be read, or one that was changed since
-        it was written.
+    Raises:
+        SuiteError: an unknown name, a file that cannot be read, or one that was changed since it
+            was written.
     """
     path = Path(name_or_path)
     if path.suffix != ".json":

@@ -94,7 +94,7 @@ class BlackBox(Plant):
     the default device is another, run inside ``with jax.default_device(jax.devices("cpu")[0])``;
     JAX raises a ValueError otherwise.
 
-    Args:
+    Attributes:
         path: the artifact's file.
         state_size: components of the artifact's own state, 21 or 18.
         dt: s, baked in.

@@ -71,11 +71,15 @@ def close_loop(
 
     Logs, models, diagnosis, trainings and ``loop.json`` are written into ``out``.
 
-    plant: a black box, or any ``flytrack_env.plants.Plant``. config: of both trainings. start: the
-    model to fit from, and how it moves; the nominal one, moving as fits the log, if None.
+    Args:
+        plant: a black box, or any ``flytrack_env.plants.Plant``.
+        config: of both trainings.
+        start: the model to fit from, and how it moves; the nominal one, moving as fits the log, if
+            None.
 
-    Raises: ValueError: a plant that does not fly, settings that cannot be used, ``out`` with
-        another run in it.
+    Raises:
+        ValueError: a plant that does not fly, settings that cannot be used, ``out`` with another
+            run in it.
     """
     config.check()
     out.mkdir(parents=True, exist_ok=True)

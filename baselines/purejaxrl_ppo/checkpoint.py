@@ -77,10 +77,15 @@ class _Progress(msgspec.Struct):
 class Checkpoint(NamedTuple):
     """A trained policy and, in a run, the state of its training.
 
-    Attributes: params: of the network. config: of the training. env_id: what it was trained on.
-        track: what it was trained on, a name or the path of a file. observation_size: of the
-        network's input. meta: the whole description as stored. training: named arrays of the rest
-        of the training's state (optimizer, environments, random keys); None for a policy alone.
+    Attributes:
+        params: of the network.
+        config: of the training.
+        env_id: what it was trained on.
+        track: what it was trained on, a name or the path of a file.
+        observation_size: of the network's input.
+        meta: the whole description as stored.
+        training: named arrays of the rest of the training's state (optimizer, environments, random
+            keys); None for a policy alone.
         path: of its file.
     """
 
@@ -251,8 +256,9 @@ def save_run(path: Path, runner: Runner, config: Config, description: dict[str, 
 def load_checkpoint(path: str | Path) -> Checkpoint:
     """Return the checkpoint in a file.
 
-    Raises: CheckpointError: missing or damaged file, another format, or parameters that do not
-            belong to the network that the file describes.
+    Raises:
+        CheckpointError: missing or damaged file, another format, or parameters that do not belong
+            to the network that the file describes.
     """
     path = Path(path)
     if path.is_dir():

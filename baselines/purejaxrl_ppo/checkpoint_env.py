@@ -69,8 +69,9 @@ def simulated_env(
 ) -> EpisodicEnvironment:
     """Return the checkpoint's environment with the simulator and the model that it was trained on.
 
-    Raises: CheckpointError, TrackError: a file that cannot be used, a checkpoint that does not hold
-        its model.
+    Raises:
+        CheckpointError: a file that cannot be used, a checkpoint that does not hold its model.
+        TrackError: a track that cannot be used.
     """
     if "model" not in checkpoint.meta:
         raise CheckpointError("checkpoint: model: found none, expected the one it was trained on")
@@ -103,8 +104,10 @@ def with_model_as_given(params: EnvParams) -> EnvParams:
 class Plants(NamedTuple):
     """Drawn plants.
 
-    Attributes: models: leaves (num_plants, ...). drawn: values by the names of ``RANGES``,
-        (num_plants,) each; of the drag, the mean of the three axes.
+    Attributes:
+        models: leaves (num_plants, ...).
+        drawn: values by the names of ``RANGES``, (num_plants,) each; of the drag, the mean of the
+            three axes.
     """
 
     models: ModelParameters

@@ -78,15 +78,20 @@ SENTENCES = {
 class ExportedPolicy(NamedTuple):
     """A policy as arrays, float64, and what its files say about it.
 
-    Attributes: centres: of the gates, world, (num_gates, 3), m. frames: of the gates, rows forward,
-        left, up, world, (num_gates, 3, 3). free: half of the opening less the drone's radius,
-        (num_gates,), m. next_rows: rows of the observation about the gate after the next,
-        (num_gates, 6). offsets: of the rows before these, (23,): clip((quantity - offset) * factor,
-        -limit, limit). factors: as ``offsets``. limits: as ``offsets``. past: entries of earlier
-        actions, behind ``next_rows``. layers: kernel (num_inputs, num_outputs) and bias; tanh
-        between layers. blend: share of the way to the command that the lags of the checkpoint's
-        model go in a step, (4,). about: sentences about the policy. meanings: of inputs and output,
-        by name.
+    Attributes:
+        centres: of the gates, world, (num_gates, 3), m.
+        frames: of the gates, rows forward, left, up, world, (num_gates, 3, 3).
+        free: half of the opening less the drone's radius, (num_gates,), m.
+        next_rows: rows of the observation about the gate after the next, (num_gates, 6).
+        offsets: of the rows before these, (23,): clip((quantity - offset) * factor, -limit, limit).
+        factors: as ``offsets``.
+        limits: as ``offsets``.
+        past: entries of earlier actions, behind ``next_rows``.
+        layers: kernel (num_inputs, num_outputs) and bias; tanh between layers.
+        blend: share of the way to the command that the lags of the checkpoint's model go in a step,
+            (4,).
+        about: sentences about the policy.
+        meanings: of inputs and output, by name.
     """
 
     centres: np.ndarray
@@ -111,11 +116,15 @@ class ExportedPolicy(NamedTuple):
 def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> ExportedPolicy:
     """Return the policy of a checkpoint on a track, by default on its own.
 
-    name: of the checkpoint's file.
+    Args:
+        checkpoint: of the policy.
+        name: of the checkpoint's file.
+        track: name or path of another track.
 
-    Raises: CheckpointError, TrackError: a checkpoint that does not fit its environment, whose
-            policy remembers, or whose observation has rows that cannot be exported; a track that
-            cannot be used.
+    Raises:
+        CheckpointError: a checkpoint that does not fit its environment, whose policy remembers, or
+            whose observation has rows that cannot be exported.
+        TrackError: a track that cannot be used.
     """
     if checkpoint.config.memory_size:
         raise CheckpointError(

@@ -327,11 +327,16 @@ def race_many(
 ) -> Outcomes:
     """Return the outcomes of flights from noisy start poses, one per key, as NumPy arrays.
 
-    Args: env: that is flown in. policy: whose mean action flies. keys: of the flights,
-        (num_flights,). num_steps: time limit of a flight. num_laps: laps to complete. params: of
-        the environment, its default if None. models: a simulated drone for each flight, leaves
-        (num_flights, ...); None: that of the parameters, or a black box. report: called with the
-        number of flights flown and of all.
+    Args:
+        env: that is flown in.
+        policy: whose mean action flies.
+        keys: of the flights, (num_flights,).
+        num_steps: time limit of a flight.
+        num_laps: laps to complete.
+        params: of the environment, its default if None.
+        models: a simulated drone for each flight, leaves (num_flights, ...); None: that of the
+            parameters, or a black box.
+        report: called with the number of flights flown and of all.
     """
     params = start_pose_params(env.default_params if params is None else params, num_steps)
     num_flights = len(keys)

@@ -114,9 +114,11 @@ class ActorCritic(nn.Module):
     ) -> tuple[distrax.Distribution, jax.Array]:
         """Return policy and value of steps: in any order, or with a memory in their order.
 
-        Args: memory: (num_envs, num_steps, memory_size), of which that of the first step counts; or
-            (). observation: (num_envs, num_steps, size) with a memory, else (num_rows, size). done:
-            whether an episode ends after the step, (num_envs, num_steps).
+        Args:
+            memory: (num_envs, num_steps, memory_size), of which that of the first step counts; or
+                ().
+            observation: (num_envs, num_steps, size) with a memory, else (num_rows, size).
+            done: whether an episode ends after the step, (num_envs, num_steps).
         """
         if self.memory_size:
             remembered = self.gru(memory[:, 0], (observation, done))[1]

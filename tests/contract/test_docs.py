@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from docs.effect_pages import effect_page
+from docs.pages import site_pages
 from docs.track_pages import gate_rows, track_page
 from flytrack_env.effects import EFFECTS
 from flytrack_env.tracks import available_tracks, build_course, load_track
@@ -77,3 +78,10 @@ def test_page_of_a_track_has_the_headings_of_its_gates(name):
         forward, np.stack([np.cos(headings), np.sin(headings)], -1), atol=1e-5
     )
     assert BLOCK.search(track_page(name)) and (DOCS / "tracks" / f"{name}.png").is_file()
+
+
+@pytest.mark.slow
+def test_pages_of_environments_and_effects_are_generated():
+    pages = site_pages()
+    assert all(text.strip() for text in pages.values())
+    assert {f"effects/{effect.name}.md" for effect in EFFECTS} <= pages.keys()
