@@ -55,7 +55,7 @@ class Trial(NamedTuple):
 
 
 @lru_cache(1)
-def flight_of(seed: int, number: int) -> Flight:
+def cached_flight(seed: int, number: int) -> Flight:
     """Return a flight; trials of a number follow each other."""
     return make_flight(100_000 * seed + number)
 
@@ -76,7 +76,7 @@ def measure(trial: Trial) -> dict[str, Any]:
         check = check_plant(simulator.step, simulator.layout)
         result = {"shown": True, **compare(check, simulator.expected)}
         return {"truth": sorted(simulator.expected), **result}
-    flight = flight_of(trial.seed, trial.number)
+    flight = cached_flight(trial.seed, trial.number)
     rng = np.random.default_rng([trial.seed, trial.number, crc32(trial.name.encode())])
     dt, name, truth = float(np.median(np.diff(flight.log.time))), trial.name, Truth()
     if trial.part == "faults":

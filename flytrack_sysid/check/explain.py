@@ -153,7 +153,7 @@ def explain(channels: frozenset[str], edges: Edges) -> list[Explanation]:
         key = body, world, reading
         lowest[key] = _least(key, channels) if cheapest > 0.0 else np.inf
         if lowest[key] < cheapest:
-            costs = _costs_of(key, channels, edges)
+            costs = _build_costs(key, channels, edges)
             lowest[key] = np.inf if costs is None else float(costs.total.min())
             cheapest = min(cheapest, lowest[key])
     if not np.isfinite(cheapest):
@@ -161,7 +161,7 @@ def explain(channels: frozenset[str], edges: Edges) -> list[Explanation]:
     limit = cheapest + (MIRRORED if cheapest > 0.0 else 0.0)
     found: list[tuple[float, int, Explanation]] = []
     for key, cost in lowest.items():
-        costs = _costs_of(key, channels, edges) if cost <= limit else None
+        costs = _build_costs(key, channels, edges) if cost <= limit else None
         if costs is not None:
             found += _listed(costs, key[2], limit)
     unique: dict[tuple[Change, ...], Explanation] = {}
@@ -179,7 +179,9 @@ def _least(key: tuple[int, int, int], channels: frozenset[str]) -> float:
     return CHANGED * (misread + (body != IDENTITY) + (world != IDENTITY))
 
 
-def _costs_of(key: tuple[int, int, int], channels: frozenset[str], edges: Edges) -> _Costs | None:
+def _build_costs(
+    key: tuple[int, int, int], channels: frozenset[str], edges: Edges
+) -> _Costs | None:
     """Return the costs with shared frames of body and world, and a reading; None if impossible."""
     body_frame, world_frame, number = key
     if not (edges.rates[number].any() and edges.forces[number].any()):

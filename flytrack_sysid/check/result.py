@@ -13,7 +13,7 @@ from flytrack_sysid.check.explain import Change, Explanation, explain
 from flytrack_sysid.check.frames import FRAMES, IDENTITY, READINGS
 from flytrack_sysid.check.motion import MARGIN, RATE_FLOOR, compare
 from flytrack_sysid.check.pairs import CONTRADICTS, STILL, Compared, Pair, compare_pairs
-from flytrack_sysid.check.samples import sample_changes
+from flytrack_sysid.check.samples import describe_stuck, sample_changes
 from flytrack_sysid.check.scales import scale_changes
 from flytrack_sysid.check.thrust import hover_command, motor_changes, thrust_changes
 from flytrack_sysid.check.timing import late_sensors
@@ -53,7 +53,7 @@ class Check:
             does that no known change explains.
         corrected: the log by the first explanation's axes, scales and clocks.
         after: the pairs of the corrected log; empty if nothing contradicts.
-        remarks: on constants of the model that the log contradicts.
+        remarks: on columns that never change, and constants of the model that the log contradicts.
     """
 
     source: str
@@ -173,7 +173,8 @@ def check_log(
         for one in islice(parts, MAX_ALTERNATIVES)
     ]
     contradicted = any(pair.verdict == CONTRADICTS for pair in compared.pairs)
-    remarks = () if model is None else constants_that_differ(right, model)
+    remarks = describe_stuck(log)
+    remarks += () if model is None else constants_that_differ(right, model)
     if not any(explanations) and not contradicted:
         return Check(log.source, compared.pairs, (), right, (), remarks)
     pairs = with_wrong_sizes(found[0][2].pairs, explanations[0])

@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.check.explain import Change
 from flytrack_sysid.kinematics import summed_turns
-from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
 
 SENSORS = ("w", "f", "q", "v", "p")
 MIN_HELD = 3  # rows: sensors at half the log's rate are common
@@ -57,6 +57,18 @@ def sample_changes(log: FlightLog) -> list[Change]:
     share = _repeated_share(others) if others else 0.0
     found += [Change("rows", "repeated", share)] * (share > MIN_REPEATED)
     return found + [Change("q", "wrapped", True)] * is_wrapped(log)
+
+
+def describe_stuck(log: FlightLog) -> tuple[str, ...]:
+    """Return a sentence on each column of a sensor that never changes: it cannot be compared."""
+    columns = [
+        column
+        for channel in SENSORS
+        if channel in log
+        for column, spread in zip(CHANNELS[channel], np.ptp(log[channel], axis=0), strict=True)
+        if spread == 0.0
+    ]
+    return tuple(f"{column}: the same in every row, so not compared: stuck?" for column in columns)
 
 
 def is_wrapped(log: FlightLog) -> bool:

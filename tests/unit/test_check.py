@@ -521,3 +521,11 @@ def test_short_logs_name_nothing(flights, kind):
     log = flights[kind].log
     for length_s in (0.5, 3.0):
         assert check_log(log.select(log.time < length_s)).explanations == ()
+
+
+def test_stuck_axis_is_said(flights):
+    log = flights["race"].log
+    rates = log["w"].copy()
+    rates[:, 1] = 0.1
+    check = check_log(with_channels(log, w=rates))
+    assert check.explanations == () and any(one.startswith("w_y: ") for one in check.remarks)
