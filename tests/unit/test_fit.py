@@ -158,7 +158,7 @@ REFUSED = {
     "nothing left": (None, {"fixed": EVERYTHING}, "fixed: found every parameter"),
     "wrong sign": (
         lambda log: scaled(log, "w", (-1, 1, 1)),
-        {},
+        {"accept": True},
         "w_x: .* sign and order of u_roll and w_x",
     ),
     "on the ground": (at_rest, {}, "w: found no body rate that follows its command"),
