@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import process_time
 from typing import Any, Literal, NamedTuple
 from zlib import crc32
@@ -18,22 +19,34 @@ from scipy.stats import beta
 
 from benchmarks.real.crazyflie import DATA
 from benchmarks.report import RESULTS, command, fill_page, lines_of_commit, record_trials, table
-from benchmarks.seams.faults import FAULTS, Change, Truth, draw_pair, inject, is_shown
+from benchmarks.seams.faults import FAULTS, UNITS, Change, Truth, draw_pair, inject, is_shown
 from benchmarks.seams.flight import Flight, make_flight
+from benchmarks.seams.mapped import MAPPING, import_csv, is_equal, write_csv
 from benchmarks.seams.measured import measured_flights
 from benchmarks.seams.simulators import SIMULATORS
-from flytrack_env.dynamics import nominal_parameters
+from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_sysid.check import check_log, check_plant
+from flytrack_sysid.check.fix import fix_mapping
 from flytrack_sysid.log import FlightLog
 
 LINES = RESULTS / "check.jsonl"
-Part = Literal["clean", "faults", "pairs", "simulators", "measured"]
-PARTS: tuple[Part, ...] = ("clean", "faults", "pairs", "simulators", "measured")
+Part = Literal["clean", "faults", "fixes", "pairs", "simulators", "measured"]
+PARTS: tuple[Part, ...] = ("clean", "faults", "fixes", "pairs", "simulators", "measured")
+FIXED = ("equal", "ambiguous", "left", "wrong", "missed")
 MAX_ALTERNATIVES = 4
 SCALE_TOLERANCE, DELAY_TOLERANCE, DELAY_TOLERANCE_S = 0.05, 0.1, 0.003
 COMMAND_TOLERANCE_S = 0.02  # the lag of the craft is not known better
 FRACTION_TOLERANCE = 0.2  # of the fraction of repeated rows
 LOGS_A_FAULT = 0.1  # of the number of clean logs
+# Faults that are words of a mapping: units, signs, order of columns, frames, ends of commands.
+FIXABLE = [
+    name
+    for name in FAULTS
+    if name in UNITS
+    or name.endswith((" sign", " swapped", " frame"))
+    or name in ("q order", "q conjugate", "q body", "q world", "all NED and FRD")
+    or name in ("u_thrust 0..1", "u_thrust upside down")  # an import refuses PWM
+]
 
 
 class Trial(NamedTuple):
@@ -79,7 +92,7 @@ def measure(trial: Trial) -> dict[str, Any]:
     flight = cached_flight(trial.seed, trial.number)
     rng = np.random.default_rng([trial.seed, trial.number, crc32(trial.name.encode())])
     dt, name, truth = float(np.median(np.diff(flight.log.time))), trial.name, Truth()
-    if trial.part == "faults":
+    if trial.part in ("faults", "fixes"):
         truth = FAULTS[name](rng, dt)
     elif trial.part == "pairs":
         name, truth = draw_pair(rng, dt)
@@ -88,9 +101,36 @@ def measure(trial: Trial) -> dict[str, Any]:
         model = nominal_parameters()._replace(
             max_rate=np.array(craft.max_rate), tau=np.array(craft.lags)
         )
-    check = check_log(faulty.log, model, faulty.motors)
     result = {"kind": flight.kind, "faults": name, "shown": is_shown(flight, truth)}
+    if trial.part == "fixes":
+        return {"truth": sorted(truth), **result, **fix_and_compare(faulty.log, flight.log, model)}
+    check = check_log(faulty.log, model, faulty.motors)
     return {"truth": sorted(truth), **result, **compare(check, truth)}
+
+
+def fix_and_compare(
+    faulty: FlightLog, right: FlightLog, model: ModelParameters | None
+) -> dict[str, Any]:
+    """Import a faulty log by a mapping that takes it as it is, correct the mapping, import again.
+
+    Returns:
+        alternatives, and the outcome: "equal" if the mapping corrected by one of at most four
+        alternatives reads the right log; "ambiguous" if there are several that do not, of which
+        only what they share is written; "left" if no word of a mapping says some of the changes;
+        "wrong" if the corrected mapping reads another log; "missed" if nothing was found.
+    """
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "flight.csv"
+        write_csv(path, faulty)
+        check = check_log(import_csv(path, MAPPING), model)
+        alternatives = [changes for changes in check.explanations if changes]
+        fixes = [fix_mapping(MAPPING, changes) for changes in alternatives[:MAX_ALTERNATIVES]]
+        if any(not fix.left and is_equal(import_csv(path, fix.text), right) for fix in fixes):
+            outcome = "equal"
+        else:
+            outcome = "missed" if not fixes else "left" if fixes[0].left else "wrong"
+            outcome = "ambiguous" if len(fixes) > 1 else outcome
+    return {"alternatives": [tuple(one) for one in alternatives], "outcome": outcome}
 
 
 def compare(check: Any, truth: Iterable[Change]) -> dict[str, Any]:
@@ -153,6 +193,8 @@ def plan_trials(parts: Iterable[Part], logs: int, seed: int, model: bool) -> lis
             trials.append(Trial("pairs", "", number, seed, model))
         if "faults" in parts and number < LOGS_A_FAULT * logs:
             trials += [Trial("faults", name, number, seed, model) for name in FAULTS]
+        if "fixes" in parts and number < LOGS_A_FAULT * logs:
+            trials += [Trial("fixes", name, number, seed, model) for name in FIXABLE]
     if "simulators" in parts:
         trials += [Trial("simulators", simulator.name, 0, seed, False) for simulator in SIMULATORS]
     if "measured" in parts:
@@ -168,6 +210,14 @@ def outcomes(name: str, lines: list[dict[str, Any]]) -> list[Any]:
     kinds = ("exact", "partial", "unexplained", "false", "missed")
     false = f"{sum(line['outcome'] == 'false' for line in hidden)} of {len(hidden)}"
     return [name, len(shown), *(count[kind] for kind in kinds), false]
+
+
+def fixed(name: str, lines: list[dict[str, Any]]) -> list[Any]:
+    """Return a row of the page: what corrected mappings read."""
+    count = Counter(line["outcome"] for line in lines if line["shown"])
+    hidden = [line for line in lines if not line["shown"]]
+    wrong = f"{sum(line['outcome'] == 'wrong' for line in hidden)} of {len(hidden)}"
+    return [name, sum(count.values()), *(count[kind] for kind in FIXED), wrong]
 
 
 def describe(changes: Iterable[Iterable[Any]]) -> str:
@@ -200,6 +250,10 @@ def write_page() -> None:
         outcomes(name, [line for line in by_part["pairs"] if is_on_one(line) == on_one])
         for name, on_one in (("on one channel", True), ("on two channels", False))
     ]
+    fixes = [
+        fixed(name, [line for line in by_part["fixes"] if name in (line["name"], "all")])
+        for name in [*FIXABLE, "all"]
+    ]
     simulators = [
         [
             line["name"],
@@ -222,6 +276,10 @@ def write_page() -> None:
         ),
         clean=table("flight | logs | contradicted | 95 % upper bound | what", clean),
         faults=table(f"fault | {columns}", [*faults, outcomes("all", by_part["faults"])]),
+        fixes=table(
+            "fault | shown | equal | ambiguous | left | wrong | missed | wrong where not shown",
+            fixes,
+        ),
         pairs=table(f"two faults | {columns}", [*two, outcomes("all", by_part["pairs"])]),
         simulators=table("simulator | expected | outcome | first explanation", simulators),
         errors=len(lines) - len(done),

@@ -7,7 +7,8 @@ Kinds and values of changes; channels are those of a log, ``u_rates`` and ``u_th
 commands, ``rows`` all, ``motors`` the motor outputs:
 
 - ``scale``: logged = value * true.
-- ``axes``: "y -x z" if the logged x, y, z are the true y, -x, z; "-" of the thrust command.
+- ``axes``: "y -x z" if the logged x, y, z are the true y, -x, z; "-" of the thrust command, and of
+  the voltage, which then rises by as much as it falls.
 - ``delay``: s; the value logged at t is the true one of t - delay.
 - ``order`` of q: "xyzw" if columns w, x, y, z hold x, y, z, w; "zwxy" if they hold z, w, x, y.
   Of motors: "2 1 3 4" if the first column is motor 2.
@@ -118,6 +119,7 @@ FAULTS: dict[str, Fault] = {
     "u_thrust pwm": _choose("u_thrust", "range", "pwm"),
     "u_thrust 0..1": _choose("u_thrust", "range", "0..1"),
     "u_thrust upside down": _choose("u_thrust", "axes", "-"),
+    "v_bat rises": _choose("v_bat", "axes", "-"),
     "motors order": _choose("motors", "order", *MOTOR_SWAPS),
 }
 PAIRS_ON_A_CHANNEL = (
@@ -180,6 +182,8 @@ def _inject_one(rng: np.random.Generator, flight: Flight, change: Change) -> Fli
     elif kind == "held":
         rows = np.arange(len(log))
         changed = values[rows - rows % int(value)]
+    elif channel == "v_bat" and kind == "axes":
+        changed = values.max() + values.min() - values
     elif kind == "wrapped":
         changed = _interpolate_across_wrap(log, source_rows=int(rng.integers(4, 7)))
     else:
@@ -324,6 +328,8 @@ def _is_one_shown(motion: _Motion, change: Change) -> bool:
     0.05 rad/s of gyro, 0.5 degrees of attitude, 0.1 m/s^2 of accelerometer bias, 0.05 m/s.
     """
     channel, kind, value = change
+    if channel == "v_bat":
+        return True
     turning = bool(np.all(motion.rates[:2] > 0.2) and motion.tilt > 0.1)
     if kind == "axes" and value != "-":
         indices, signs = _signed_axes(str(value))

@@ -24,14 +24,14 @@ OPPOSITE = {
     "frd": "flu",
     "z_up": "ned",
     "ned": "z_up",
-    "wxyz": "xyzw",
-    "xyzw": "wxyz",
 }
+ORDERS = ("wxyz", "xyzw")
 TURNED = ("frd", "ned")  # half a turn about x from ours
 HALF_TURN = np.diag([1.0, -1.0, -1.0])
 HALF_TURN_NAME = "x -y -z"
 OTHER_DIRECTION = {"body_to_world": "world_to_body", "world_to_body": "body_to_world"}
 UNIT_TOLERANCE = 0.01  # relative
+COMMENT = re.compile(r"\s+#[^\"'\]]*$")  # behind a value; one with quotes may be a part of it
 Fields = dict[str, Any]
 
 
@@ -101,13 +101,22 @@ def _number(name: str) -> int:
 def _attitude(fields: Fields, kind: str, value: Any) -> Fields:
     """Return corrected fields of the table ``attitude``; empty if none can correct it."""
     if kind == "order" and "quaternion" in fields:
-        return {"order": OPPOSITE[fields["order"]]}
+        return _order(fields, str(value))
     if kind == "conjugate":
         direction = fields.get("direction", "body_to_world")
         return {"direction": OTHER_DIRECTION[direction]}
     if kind in ("body", "world") and value == HALF_TURN_NAME:
         return {kind: OPPOSITE[fields[kind]]}
     return {}
+
+
+def _order(fields: Fields, held: str) -> Fields:
+    """Return corrected fields of a quaternion's columns; ``held`` by those read as w, x, y, z."""
+    order = fields["order"]
+    right = "".join(held["wxyz".index(letter)] for letter in order)
+    if right in ORDERS:
+        return {"order": right}
+    return {"quaternion": [fields["quaternion"][right.index(letter)] for letter in order]}
 
 
 def _vector(fields: Fields, name: str) -> Fields:
@@ -184,6 +193,9 @@ def _with_field(text: str, table: str, field: str, value: Any) -> str:
     place = next((number for number in range(start + 1, end) if is_field(lines[number])), None)
     line = [] if value is None else [f"{field} = {msgspec.json.encode(value).decode()}"]
     if place is not None:
+        comment = COMMENT.search(lines[place])
+        if comment is not None:
+            line = [f"{text}{comment.group()}" for text in line]
         lines[place : place + 1] = line
     else:
         lines[start + 1 : start + 1] = line

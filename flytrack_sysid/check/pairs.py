@@ -40,6 +40,7 @@ MANOEUVRES = {
     "p and v": "fly faster than 0.5 m/s forward, sideways and upwards",
     "u and w": "command roll, pitch and yaw rates of more than 30 deg/s",
     "f in flight": "stay in the air for more than 2 s",
+    "v_bat and t": "stay in the air for more than 30 s",
 }
 
 
@@ -52,6 +53,7 @@ class Pair(NamedTuple):
         correlations: of the axes as they are logged; NaN where unknown.
         unseen: axes whose sign the motion does not show.
         evidence: nats by which the best frames are more likely than those of the log.
+        margin: nats by which the best frames are more likely than the best that contradict.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Pair(NamedTuple):
     correlations: tuple[float, ...]
     unseen: tuple[str, ...]
     evidence: float
+    margin: float
 
     @property
     def manoeuvre(self) -> str:
@@ -81,12 +84,13 @@ def _pair(name: str, found: Likelihoods, is_allowed: np.ndarray, flips: list[boo
     """Return a pair; ``is_allowed`` and the likelihoods begin with the frames of the log."""
     total = found.values.sum(axis=0)
     evidence = float(total.max() - total.flat[0])
+    margin = float(total.max() - total[~is_allowed].max(initial=-np.inf))
     unseen = tuple(axis for axis, is_seen in zip(AXES, flips, strict=True) if is_seen)
     verdict = AGREES if is_allowed.flat[0] else CONTRADICTS
     if verdict == AGREES and len(unseen) == len(AXES):
         verdict = STILL
     correlations = tuple(float(value) for value in found.correlations)
-    return Pair(name, verdict, correlations, unseen, evidence)
+    return Pair(name, verdict, correlations, unseen, evidence, margin)
 
 
 class Compared(NamedTuple):
@@ -194,4 +198,4 @@ def _compare_up(log: FlightLog) -> tuple[Pair | None, np.ndarray]:
     if along[2] > CLEARLY * along[1]:
         force_up = np.arange(len(DIRECTIONS)) == np.argmax(DIRECTIONS @ middle)
     verdict = STILL if force_up.all() else AGREES if force_up[0] else CONTRADICTS
-    return Pair("f in flight", verdict, (), (), float("nan")), force_up
+    return Pair("f in flight", verdict, (), (), float("nan"), float("nan")), force_up

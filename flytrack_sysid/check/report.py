@@ -16,11 +16,12 @@ from flytrack_sysid.check.pairs import CONTRADICTS, Pair
 from flytrack_sysid.check.result import Check
 from flytrack_sysid.check.words import HEADER, describe, row_of, text_of, verdict_of
 from flytrack_sysid.kinematics import GRAVITY, WINDOWS_S, cut_windows, summed_turns
-from flytrack_sysid.log import FlightLog
+from flytrack_sysid.log import FlightLog, time_in_line
 from flytrack_sysid.page import Bullets, Part, Picture, Section, Table, Verdict, page
 from flytrack_sysid.plots import png_of
 
 SHOWN_S = 20.0  # of flight in a picture: longer ones are black
+MAX_STEP_S = 3.0 * WINDOWS_S[0]  # a longer one is a pause
 LEGENDS = {  # of the two quantities of each pair, and their unit
     "q and w": ("turn of the attitude", "gyroscope", "rad/s"),
     "v, f and q": ("change of the velocity", "accelerometer, turned by the attitude", "m/s^2"),
@@ -57,7 +58,22 @@ def signals_of(log: FlightLog, pair: str) -> Signals | None:
         if sums is None
         else windows.change_of(sums) / windows.durations[:, None]
     )
-    return log.time[windows.starts], shown, windows.mean_of(log, rates)
+    return time_in_line(log)[windows.starts], shown, windows.mean_of(log, rates)
+
+
+def most_different(time: np.ndarray, shown: np.ndarray, measured: np.ndarray) -> float:
+    """Return when the part of a flight begins, s, in which two quantities differ most.
+
+    Args:
+        time: (num_windows,) s.
+        shown: (num_windows, 3).
+        measured: (num_windows, 3).
+    """
+    size = np.maximum(np.mean(shown**2, axis=0), np.mean(measured**2, axis=0))
+    differences = np.sum((shown - measured) ** 2 / np.maximum(size, 1e-12), axis=1)
+    summed = np.concatenate([[0.0], np.cumsum(differences)])
+    ends = np.searchsorted(time, time + SHOWN_S)
+    return float(time[np.argmax(summed[ends] - summed[:-1])])
 
 
 def draw_pair(name: str, before: Signals, after: Signals) -> Figure:
@@ -65,14 +81,22 @@ def draw_pair(name: str, before: Signals, after: Signals) -> Figure:
     figure = new_figure(9.0, 6.0)
     panels = figure.subplots(3, 2, sharex=True, sharey="row")
     first, second, unit = LEGENDS[name]
+    start_s = most_different(*before)
     for column, (title, (time, shown, measured)) in enumerate(
         (("as logged", before), ("as it agrees", after))
     ):
-        is_shown = time - time[0] < SHOWN_S
+        is_shown = (time >= start_s) & (time < start_s + SHOWN_S)
+        time = time[is_shown]
+        # A row without a value interrupts the lines at pauses.
+        pauses = np.flatnonzero(np.diff(time) > MAX_STEP_S) + 1
+        time, shown, measured = (
+            np.insert(values, pauses, np.nan, axis=0)
+            for values in (time, shown[is_shown], measured[is_shown])
+        )
         for axis in range(3):
             panel = plain(panels[axis, column])
-            panel.plot(time[is_shown], shown[is_shown, axis], color=BLUE, label=first)
-            panel.plot(time[is_shown], measured[is_shown, axis], color=ORANGE, label=second, lw=1)
+            panel.plot(time, shown[:, axis], color=BLUE, label=first)
+            panel.plot(time, measured[:, axis], color=ORANGE, label=second, lw=1)
             if column == 0:
                 panel.set_ylabel(f"{'xyz'[axis]} ({unit})")
         panels[0, column].set_title(title)
@@ -87,10 +111,10 @@ def as_json(check: Check) -> dict[str, Any]:
     """Return a check as JSON values; null where a number is unknown."""
 
     def pair_json(pair: Pair) -> dict[str, Any]:
-        known = pair.evidence == pair.evidence
+        numbers = {"evidence": pair.evidence, "margin": pair.margin}
         return {
             **pair._asdict(),
-            "evidence": pair.evidence if known else None,
+            **{name: one if np.isfinite(one) else None for name, one in numbers.items()},
             "correlations": [None if one != one else one for one in pair.correlations],
         }
 

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.thrust import hover_action
+from flytrack_sysid.check.battery import battery_changes, compare_battery
 from flytrack_sysid.check.commands import curve_changes, mean_delay, responses, thinned
 from flytrack_sysid.check.explain import Change, Explanation, explain
 from flytrack_sysid.check.frames import FRAMES, IDENTITY, READINGS
@@ -33,12 +34,11 @@ PAIRS_OF = {  # that compare the size of a channel
     "f": ("v, f and q",),
     "v": ("v, f and q", "p and v"),
     "p": ("p and v",),
+    "v_bat": ("v_bat and t",),
 }
 STICKS = ("roll", "pitch", "yaw")
 MAX_HOVER_ERROR = 0.15  # thrust command: voltage and drag move it by less
 CLEAR, MAX_RATE_ERROR = 0.995, 0.1  # correlation, and relative error, of a full-stick rate
-LIKELY_BATTERY_V, HIGHEST_BATTERY_V = (2.5, 70.0), 100.0
-BATTERY_UNITS = (1000.0, 100.0, 10.0)
 
 
 @dataclass(frozen=True)
@@ -100,16 +100,6 @@ def rescaled(log: FlightLog, changes: tuple[Change, ...]) -> FlightLog:
     return replace(log, channels=channels)
 
 
-def battery_changes(log: FlightLog) -> list[tuple[Change, ...]]:
-    """Return units of the battery's voltage that a pack may have, as alternatives."""
-    median_v = float(np.median(log["v_bat"])) if "v_bat" in log else 0.0
-    low, high = LIKELY_BATTERY_V
-    units = [unit for unit in BATTERY_UNITS if low <= median_v / unit <= high]
-    if median_v <= HIGHEST_BATTERY_V or not units:
-        return [()]
-    return [(Change("v_bat", "scale", unit),) for unit in units]
-
-
 def command_changes(log: FlightLog, model: ModelParameters | None) -> list[tuple[Change, ...]]:
     """Return what differs in the rate commands, as alternatives; [()] if nothing does.
 
@@ -152,8 +142,10 @@ def check_log(
     readings = [((), log), *with_body_rates(log)]
     found = [(turned, one, *explain_frames(one)) for turned, one in readings]
     explained = [one for one in found if one[3]]
+    battery = compare_battery(log)
+    pairs = (*found[0][2].pairs, *battery)
     if not explained:
-        return Check(log.source, found[0][2].pairs, ((),), log)
+        return Check(log.source, pairs, ((),), log)
     turned, right, compared, frames, scales = min(
         explained, key=lambda one: len(one[0]) + len(one[3][0].changes())
     )
@@ -161,6 +153,7 @@ def check_log(
     late = late_sensors(right.without(*held))
     right = on_time(right, late)
     others = [*turned, *samples, *late, *thrust_changes(right)]
+    others += [Change("v_bat", "axes", "-") for pair in battery if pair.verdict == CONTRADICTS]
     parts = product(
         [one.changes() for one in frames],
         scales,
@@ -172,12 +165,12 @@ def check_log(
         (*(change for part in one for change in part), *others)
         for one in islice(parts, MAX_ALTERNATIVES)
     ]
-    contradicted = any(pair.verdict == CONTRADICTS for pair in compared.pairs)
+    contradicted = any(pair.verdict == CONTRADICTS for pair in (*compared.pairs, *battery))
     remarks = describe_stuck(log)
     remarks += () if model is None else constants_that_differ(right, model)
     if not any(explanations) and not contradicted:
-        return Check(log.source, compared.pairs, (), right, (), remarks)
-    pairs = with_wrong_sizes(found[0][2].pairs, explanations[0])
+        return Check(log.source, (*compared.pairs, *battery), (), right, (), remarks)
+    pairs = with_wrong_sizes(pairs, explanations[0])
     after = compare_pairs(right).pairs
     return Check(log.source, pairs, tuple(dict.fromkeys(explanations)), right, after, remarks)
 
@@ -188,7 +181,7 @@ def with_wrong_sizes(pairs: tuple[Pair, ...], changes: tuple[Change, ...]) -> tu
         name
         for change in changes
         if change.kind == "scale"
-        for name in PAIRS_OF.get(change.channel[:1], ())
+        for name in PAIRS_OF[change.channel if change.channel == "v_bat" else change.channel[:1]]
     }
     return tuple(
         pair._replace(verdict=CONTRADICTS) if pair.name in wrong and pair.verdict != STILL else pair

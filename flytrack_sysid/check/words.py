@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from flytrack_sysid.check.explain import Change
 from flytrack_sysid.check.motion import MARGIN
 from flytrack_sysid.check.pairs import CONTRADICTS, STILL, Pair
@@ -35,7 +37,10 @@ def describe(change: Change) -> str:
 
 def _says(channel: str, kind: str, value: str | float | bool) -> str:
     if kind == "axes" and value == "-":
-        return "upside down: more command is less thrust"
+        return {
+            "u_thrust": "upside down: more command is less thrust",
+            "v_bat": "rises in flight, as no battery does: the charge used, or rows in reverse?",
+        }[channel]
     if kind == "axes":
         names = BODY_NAMES if channel in BODY_CHANNELS else WORLD_NAMES
         sticks = "roll, pitch, yaw are about" if channel == "u_rates" else "x, y, z hold"
@@ -47,7 +52,7 @@ def _says(channel: str, kind: str, value: str | float | bool) -> str:
         return f"the {kind}'s axes are {', '.join(str(value).split())}{known}"
     if kind == "scale":
         unit = unit_of(channel, float(value))
-        return f"{float(value):.4g} times too large" + (f": in {unit}" if unit else "")
+        return f"{float(value):.4g} times the true size" + (f": in {unit}" if unit else "")
     if kind == "delay":
         late = "late" if float(value) > 0.0 else "early"
         return f"{1e3 * abs(float(value)):.0f} ms {late}"
@@ -85,12 +90,17 @@ def row_of(pair: Pair) -> list[str]:
     if pair.verdict == STILL:
         remark = f"fly: {pair.manoeuvre}"
     elif pair.verdict == CONTRADICTS and pair.evidence > MARGIN:
-        remark = f"another reading is e^{pair.evidence:.0f} times as likely"
+        remark = f"the best reading is e^{pair.evidence:.0f} times as likely{ahead(pair.margin)}"
     elif pair.verdict == CONTRADICTS and pair.correlations:
         remark = "sizes differ"
     elif pair.unseen:
         remark = f"the sign of {', '.join(pair.unseen)} does not show"
     return [pair.name, pair.verdict, numbers, remark]
+
+
+def ahead(margin: float) -> str:
+    """Return how much more likely the best reading is than the next that differs, in words."""
+    return f", and e^{margin:.0f} times the next" if np.isfinite(margin) else ""
 
 
 HEADER = ("pair", "verdict", "correlation of x, y, z", "")

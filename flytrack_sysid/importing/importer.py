@@ -3,9 +3,9 @@
 import csv
 import json
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -41,7 +41,8 @@ MAX_MANIFEST_BYTES = 2**24
 MIN_THRUST = -0.9  # command: in flight it exceeds a twentieth of the thrust range at some time
 
 
-class Imported(NamedTuple):
+@dataclass(frozen=True)
+class Imported:
     """The result of an import.
 
     Attributes:
@@ -50,7 +51,6 @@ class Imported(NamedTuple):
         craft: what files and mapping state.
         offsets: between the sensors' clocks.
         notes: what was left out.
-        problems: reasons why no flight can have this log; ``fit`` would refuse it.
     """
 
     log: FlightLog
@@ -58,7 +58,11 @@ class Imported(NamedTuple):
     craft: Craft
     offsets: tuple[ClockOffset, ...]
     notes: tuple[str, ...]
-    problems: tuple[str, ...]
+
+    @cached_property
+    def problems(self) -> tuple[str, ...]:
+        """Reasons why no flight can have this log; ``fit`` would refuse it."""
+        return tuple(find_problems(self.log))
 
     def nominal_model(self) -> ModelParameters:
         """Return the generic quadcopter scaled to this craft, as a start for fits.
@@ -150,7 +154,7 @@ def import_log(
     if "w" in log and step_s > SLOW_STEP_S:
         remark = f"body rates at {1.0 / step_s:.3g} Hz: too slow for a rate loop's lag or delay"
         notes += (f"{log.source}: {remark}",)
-    return Imported(log, tuple(sources), craft, offsets, notes, tuple(find_problems(log)))
+    return Imported(log, tuple(sources), craft, offsets, notes)
 
 
 def _parts(flight: ImportedFlight) -> list[ImportedFlight]:

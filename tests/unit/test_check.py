@@ -37,6 +37,7 @@ from flytrack_sysid.check.pairs import AGREES, CONTRADICTS, MANOEUVRES, STILL, c
 from flytrack_sysid.check.samples import sample_changes
 from flytrack_sysid.check.thrust import motor_changes, thrust_changes
 from flytrack_sysid.log import FlightLog
+from tests.support.compiling import programs
 from tests.support.slow import slow_but
 
 KINDS = ("race", "excitation", "gentle", "hover")
@@ -154,7 +155,7 @@ def test_sign_of_an_axis_without_motion_is_unseen(planar):
 def test_mirrored_axis_is_excluded(planar, axis):
     signs = np.where(np.arange(3) == axis, -1.0, 1.0)
     pair, is_allowed = position_pair(with_channels(planar, v=signs * planar["v"]))
-    assert pair.verdict == CONTRADICTS and pair.evidence > 10.0
+    assert pair.verdict == CONTRADICTS and pair.evidence > 10.0 and pair.margin > 10.0
     assert not is_allowed[IDENTITY] and is_allowed[number_of(np.diag(signs))]
     assert pair.correlations[axis] < -0.9
 
@@ -274,6 +275,7 @@ REPRESENTATIVE = {  # and how many explanations are alike
     **dict.fromkeys(("w sign", "f frame", "v swapped", "p frame", "u_rates frame"), 1),
     **dict.fromkeys(("q order", "q conjugate", "q body", "q world"), 1),
     **dict.fromkeys(("u delay", "q delay", "v delay", "w held", "rows repeated"), 1),
+    "v_bat rises": 1,
     "all NED and FRD": 2,
     "u_rates curve": 3,
 }
@@ -313,7 +315,7 @@ def test_right_flight_contradicts_nothing(checks, kind):
 
 def test_race_shows_all_pairs(checks):
     assert set(verdicts(checks["race"]).values()) == {AGREES}
-    assert len(checks["race"].pairs) == 5
+    assert len(checks["race"].pairs) == 6
 
 
 def test_hover_says_what_to_fly(checks):
@@ -322,6 +324,26 @@ def test_hover_says_what_to_fly(checks):
     text = text_of(checks["hover"])
     assert all(MANOEUVRES[name] in text for name in still)
     assert not any(MANOEUVRES[name] in text_of(checks["race"]) for name in still)
+
+
+def test_check_compiles_nothing(flights):
+    with programs() as compiled:
+        check_log(flights["excitation"].log)
+    assert compiled == []
+
+
+@pytest.mark.parametrize("fault", ["v_bat rises", "v_bat in mV"])
+def test_fault_of_the_battery_contradicts_time_alone(flights, fault):
+    faulty = changed(flights["race"], *FAULTS[fault](np.random.default_rng(0), 0.01))
+    contradicting = [one.name for one in check_log(faulty.log).pairs if one.verdict == CONTRADICTS]
+    assert contradicting == ["v_bat and t"]
+
+
+def test_voltage_of_a_short_flight_decides_nothing(flights):
+    log = flights["race"].log
+    rising = with_channels(log, v_bat=2.0 * log["v_bat"].mean() - log["v_bat"])
+    verdict = verdicts(check_log(rising.select(log.time < 8.0)))["v_bat and t"]
+    assert verdict == STILL
 
 
 def test_corrected_log_is_the_right_one(flights, turned_gyro):

@@ -41,6 +41,7 @@ from flytrack_sysid.inference.record import make_record
 from flytrack_sysid.inference.replay import replay, start_replay
 from flytrack_sysid.inference.search import SearchState
 from flytrack_sysid.log_file import save_log
+from tests.support.compiling import programs
 from tests.support.hidden_flights import scripted
 
 SECONDS, DT_S = 40.0, 0.01
@@ -51,7 +52,6 @@ DIRECT = np.repeat([0.1, 1.5, 1.0], [3, 3, 1])
 LEVEL = np.repeat([0.01, 0.05, 0.01], [3, 3, 1])
 DISTURBANCE = np.repeat([0.1, 1.5, 1e-3], [3, 3, 1])
 WANDER, TAU_S = 0.1 * LEVEL, 0.3
-TRACED = "/jax/core/compile/jaxpr_trace_duration"
 CAUSE = Cause("rate_scale", (), "rates", {}, 100.0, 30.0, 100.0, 90.0)
 
 
@@ -208,12 +208,7 @@ def evaluate(log, model):
 
 def test_logs_of_another_length_rate_and_channels_compile_nothing(flown):
     truth, log = flown
-    model, compiled = model_of(truth), []
-
-    def count(event, duration_s, **_):
-        if event in ("/jax/core/compile/backend_compile_duration", TRACED):
-            compiled.append(event)
-
+    model = model_of(truth)
     others = (
         log.select(np.arange(len(log)) < 1500),
         replace(log, time=0.8 * log.time),
@@ -222,10 +217,9 @@ def test_logs_of_another_length_rate_and_channels_compile_nothing(flown):
     )
     with jax.enable_x64(True):
         evaluate(log, model)
-        jax.monitoring.register_event_duration_secs_listener(count)
-        for other in others:
-            evaluate(other, model)
-    jax.monitoring.unregister_event_duration_listener(count)
+        with programs() as compiled:
+            for other in others:
+                evaluate(other, model)
     assert compiled == []
 
 
