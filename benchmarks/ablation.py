@@ -1,23 +1,24 @@
 """Ablation of the rules of the diagnosis: ``python -m benchmarks.ablation``.
 
-First it diagnoses plants (those of ``benchmarks.diagnosis``, flown for half a minute) and records
-which rules fire. Then it diagnoses each plant again without one rule at a time, for the rules that
-fired on it; a rule that did not fire changes nothing. Results are appended to
+First it diagnoses plants (those of ``benchmarks.diagnosis``, flown for half a minute), or measured
+flights, and records which rules fire. Then it diagnoses each again without one rule at a time, for
+the rules that fired on it; a rule that did not fire changes nothing. Results are appended to
 docs/results/ablation.jsonl, and a later run resumes there; ``--page`` writes
 docs/results/ablation.md from them.
 """
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import wraps
+from functools import cache, wraps
 from itertools import product
 from types import ModuleType
 from typing import Any, NamedTuple
 
 from benchmarks import hidden
 from benchmarks.diagnosis import ROWS, Trial, make_log
+from benchmarks.real.crazyflie import DATA
 from benchmarks.report import (
     RESULTS,
     append_line,
@@ -28,7 +29,9 @@ from benchmarks.report import (
     progress,
     table,
 )
+from benchmarks.seams.measured import measured_flights
 from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid import Imported
 from flytrack_sysid.diagnosis import (
     Diagnosis,
     diagnose,
@@ -46,6 +49,8 @@ from flytrack_sysid.log import FlightLog
 LINES = RESULTS / "ablation.jsonl"
 SECONDS, SECONDS_OF_ONSET = 30.0, 60.0
 SEED = 41  # no rule was made on it
+MEASURED = "measured"  # a row whose trials have the name of a flight for their motion
+SHORTEST_S, FLIGHTS_OF_A_FOLDER = 15.0, 2
 PACKAGE = "flytrack_sysid"
 
 
@@ -131,15 +136,35 @@ def outcome(diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def flown(trial: Trial) -> tuple[hidden.Truth, FlightLog, ModelParameters]:
-    """Return a plant, its flight, and its team's model."""
+def flown(trial: Trial) -> tuple[list[str], FlightLog, ModelParameters]:
+    """Return the names of a plant's effects, its flight, and its team's model."""
+    if trial.row == MEASURED:
+        flight = measured()[trial.motion]
+        return [], flight.log, flight.nominal_model()
     truth, _, log, model, _ = make_log(trial, SECONDS_OF_ONSET if trial.row == "onset" else SECONDS)
-    return truth, log, model
+    return sorted(truth.effects) + ["mocap_latency"] * (truth.mocap_late_s > 0.0), log, model
+
+
+@cache
+def measured() -> dict[str, Imported]:
+    """Return measured flights that have a nominal model, by name, at most two of a folder."""
+    chosen: dict[str, Imported] = {}
+    for name, flight in measured_flights(DATA):
+        others = [one for one in chosen if one.partition("/")[0] == name.partition("/")[0]]
+        duration_s = flight.log.time[-1] - flight.log.time[0]
+        is_known = None not in (
+            flight.craft.mass_kg,
+            flight.craft.max_rate_deg_s,
+            flight.craft.voltage_v,
+        )
+        if is_known and duration_s > SHORTEST_S and len(others) < FLIGHTS_OF_A_FOLDER:
+            chosen[name] = flight
+    return chosen
 
 
 def census(trial: Trial) -> dict[str, Any]:
     """Return the outcome on a plant, and how often each rule fired."""
-    truth, log, model = flown(trial)
+    names, log, model = flown(trial)
     fired: Counter[str] = Counter()
 
     def watched(rule: Rule) -> Callable[..., Any]:
@@ -160,7 +185,6 @@ def census(trial: Trial) -> dict[str, Any]:
             return with_all_watched(rules[1:])
 
     result = outcome(with_all_watched(RULES))
-    names = sorted(truth.effects) + ["mocap_latency"] * (truth.mocap_late_s > 0.0)
     return {"truth": names, "fired": +fired, "outcome": result}
 
 
@@ -191,7 +215,7 @@ def plant_of(line: dict[str, Any]) -> tuple[Any, ...]:
     return tuple(line[field] for field in Trial._fields)
 
 
-def measure(trials: list[Trial]) -> None:
+def measure(trials: list[Trial], rules: Iterable[str]) -> None:
     """Append the missing lines: first with all rules, then without one rule at a time."""
     lines, commit = lines_in(LINES), {"commit": commit_of_checkout()}
     counted = {plant_of(line): line for line in lines if not line["without"]}
@@ -201,7 +225,7 @@ def measure(trials: list[Trial]) -> None:
     done = {(plant_of(line), line["without"]) for line in lines}
     missing = [
         (trial, name)
-        for trial, name in product(trials, BY_NAME)
+        for trial, name in product(trials, rules)
         if name in counted[tuple(trial)]["fired"] and (tuple(trial), name) not in done
     ]
     for trial, name in progress(missing, "plants without a rule"):
@@ -211,6 +235,36 @@ def measure(trials: list[Trial]) -> None:
 def write_page() -> None:
     """Write docs/results/ablation.md from the lines."""
     lines = lines_in(LINES)
+    flights = [line for line in lines if line["row"] == MEASURED]
+    plants = [line for line in lines if line["row"] != MEASURED]
+    scores = ["score lower without it", "score higher"]
+    fill_page(
+        RESULTS / "ablation.md",
+        "ablation",
+        plants=count_whole(plants),
+        commits=", ".join(sorted({line["commit"] for line in lines})),
+        seconds=f"{SECONDS:g}",
+        seed=SEED,
+        table=table(["rule", "plants on which it fires", DIFFER, *scores], count_by_rule(plants)),
+        flights=count_whole(flights),
+        shortest=f"{SHORTEST_S:g}",
+        measured=table(
+            ["rule", "flights on which it fires", DIFFER],
+            [row[:3] for row in count_by_rule(flights)],
+        ),
+    )
+
+
+DIFFER = "outcomes that differ without it"
+
+
+def count_whole(lines: list[dict[str, Any]]) -> int:
+    """Return the number of plants or flights that were diagnosed with all rules."""
+    return sum(not line["without"] for line in lines)
+
+
+def count_by_rule(lines: list[dict[str, Any]]) -> list[list[Any]]:
+    """Return for each rule how often it fires, and what differs without it."""
     counted = {plant_of(line): line for line in lines if not line["without"]}
     rows = []
     for rule in RULES:
@@ -221,51 +275,35 @@ def write_page() -> None:
         gains = [
             score(line, whole["truth"]) - score(whole, whole["truth"]) for line, whole in changed
         ]
-        rows.append(
-            [
-                f"`{rule.name}`",
-                len(fired),
-                f"{len(changed)} of {len(removed)}",
-                sum(gain < 0 for gain in gains),
-                sum(gain > 0 for gain in gains),
-            ]
-        )
-    header = [
-        "rule",
-        "plants on which it fires",
-        "outcomes that differ without it",
-        "score lower without it",
-        "score higher",
-    ]
-    fill_page(
-        RESULTS / "ablation.md",
-        "ablation",
-        plants=len(counted),
-        commits=", ".join(sorted({line["commit"] for line in lines})),
-        seconds=f"{SECONDS:g}",
-        seed=SEED,
-        table=table(header, rows),
-    )
+        share = f"{len(changed)} of {len(removed)}"
+        lower, higher = sum(gain < 0 for gain in gains), sum(gain > 0 for gain in gains)
+        rows.append([f"`{rule.name}`", len(fired), share, lower, higher])
+    return rows
 
 
 def main(
     plants: int = 10,
     rows: str = ",".join(ROWS),
     motion: str = ",".join(hidden.MOTIONS),
+    rules: str = ",".join(BY_NAME),
     page: bool = False,
 ) -> None:
     """Diagnose plants with all rules, and without one rule at a time.
 
     plants: of each row and motion, up to this number.
-    rows: kinds of plants.
+    rows: kinds of plants, or "measured" for measured flights.
     motion: how they move.
+    rules: disabled one at a time.
     page: write the page from the lines instead.
     """
     if page:
         write_page()
         return
+    if rows == MEASURED:
+        measure([Trial(MEASURED, 0, SEED, name) for name in measured()], rules.split(","))
+        return
     every = product(range(plants), rows.split(","), motion.split(","))
-    measure([Trial(row, number, SEED, moved) for number, row, moved in every])
+    measure([Trial(row, number, SEED, moved) for number, row, moved in every], rules.split(","))
 
 
 if __name__ == "__main__":

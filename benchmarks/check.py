@@ -76,7 +76,8 @@ def cached_flight(seed: int, number: int) -> Flight:
 @lru_cache(1)
 def flights_at(data: Path) -> dict[str, FlightLog]:
     """Return the measured flights below a folder, by name; empty if there is none."""
-    return dict(measured_flights(data)) if data.is_dir() else {}
+    imported = measured_flights(data) if data.is_dir() else ()
+    return {name: one.log for name, one in imported}
 
 
 def measure(trial: Trial) -> dict[str, Any]:
