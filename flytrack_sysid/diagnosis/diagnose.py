@@ -186,7 +186,7 @@ def split(
     """
     warnings = [] if isinstance(log, FlightLog) else unused_channels(log)
     log = log if isinstance(log, FlightLog) else joined(log)
-    check_log(log)
+    check_is_usable(log)
     mask = held_out_rows(log, HELD_OUT_EVERY) if held_out is None else np.asarray(held_out)
     if mask.shape != (len(log),) or mask.dtype != bool:
         raise DiagnosisError(
@@ -460,12 +460,12 @@ def notes_on(
         *summary.refinement_notes(vetted.refined, selection.model),
         *summary.stand_in_notes(selection, flying["extended"]),
         *summary.given_law_notes(problem, selection.unexplained),
-        *summary.unseen_at_rest_notes(vetted.rejected),
+        *summary.veto_notes(vetted.rejected),
         *describe_changes(selection, named.linearization, parts.log),
     ]
 
 
-def check_log(log: FlightLog) -> None:
+def check_is_usable(log: FlightLog) -> None:
     """Raise DiagnosisError for a log without rows, or with neither gyro nor attitude."""
     if not len(log):
         raise DiagnosisError(f"{log.source}: found 0 rows, expected some seconds of flight")

@@ -664,15 +664,14 @@ def given_law_notes(problem: Problem, unexplained: Unexplained) -> list[str]:
     ]
 
 
-def unseen_at_rest_notes(rejected: Mapping[str, vetoes.Veto]) -> list[str]:
-    """Return a note on laws of the sticks that were rejected for their action at resting sticks."""
-    names = ", ".join(name for name, veto in rejected.items() if veto is vetoes.not_seen_at_rest)
-    if not names:
-        return []
-    return [
-        f"{names}: not named, since dynamics of the rate loop that no list has would look the same "
-        "while sticks move; fly stick_amplitudes, and hold each stick for a second"
-    ]
+def veto_notes(rejected: Mapping[str, vetoes.Veto]) -> list[str]:
+    """Return a note for each reason on the effects that were rejected for it."""
+    names: dict[str, list[str]] = {}
+    for effect, veto in rejected.items():
+        reason = vetoes.REASONS.get(veto.__name__)
+        if reason is not None:
+            names.setdefault(reason, []).append(effect)
+    return [f"{', '.join(effects)}: not named, since {reason}" for reason, effects in names.items()]
 
 
 def _at_bound(cause: Cause) -> str:

@@ -346,3 +346,13 @@ VETOES: tuple[tuple[Veto, ...], ...] = (
     (not_seen_at_rest,),
     (remainder_of_force_law, seen_once),
 )
+# Why a rule rejects an effect, by its name; what held-out rows contradict is told otherwise.
+REASONS = {
+    "stands_in_for_unknown": "what remains unexplained could pass for it",
+    "not_seen_at_rest": (
+        "dynamics of the rate loop that no list has would look the same while sticks move; fly "
+        "stick_amplitudes, and hold each stick for a second"
+    ),
+    "remainder_of_force_law": "it explains almost nothing beside another law of a force",
+    "seen_once": "it gains barely enough where it was fitted, and nothing on held-out rows",
+}

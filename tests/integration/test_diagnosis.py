@@ -282,7 +282,7 @@ def test_what_is_gone_on_held_out_rows_is_no_cause(diagnosed):
     _, found = diagnosed("training_only")
     assert found.causes == ()
     assert found.unexplained.flagged and "time" in found.unexplained.depends_on
-    assert any("held-out" in warning for warning in found.warnings)
+    assert any("linear_drag" in warning for warning in found.warnings)
 
 
 @pytest.mark.slow
