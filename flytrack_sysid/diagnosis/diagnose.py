@@ -320,6 +320,7 @@ class NamedModel(NamedTuple):
         found: causes that matter, including those at a search bound.
         negligible: as in ``Diagnosis``.
         lost: causes that held-out rows contradict.
+        neutral: causes whose refined intervals hold the nominal values.
     """
 
     selection: Selection
@@ -328,6 +329,7 @@ class NamedModel(NamedTuple):
     found: tuple[Cause, ...]
     negligible: tuple[Cause, ...]
     lost: tuple[str, ...]
+    neutral: tuple[str, ...]
 
 
 def name_causes(vetted: VettedModel, parts: Split) -> NamedModel:
@@ -347,7 +349,10 @@ def name_causes(vetted: VettedModel, parts: Split) -> NamedModel:
     ]
     fit = refined.fit
     extended = model if fit is None else model._replace(vector=fit.vector)
-    causes = summary.with_refined_values([*effects, *in_base], refined, extended.vector)
+    before = [*effects, *in_base]
+    causes = summary.with_refined_values(before, refined, extended.vector)
+    names = {cause.effect for cause in causes}
+    neutral = tuple(cause.effect for cause in before if cause.effect not in names)
     spans = find_spans(selection, test, parts.log)
     causes = tuple(replace(named, **spans.get(named.effect, {})) for named in causes)
 
@@ -366,6 +371,7 @@ def name_causes(vetted: VettedModel, parts: Split) -> NamedModel:
         found=causes,
         negligible=negligible,
         lost=(*contradicted, *lost_in_base),
+        neutral=neutral,
     )
 
 
@@ -457,6 +463,7 @@ def notes_on(
     problem = selection.state.problem
     return [
         *summary.collect_warnings(problem, (*vetted.refused, *named.found), named.lost),
+        *summary.neutral_notes(named.neutral),
         *summary.refinement_notes(vetted.refined, selection.model),
         *summary.stand_in_notes(selection, flying["extended"]),
         *summary.given_law_notes(problem, selection.unexplained),

@@ -215,17 +215,16 @@ class Fit(NamedTuple):
         vector: all parameters, (num_parameters,).
         indices: the free parameters.
         covariance: covariance of the free parameters, (indices, indices), scaled so that the square
-            roots of its diagonal are the half-widths of 95 % intervals.
+            roots of its diagonal are the half-widths of 95 % intervals. Parameters at the end of
+            their range are held there, and have none.
+        half_widths: half of the 95 % interval of each free index; of those at the end of their
+            range as if it went on.
     """
 
     vector: np.ndarray
     indices: tuple[int, ...]
     covariance: np.ndarray
-
-    @property
-    def half_widths(self) -> np.ndarray:
-        """Half of the 95 % interval of each free index."""
-        return np.sqrt(np.diag(self.covariance))
+    half_widths: np.ndarray
 
 
 class Target(NamedTuple):
@@ -281,7 +280,15 @@ class Target(NamedTuple):
             if costs[best] > cost * (1.0 - MIN_GAIN):
                 break
             vector = candidates[best]
-        return Fit(vector, tuple(indices), self._covariance(information, scores))
+        whole = self._covariance(information, scores)
+        room = 1e-6 * problem.scale[free_indices]
+        is_inside = (vector - problem.low)[free_indices] > room
+        is_inside &= (problem.high - vector)[free_indices] > room
+        inside = np.ix_(is_inside, is_inside)
+        covariance = np.zeros_like(whole)
+        covariance[inside] = self._covariance(information[inside], scores[:, is_inside])
+        variances = np.where(is_inside, np.diag(covariance), np.diag(whole))
+        return Fit(vector, tuple(indices), covariance, np.sqrt(variances))
 
     def _ways(
         self,

@@ -41,10 +41,7 @@ BARS_HEIGHT_IN = 2.6
 MAX_LISTED = 3  # names in one cell
 LIMITED_S = 1e-3  # a step to full stick takes longer by more than this if a limit acts
 NO_BREAK = "\u00a0"  # a space at which lines do not break
-AS_CLOSE, MIN_CHANGE_PERCENT = (
-    "no closer",
-    0.5,
-)  # % of an error: a smaller change counts as none
+MIN_CHANGE_PERCENT = 0.5  # of an error: a smaller change counts as none
 HEADLINE_HORIZON = "1"  # s of free flight, the horizon of the error in the first sentence
 WRONG = "has the wrong value of"
 LOG_BARS = 20.0  # ratio of largest to smallest error above which bars vanish on a linear scale
@@ -147,7 +144,10 @@ def describe_fault(cause: str, diagnosis: Diagnosis) -> str:
 
 
 def _gain(diagnosis: Diagnosis) -> str:
-    """Return a sentence on how much closer the extended model predicts; empty if unknown."""
+    """Return a sentence on how much closer the extended model predicts; empty if unknown.
+
+    It says what the refitted base, the named effects and a learnt law contribute.
+    """
 
     def error(model: str) -> float:
         errors = diagnosis.error[model].position_m if model in diagnosis.error else {}
@@ -160,8 +160,14 @@ def _gain(diagnosis: Diagnosis) -> str:
     text = f"Named {names}: flies {_closer(before, after)} after 1 s"
     details = [f"{after:.2g} m instead of {before:.2g} m on held-out flight"]
     if np.isfinite(refitted):
-        as_good = ": no effect adds to that" if _closer(refitted, after) == AS_CLOSE else ""
-        details.append(f"{refitted:.2g} m when only refitted{as_good}")
+        named = after if diagnosis.learned is None else error("without_learned")
+        steps = {"the refitted base": before - refitted}
+        if any(cause.effect in BY_NAME for cause in diagnosis.causes):
+            steps["the named effects"] = refitted - named
+        if diagnosis.learned is not None:
+            steps["the learnt law"] = named - after
+        shares = [f"{name} {100.0 * gain / before:.0f} %" for name, gain in steps.items()]
+        details.append(f"by {', '.join(shares)}")
     placebo = (
         diagnosis.prediction.errors.get("placebo", {})
         .get("position_m", {})
@@ -176,7 +182,7 @@ def _closer(before: float, after: float) -> str:
     """Return the decrease of an error as words, such as "13 % closer"."""
     share = 100.0 * (1.0 - after / before)
     if abs(share) < MIN_CHANGE_PERCENT:
-        return AS_CLOSE
+        return "no closer"
     return f"{abs(share):.0f} % {'closer' if share > 0.0 else 'farther off'}"
 
 
@@ -325,7 +331,10 @@ def _half_response(response: HalfResponse | None) -> str:
         return "-"
     text = f"{1e3 * response.time:.1f}"
     if response.ci95 is not None:
-        text += f" ± {1e3 * (response.ci95[1] - response.time):.1f}"
+        half_width = response.ci95[1] - response.time
+        if half_width > response.time:
+            return "not determined"
+        text += f" ± {1e3 * half_width:.1f}"
     differs = abs(response.full_stick - response.time) > LIMITED_S
     return f"{text} ({1e3 * response.full_stick:.0f})" if differs else text
 

@@ -490,18 +490,25 @@ def causes_at_end(
 def with_refined_values(
     causes: Sequence[Cause], refined: Refined, vector: np.ndarray
 ) -> tuple[Cause, ...]:
-    """Return causes with refined values and intervals, and with the values that are at a bound."""
+    """Return causes with refined values and intervals, and with the values that are at a bound.
+
+    A cause lists all parameters that were fitted to flights. Those whose intervals all hold the
+    nominal values are omitted: single steps show them, and flights do not.
+    """
     problem, fit = refined.problem, refined.fit
     half = {} if fit is None else dict(zip(fit.indices, fit.half_widths, strict=True))
     result = []
     for cause in causes:
         prefix = f"{cause.effect}." if cause.effect in BY_NAME else ""
-        fields = [prefix + name for name in cause.parameters if prefix + name in problem.names]
+        determined = [prefix + name for name in cause.parameters if prefix + name in problem.names]
+        fitted = [problem.names[index] for index in half if prefix]
+        fields = [*determined, *(field for field in fitted if field.startswith(prefix))]
+        fields = list(dict.fromkeys(fields))
         values = dict(cause.parameters)
         for field in fields:
             index, name = problem.names.index(field), field.split(".")[-1]
             if half.get(index) == 0.0 and len(values) > 1:
-                del values[name]  # no flight depends on it
+                values.pop(name, None)  # no flight depends on it
             elif index in half:
                 value, low, high = (
                     float(array[index]) for array in (vector, problem.low, problem.high)
@@ -517,13 +524,20 @@ def with_refined_values(
                 np.sqrt(slopes @ fit.covariance[np.ix_(thrust_columns, thrust_columns)] @ slopes)
             )
             values |= mean_factor(problem, vector, half_n)
-        if len(fields) == 1 and fit is not None and "." not in fields[0]:
-            low, high = values[fields[0]].ci95
-            if low <= problem.start[problem.names.index(fields[0])] <= high:
-                continue  # a lag that single steps show and flights do not
+        elif fields and all(_holds_nominal(problem, half, values, field) for field in fields):
+            continue
         beyond = ", ".join(filter(None, (_is_beyond(problem, vector, field) for field in fields)))
         result.append(replace(cause, parameters=values, beyond=beyond))
     return tuple(result)
+
+
+def _holds_nominal(
+    problem: Problem, half: Mapping[int, float], values: Mapping[str, Estimated], field: str
+) -> bool:
+    """Return whether a parameter was fitted to flights and its interval holds the nominal value."""
+    index = problem.names.index(field)
+    low, high = values[field.split(".")[-1]].ci95
+    return index in half and low <= problem.start[index] <= high
 
 
 def summarize_prediction(refined: Refined, vectors: Mapping[str, np.ndarray]) -> Prediction:
@@ -661,6 +675,16 @@ def given_law_notes(problem: Problem, unexplained: Unexplained) -> list[str]:
     return [
         "the model has learned_law from another log: nothing is learnt beside that; diagnose the "
         "model without it to learn from this log"
+    ]
+
+
+def neutral_notes(names: Sequence[str]) -> list[str]:
+    """Return a note on causes that flights do not show, if there are any."""
+    if not names:
+        return []
+    return [
+        f"{', '.join(names)}: not named, since single steps show it and free flights do not: with "
+        "all else refitted, its intervals hold the nominal values"
     ]
 
 

@@ -371,16 +371,31 @@ def test_a_value_that_no_flight_depends_on_is_not_told(state):
     """A yaw that is ahead of the others by more than their delay is in time, whatever the value."""
     problem, names = state.problem, ("delay_s", "yaw_extra_s")
     indices = tuple(problem.parameter_indices([f"command_delay.{name}" for name in names]))
-    fit = Fit(problem.start, indices, np.diag([1e-6, 0.0]))
+    moved = problem.start.copy()
+    moved[indices[0]] = 0.01
+    fit = Fit(moved, indices, np.diag([1e-6, 0.0]), np.array([1e-3, 0.0]))
     told = {name: Estimated(0.01, (0.0, 0.02), "s") for name in names}
     cause = replace(CAUSE, effect="command_delay", parameters=told)
-    (found,) = with_refined_values(
-        [cause], Refined((), fit, None, (), {}, problem, None), problem.start
+    refined = Refined((), fit, None, (), {}, problem, None)
+    (found,) = with_refined_values([cause], refined, moved)
+    assert list(found.parameters) == ["delay_s"]
+    assert found.parameters["delay_s"].ci95 == pytest.approx((0.009, 0.011))
+
+
+def test_a_cause_lists_all_that_was_fitted_and_goes_where_flights_show_none_of_it(state):
+    """A delay of nothing and of thrust alone is one of thrust; one of neither is no cause."""
+    problem, names = state.problem, ("delay_s", "thrust_extra_s")
+    indices = tuple(problem.parameter_indices([f"command_delay.{name}" for name in names]))
+    fit = Fit(problem.start, indices, np.eye(2), np.array([0.02, 0.02]))
+    cause = replace(
+        CAUSE, effect="command_delay", parameters={"delay_s": Estimated(0.01, (0.0, 0.02), "s")}
     )
-    assert list(found.parameters) == ["delay_s"] and found.parameters["delay_s"].ci95 == (
-        0.0,
-        0.001,
-    )
+    refined = Refined((), fit, None, (), {}, problem, None)
+    assert with_refined_values([cause], refined, problem.start) == ()
+    late = problem.start.copy()
+    late[indices[1]] = 0.039
+    (found,) = with_refined_values([cause], refined, late)
+    assert list(found.parameters) == list(names)
 
 
 @pytest.mark.parametrize(("effect", "is_law"), [("rate_scale", True), ("command_delay", False)])
