@@ -74,11 +74,10 @@ class Rule(NamedTuple):
 
 
 RULES = (
-    *(Rule(vetoes, rule.__name__, empty) for rules in vetoes.VETOES for rule in rules),
+    *(Rule(vetoes, rule.__name__, empty) for rule in vetoes.VETOES),
     Rule(model_selection, "with_lags_anew", empty),
     Rule(model_selection, "other_groups", empty),
     Rule(model_selection, "explain_base_by_effect", lambda state, *_: (state, None)),
-    Rule(model_selection, "is_determined", lambda *_: True),
     Rule(model_selection, "_is_immaterial", lambda *_: False),
     Rule(onset, "with_changes", lambda selection, *_: selection),
     Rule(refinement, "_flies_worse", lambda *_: False),
@@ -114,9 +113,7 @@ def replaced(rule: Rule, function: Callable[..., Any]) -> Iterator[None]:
     kept_vetoes = vetoes.VETOES
     for place in places:
         setattr(place, rule.name, function)
-    vetoes.VETOES = tuple(
-        tuple(function if one is original else one for one in rules) for rules in kept_vetoes
-    )
+    vetoes.VETOES = tuple(function if one is original else one for one in kept_vetoes)
     try:
         yield
     finally:

@@ -8,7 +8,6 @@ import numpy as np
 from scipy import stats
 
 from flytrack_env.dynamics import collective_thrust
-from flytrack_env.effects import BY_NAME
 from flytrack_sysid.inference.parameters import TAUS, THRUST_COEFFS
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import (
@@ -497,23 +496,9 @@ def _best_instead(
     for instead in _cheaper_instead(state, model, fields):
         if best is not None and instead.price >= best.price:
             continue
-        if not instead.fields or is_determined(instead.state, instead.model, instead.fields):
-            best = instead
+        best = instead
     if best is None:
         return state, None  # this state keeps its slopes, of the model without anything held
     effect = "".join(one.effect for one in best.model.candidates if one not in model.candidates)
     held = (HeldParameter(field, effect) for field in fields)
     return replace(best.state, held=(*state.held, *held)), best.model
-
-
-def is_determined(state: SearchState, model: FittedModel, fields: Sequence[str]) -> bool:
-    """Return whether the log shows that some parameter of an effect is not neutral."""
-    problem = state.problem
-    indices = problem.parameter_indices(fields)
-    change = np.abs(model.vector[indices] - problem.start[indices])
-    acting = [
-        field.split(".")[1] not in BY_NAME[field.split(".")[0]].search.shapes for field in fields
-    ]
-    linearization = state.linearized(model.vector)[1]
-    half_widths = Marginal(linearization, model, fields).half_widths()
-    return bool(np.any((change > half_widths) & acting))

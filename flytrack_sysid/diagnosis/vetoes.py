@@ -33,11 +33,8 @@ REST_S, REST_SHARE = 0.1, 0.05
 # A choice among many effects can fit the noise of one log. So an effect that gains less than this
 # many thresholds has to gain on held-out rows, too, if at least this chi2 is expected there.
 BARELY, BARELY_SHOWN = 2.0, 1.0
-# No law of a force is exact to 5 % of the force, 1/400 of what it explains. An effect that gains
-# less than this share of another one's gain is the remainder of the other's law.
-FORCE_REMAINDER = 0.0025
-# The same for a base change beside an effect that shows in the same channels. The share is larger:
-# lags and thrust curves absorb remainders more easily than a law does.
+# A change of the base that gains less than this share of the gain of an effect that shows in the
+# same channels is the remainder of the effect's law: lags and thrust curves absorb those easily.
 BASE_REMAINDER = 0.01
 # A name on a side that something unknown disturbs needs this many thresholds; base changes, which
 # absorb remainders easily, need more. A name that keeps less than KEPT_SHARE of its noncentrality
@@ -103,8 +100,8 @@ def apply_vetoes(selection: Selection, test: Problem) -> tuple[Selection, dict[s
     vetoed: dict[str, Veto] = {}
     selection = examined(selection)
     while True:
-        for rules in VETOES:
-            rejected = {effect: rule for rule in rules for effect in rule(selection, test)}
+        for rule in VETOES:
+            rejected = dict.fromkeys(rule(selection, test), rule)
             if rejected:
                 vetoed |= rejected
                 selection = examined(reject(selection, tuple(rejected)))
@@ -309,18 +306,6 @@ def is_force_law(effect: str) -> bool:
     return acts_on_force and effect != "thrust_scale"
 
 
-def remainder_of_force_law(selection: Selection, test: Problem) -> list[str]:
-    """Reject laws of a force that explain almost nothing compared with another one."""
-    gains = {
-        effect: ablation.gain
-        for effect, ablation in selection.ablations.items()
-        if is_force_law(effect)
-    }
-    return [
-        effect for effect, gain in gains.items() if gain < FORCE_REMAINDER * max(gains.values())
-    ]
-
-
 def seen_once(selection: Selection, test: Problem) -> list[str]:
     """Reject effects that gain barely enough where they were fitted, and nothing on held-out rows.
 
@@ -339,12 +324,11 @@ def seen_once(selection: Selection, test: Problem) -> list[str]:
     return [effect for effect, one in selection.ablations.items() if is_rejected(effect, one)]
 
 
-# Rules in one row are applied together, to the same selection.
-VETOES: tuple[tuple[Veto, ...], ...] = (
-    (stands_in_for_unknown,),
-    (contradicted_on_held_out,),
-    (not_seen_at_rest,),
-    (remainder_of_force_law, seen_once),
+VETOES: tuple[Veto, ...] = (
+    stands_in_for_unknown,
+    contradicted_on_held_out,
+    not_seen_at_rest,
+    seen_once,
 )
 # Why a rule rejects an effect, by its name; what held-out rows contradict is told otherwise.
 REASONS = {
@@ -353,6 +337,5 @@ REASONS = {
         "dynamics of the rate loop that no list has would look the same while sticks move; fly "
         "stick_amplitudes, and hold each stick for a second"
     ),
-    "remainder_of_force_law": "it explains almost nothing beside another law of a force",
     "seen_once": "it gains barely enough where it was fitted, and nothing on held-out rows",
 }

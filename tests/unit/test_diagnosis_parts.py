@@ -442,3 +442,8 @@ def test_a_long_log_is_thinned_with_a_warning_that_counts_judged_rows(state, mon
 )
 def test_what_is_learnt_has_to_improve_held_out_flights(ratio, lost, acts_there, expected):
     assert improves_flights(np.array(ratio), np.array(lost), acts_there) is expected
+
+
+def test_every_veto_has_a_reason_to_tell():
+    told_otherwise = {vetoes.contradicted_on_held_out.__name__}
+    assert set(vetoes.REASONS) == {veto.__name__ for veto in vetoes.VETOES} - told_otherwise
