@@ -1,0 +1,165 @@
+"""Flights of one craft, diagnosed apart: ``python -m benchmarks.repeatability``.
+
+Each measured flight is diagnosed alone, with the nominal model that is imported with it. A name is
+a statement about the craft only if another flight of the same craft gives it too. Results are
+appended to docs/results/repeatability.jsonl, and a later run of the same commit resumes there;
+``--page`` writes docs/results/repeatability.md from them.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from itertools import combinations
+from time import process_time
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.real.crazyflie import DATA
+from benchmarks.report import RESULTS, command, fill_page, lines_of_commit, record_trials, table
+from benchmarks.seams.measured import measured_flights
+from flytrack_sysid import Imported, diagnose
+from flytrack_sysid.inference.parameters import STICKS
+
+LINES = RESULTS / "repeatability.jsonl"
+SHORTEST_S = 14.0
+CRAFT = {  # and the beginnings of its flights' names
+    "Crazyflie, rate policies": ("crazyflie_rate_flights/",),
+    "Crazyflie, angle mode, two days": ("cf_utias_angle/",),
+    "Crazyflie of ARPL, motors": ("cf_arpl_motors/",),
+    "NanoBench, one trajectory twice": ("nanobench/B3_", "nanobench/B9_"),
+}
+Line = Mapping[str, Any]
+
+
+class Trial(NamedTuple):
+    """A flight to diagnose, and the craft that flew it."""
+
+    craft: str
+    flight: str
+
+
+@cache
+def flights() -> dict[str, Imported]:
+    """Return the measured flights that are long enough, by name."""
+    imported = measured_flights(DATA) if DATA.is_dir() else ()
+    return {
+        name: flight
+        for name, flight in imported
+        if flight.log.time[-1] - flight.log.time[0] > SHORTEST_S
+    }
+
+
+def trials() -> list[Trial]:
+    """Return the flights of each craft."""
+    return [
+        Trial(craft, name)
+        for craft, beginnings in CRAFT.items()
+        for name in flights()
+        if name.startswith(beginnings)
+    ]
+
+
+def measure(trial: Trial) -> dict[str, Any]:
+    """Diagnose a flight: causes with equivalents, values and times to half response."""
+    flight = flights()[trial.flight]
+    start = process_time()
+    found = diagnose(flight.log, flight.nominal_model())
+    return {
+        "cpu_s": process_time() - start,
+        "verdict": found.verdict,
+        "causes": {cause.effect: sorted(cause.equivalent) for cause in found.causes},
+        "values": {
+            f"{cause.effect}.{name}": [value.value, *value.ci95]
+            for cause in found.causes
+            for name, value in cause.parameters.items()
+        },
+        "half_responses_s": {
+            stick: [response.time, *response.ci95]
+            for stick, response in found.half_response_s.get("extended", {}).items()
+            if response.ci95 is not None
+        },
+    }
+
+
+def is_same_class(one: Mapping[str, list[str]], other: Mapping[str, list[str]]) -> bool:
+    """Return whether each cause of either is a cause or an equivalent of one of the other."""
+
+    def covers(some: Mapping[str, list[str]], names: Iterable[str]) -> bool:
+        known = {name for cause, equivalent in some.items() for name in (cause, *equivalent)}
+        return set(names) <= known
+
+    return covers(one, other) and covers(other, one)
+
+
+def overlaps(one: list[float], other: list[float]) -> bool:
+    """Return whether two intervals overlap; each is a value, its lowest and its highest."""
+    return one[1] <= other[2] and other[1] <= one[2]
+
+
+def compare(lines: Sequence[Line]) -> list[Any]:
+    """Return a row of the page: how alike the flights of a craft are."""
+    pairs = list(combinations(lines, 2))
+    values = [
+        overlaps(one[name][key], other[name][key])
+        for one, other in pairs
+        for name in ("values", "half_responses_s")
+        for key in one[name].keys() & other[name].keys()
+        if not is_coefficient(key)
+    ]
+    halves = [
+        1e3 * float(np.median([0.5 * (one[2] - one[1]) for one in of_stick])) if of_stick else None
+        for of_stick in (
+            [line["half_responses_s"][stick] for line in lines if stick in line["half_responses_s"]]
+            for stick in STICKS
+        )
+    ]
+    same = [set(one["causes"]) == set(other["causes"]) for one, other in pairs]
+    same_class = [is_same_class(one["causes"], other["causes"]) for one, other in pairs]
+    return [
+        len(lines),
+        f"{sum(same)} of {len(pairs)}",
+        f"{sum(same_class)} of {len(pairs)}",
+        f"{sum(values)} of {len(values)}",
+        *("none" if half is None else f"± {half:.1f}" for half in halves),
+    ]
+
+
+def is_coefficient(name: str) -> bool:
+    """Return whether a value is a coefficient of the thrust curve: these trade off."""
+    return name.startswith("thrust_curve.c")
+
+
+def write_page() -> None:
+    """Write docs/results/repeatability.md from the lines of the last commit."""
+    lines = [line for line in lines_of_commit(LINES) if "error" not in line]
+    by_craft = {craft: [line for line in lines if line["craft"] == craft] for craft in CRAFT}
+    header = "craft | flights | pairs with the same names | the same class | values that overlap"
+    header += "".join(f" | {stick}, ms" for stick in STICKS)
+    names = [
+        [line["flight"].partition("/")[2], ", ".join(sorted(line["causes"])) or "none"]
+        for line in lines
+    ]
+    fill_page(
+        RESULTS / "repeatability.md",
+        "repeatability",
+        crafts=table(header, [[craft, *compare(of)] for craft, of in by_craft.items() if of]),
+        flights=table("flight | names", names),
+        shortest=f"{SHORTEST_S:g}",
+        seconds=f"{np.median([line['cpu_s'] for line in lines]):.0f}",
+        commit=lines[-1]["commit"],
+    )
+
+
+def main(page: bool = False) -> None:
+    """Diagnose flights.
+
+    page: write the page from the lines instead.
+    """
+    if page:
+        write_page()
+        return
+    record_trials(LINES, trials(), measure)
+
+
+if __name__ == "__main__":
+    command(main)

@@ -1,0 +1,39 @@
+"""Diagnoses of flights of one craft are compared by names, classes and intervals."""
+
+import pytest
+
+from benchmarks.repeatability import compare, is_same_class, overlaps
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "expected"),
+    [
+        ({"wind": []}, {"wind": []}, True),
+        ({"wind": ["thrust_tilt"]}, {"thrust_tilt": ["wind"]}, True),
+        ({"wind": ["thrust_tilt"]}, {"thrust_tilt": []}, False),
+        ({"wind": []}, {"wind": [], "linear_drag": []}, False),
+        ({}, {}, True),
+    ],
+)
+def test_causes_are_of_one_class_if_each_is_an_equivalent_of_the_other(one, other, expected):
+    assert is_same_class(one, other) is expected and is_same_class(other, one) is expected
+
+
+def test_intervals_overlap_where_they_share_a_value():
+    assert overlaps([1.0, 0.5, 1.5], [2.0, 1.5, 2.5])
+    assert not overlaps([1.0, 0.5, 1.4], [2.0, 1.5, 2.5])
+
+
+def test_a_craft_counts_pairs_values_and_widths():
+    def line(causes, low_s):
+        values = {"linear_drag.b_xy": [0.2, 0.1, 0.3], "thrust_curve.c0": [low_s, low_s, low_s]}
+        return {
+            "causes": {name: [] for name in causes},
+            "values": values,
+            "half_responses_s": {"roll": [low_s + 0.001, low_s, low_s + 0.002]},
+        }
+
+    lines = [line(["linear_drag"], 0.02), line(["linear_drag"], 0.021), line(["wind"], 0.03)]
+    flights, same, same_class, overlapping, roll, pitch, *_ = compare(lines)
+    assert (flights, same, same_class, overlapping) == (3, "1 of 3", "1 of 3", "4 of 6")
+    assert (roll, pitch) == ("± 1.0", "none")
