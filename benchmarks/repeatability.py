@@ -73,6 +73,12 @@ def measure(trial: Trial) -> dict[str, Any]:
             for cause in found.causes
             for name, value in cause.parameters.items()
         },
+        "lift": {
+            name: [value.value, *value.ci95]
+            for lift in [found.lift.get("extended")]
+            if lift is not None
+            for name, value in (("ratio", lift.thrust_to_weight), ("hover", lift.hover))
+        },
         "half_responses_s": {
             stick: [response.time, *response.ci95]
             for stick, response in found.half_response_s.get("extended", {}).items()
@@ -102,7 +108,7 @@ def compare(lines: Sequence[Line]) -> list[Any]:
     values = [
         overlaps(one[name][key], other[name][key])
         for one, other in pairs
-        for name in ("values", "half_responses_s")
+        for name in ("values", "lift", "half_responses_s")
         for key in one[name].keys() & other[name].keys()
         if not is_coefficient(key)
     ]

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import on_one_clock, with_causal_commands
-from flytrack_sysid.diagnosis import summary
+from flytrack_sysid.diagnosis import craft, summary
 from flytrack_sysid.diagnosis.beyond import Learned, with_and_without, with_learned
 from flytrack_sysid.diagnosis.first_look import FirstLook
 from flytrack_sysid.diagnosis.late_poses import with_late_poses
@@ -447,9 +447,10 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
         ),
         prediction=prediction,
         changed=summary.changed_parameters(linearization, extended, vetted.refined),
-        half_response_s=summary.summarize_half_responses(
+        half_response_s=craft.summarize_half_responses(
             linearization, selection.model, refined, flying
         ),
+        lift=craft.summarize_lift(linearization, selection.model, refined, flying),
         outliers=outliers,
         learned=learned,
     )

@@ -39,6 +39,7 @@ JSON_NAME, MODEL_NAME, REPORT_NAME = "diagnosis.json", "extended_model.json", "r
 MAX_PICTURED = 6  # causes with the largest gain that have a picture: nobody reads more pictures
 BARS_HEIGHT_IN = 2.6
 MAX_LISTED = 3  # names in one cell
+MAX_HALF_WIDTH = 0.5  # of thrust over weight, and of a stick: with more nothing is known
 LIMITED_S = 1e-3  # a step to full stick takes longer by more than this if a limit acts
 NO_BREAK = "\u00a0"  # a space at which lines do not break
 MIN_CHANGE_PERCENT = 0.5  # of an error: a smaller change counts as none
@@ -272,10 +273,24 @@ def _errors_table(diagnosis: Diagnosis) -> Table:
         ]
         for stick in diagnosis.half_response_s.get("extended", {})
     ]
+    lifts = [diagnosis.lift.get(name) for name in diagnosis.error]
+    for lift in [one for one in lifts if one is not None][:1]:
+        rows += [
+            [
+                f"thrust over weight at full stick, {lift.full_v:.3g} V",
+                "1",
+                *("-" if one is None else _known(one.thrust_to_weight) for one in lifts),
+            ],
+            [
+                f"stick of the hover, {lift.middle_v:.3g} V",
+                "1",
+                *("-" if one is None else _known(one.hover) for one in lifts),
+            ],
+        ]
     caption = (
         "Held-out part. One step: 1 is as bad as predicting the mean; position in free flight, "
         "rms. Half response: of body rate or thrust to a small step of the stick; in brackets, to "
-        "full stick."
+        "full stick. Thrust and hover by the thrust curve alone."
     )
     return Table(
         ["error", "unit", *(name.replace("_", " ") for name in diagnosis.error)], rows, caption
@@ -337,6 +352,27 @@ def _half_response(response: HalfResponse | None) -> str:
         text += f" ± {1e3 * half_width:.1f}"
     differs = abs(response.full_stick - response.time) > LIMITED_S
     return f"{text} ({1e3 * response.full_stick:.0f})" if differs else text
+
+
+def _known(estimate: Estimated) -> str:
+    """Return a value, with half of its interval if it has one."""
+    half = estimate.half_width
+    if half > MAX_HALF_WIDTH:
+        return "not determined"
+    return f"{estimate.value:.3g}" + (f" ± {half:.2g}" if half > 0.0 else "")
+
+
+def _lift_text(diagnosis: Diagnosis) -> list[str]:
+    """Return a line on what the craft lifts; none if the log does not show the thrust."""
+    if "extended" not in diagnosis.lift:
+        return []
+    nominal, lift = diagnosis.lift["nominal"], diagnosis.lift["extended"]
+    return [
+        f"thrust over weight at full stick and {lift.full_v:.3g} V: "
+        f"{_known(lift.thrust_to_weight)}, the model says {_known(nominal.thrust_to_weight)}; "
+        f"stick of the hover at {lift.middle_v:.3g} V: {_known(lift.hover)}, the model says "
+        f"{_known(nominal.hover)}"
+    ]
 
 
 def _limits_part(diagnosis: Diagnosis) -> Part:
@@ -523,8 +559,9 @@ def text_of(diagnosis: Diagnosis) -> str:
         lines.append(f"negligible: {cause.effect}: {_plus_minus(cause)}")
     answers = diagnosis.half_response_s.get("extended", {}).items()
     if answers:
-        times = ", ".join(f"{stick} {_half_response(response)} ms" for stick, response in answers)
-        lines.append(f"time from a stick to half of the response: {times}")
+        times = ", ".join(f"{stick} {_half_response(response)}" for stick, response in answers)
+        lines.append(f"time from a stick to half of the response, ms: {times}")
+    lines += _lift_text(diagnosis)
     if diagnosis.unexplained.depends_on:
         lines.append(f"unexplained, depends on: {', '.join(diagnosis.unexplained.depends_on)}")
     if diagnosis.learned is not None:

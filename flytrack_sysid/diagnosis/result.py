@@ -196,6 +196,23 @@ class HalfResponse:
 
 
 @dataclass(frozen=True)
+class Lift:
+    """What a model's thrust carries. Only the extended model's values have an interval of a width.
+
+    Attributes:
+        full_v: voltage of the full battery.
+        thrust_to_weight: at full stick and that voltage.
+        middle_v: voltage between the empty and the full battery.
+        hover: thrust command that carries the weight at that voltage.
+    """
+
+    full_v: float
+    thrust_to_weight: Estimated
+    middle_v: float
+    hover: Estimated
+
+
+@dataclass(frozen=True)
 class Outliers:
     """The number of outliers in a channel, and the number of rows."""
 
@@ -228,6 +245,7 @@ class Diagnosis:
         prediction: errors of free flight.
         changed: parameters whose value in the extended model differs from the nominal one.
         half_response_s: by model (nominal, refitted_base, extended) and by stick.
+        lift: by model, if the log shows the thrust.
         outliers: by channel, if any.
         learned: a law for what is unexplained, part of the extended model.
     """
@@ -250,6 +268,7 @@ class Diagnosis:
     prediction: Prediction = Prediction()
     changed: tuple[Changed, ...] = ()
     half_response_s: Mapping[str, Mapping[str, HalfResponse]] = field(default_factory=dict)
+    lift: Mapping[str, Lift] = field(default_factory=dict)
     outliers: Mapping[str, Outliers] = field(default_factory=dict)
     learned: Learned | None = None
 
@@ -279,6 +298,7 @@ class Diagnosis:
             "prediction": _plain(self.prediction),
             "changed": _plain(self.changed),
             "half_response_s": _plain(self.half_response_s),
+            "lift": _plain(self.lift),
             "noise": self.noise,
             "outliers": _plain(self.outliers),
             "data": {"file": self.source, "sha256": self.sha256, "voltages": self.voltages},

@@ -30,7 +30,6 @@ from flytrack_sysid.diagnosis.result import (
     Changed,
     Errors,
     Estimated,
-    HalfResponse,
     NotIdentifiable,
     Prediction,
     Unexplained,
@@ -41,7 +40,6 @@ from flytrack_sysid.inference.free_flight import HORIZONS_S, QUANTITIES
 from flytrack_sysid.inference.parameters import (
     DRAIN,
     MAX_RATES,
-    STICKS,
     THRUST_COEFFS,
     as_float32,
     from_vector,
@@ -56,13 +54,11 @@ from flytrack_sysid.inference.score_test import (
     threshold,
 )
 from flytrack_sysid.inference.search import FittedModel, SearchState
-from flytrack_sysid.response import FULL_STEP, SMALL_STEP, half_responses
 
 LOOSE = 0.5  # of the prior's width: a parameter with a wider interval is not determined
 SCALE_TWINS = (
     "thrust_curve",
 )  # mass, payload, battery and motors all scale the thrust over the mass
-SLOPE_STEP = 1e-3  # of a parameter's scale, for slopes of times to half response
 STILL = (*MAX_RATES, DRAIN, *THRUST_COEFFS)  # a model where these are 0 does not move
 
 
@@ -119,40 +115,6 @@ def mean_factor(problem: Problem, vector: np.ndarray, half_n: float) -> dict[str
     if before <= 0.0:
         return {}
     return {"mean_factor": Estimated.around(after / before, half_n / before, "1")}
-
-
-def summarize_half_responses(
-    linearization: Linearization,
-    model: FittedModel,
-    refined: Refined,
-    vectors: Mapping[str, np.ndarray],
-) -> dict[str, dict[str, HalfResponse]]:
-    """Return the times to half response by model and stick.
-
-    The extended model also gets intervals: first-order propagation of the covariance of all its
-    parameters.
-    """
-    problem, fit = refined.problem, refined.fit
-    indices = list(model.indices if fit is None else fit.indices)
-    nudged, step = problem.nudged(vectors["extended"], indices, SLOPE_STEP)
-    small = half_responses(np.stack([*vectors.values(), *nudged]), problem.like, SMALL_STEP)
-    full = half_responses(np.stack(list(vectors.values())), problem.like, FULL_STEP)
-    extended = small[list(vectors).index("extended")]
-    slopes = np.nan_to_num((small[len(vectors) :] - extended) / step[:, None]).T
-    if fit is None:
-        names = [problem.names[index] for index in indices]
-        halves = Marginal(linearization, model, names).half_widths(slopes)
-    else:
-        halves = np.sqrt(np.diag(slopes @ fit.covariance @ slopes.T))
-    result = {
-        name: dict(zip(STICKS, map(HalfResponse, small_s.tolist(), full_s.tolist()), strict=True))
-        for name, small_s, full_s in zip(vectors, small, full, strict=False)
-    }
-    for (stick, response), half in zip(result["extended"].items(), halves.tolist(), strict=True):
-        result["extended"][stick] = replace(
-            response, ci95=(max(response.time - half, 0.0), response.time + half)
-        )
-    return result
 
 
 def find_channel(problem: Problem, reduced: np.ndarray, full: np.ndarray) -> str:

@@ -305,7 +305,11 @@ def test_other_base_parameters_are_named_and_measured(diagnosed):
     case, found = diagnosed("mass")
     (cause,) = found.causes
     assert cause.effect == "thrust_scale"
-    assert is_within(case.model.m / case.truth.mass, cause.parameters["factor"])
+    lighter = case.model.m / case.truth.mass
+    assert is_within(lighter, cause.parameters["factor"])
+    nominal, extended = (found.lift[name].thrust_to_weight for name in ("nominal", "extended"))
+    low, high = (end / nominal.value for end in extended.ci95)
+    assert low <= lighter <= high and high - low < 0.05
 
 
 @pytest.mark.slow

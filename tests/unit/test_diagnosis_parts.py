@@ -13,8 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
 from flytrack.cli import main
+from flytrack_env.dynamics import collective_thrust
 from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, vetoes
+from flytrack_sysid.diagnosis.craft import lift_of
 from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
 from flytrack_sysid.diagnosis.learned import improves_flights
 from flytrack_sysid.diagnosis.model_selection import Ablation
@@ -302,6 +304,20 @@ def test_logs_are_joined_by_what_they_all_have_with_a_warning(flown):
     assert joined([first]) is first
     with pytest.raises(DiagnosisError, match="logs: found none"):
         joined([])
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.2])
+def test_a_hover_carries_the_weight_and_more_thrust_lifts_more(state, factor):
+    problem = state.problem
+    vector = problem.start.copy()
+    vector[problem.names.index("thrust_scale.factor")] = factor
+    ratio, hover = lift_of(problem, vector)
+    like, battery = problem.like, problem.like.battery
+    middle_v = 0.5 * (float(battery.empty_v) + float(battery.full_v))
+    coeffs = factor * problem.start[problem.parameter_indices(THRUST_COEFFS)]
+    weight_n = float(like.m) * float(like.g)
+    assert float(collective_thrust(hover, middle_v, coeffs)) == pytest.approx(weight_n, rel=1e-3)
+    assert ratio == pytest.approx(factor * lift_of(problem, problem.start)[0])
 
 
 @pytest.mark.slow

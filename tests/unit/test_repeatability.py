@@ -30,6 +30,7 @@ def test_a_craft_counts_pairs_values_and_widths():
         return {
             "causes": {name: [] for name in causes},
             "values": values,
+            "lift": {},
             "half_responses_s": {"roll": [low_s + 0.001, low_s, low_s + 0.002]},
         }
 
