@@ -12,7 +12,7 @@ import numpy as np
 from flytrack_env.dynamics import collective_thrust
 from flytrack_env.thrust import hover_action
 from flytrack_sysid.diagnosis.model_selection import Marginal
-from flytrack_sysid.diagnosis.refinement import Refined
+from flytrack_sysid.diagnosis.refinement import LAG_STEP, Refined
 from flytrack_sysid.diagnosis.result import Estimated, HalfResponse, Lift
 from flytrack_sysid.inference.parameters import STICKS, THRUST_COEFFS
 from flytrack_sysid.inference.problem import Problem
@@ -56,7 +56,8 @@ def summarize_half_responses(
 ) -> dict[str, dict[str, HalfResponse]]:
     """Return the times to half response by model and stick; the extended model's with intervals."""
     problem, indices = refined.problem, free_indices(model, refined)
-    nudged, step = problem.nudged(vectors["extended"], indices, SLOPE_STEP)
+    least_lag_s = LAG_STEP * float(np.median(problem.chunks.record.step_s))
+    nudged, step = problem.nudged(vectors["extended"], indices, SLOPE_STEP, least_lag_s)
     small = half_responses(np.stack([*vectors.values(), *nudged]), problem.like, SMALL_STEP)
     full = half_responses(np.stack(list(vectors.values())), problem.like, FULL_STEP)
     extended = small[list(vectors).index("extended")]

@@ -65,6 +65,7 @@ MAX_ROUNDS, REFIT_ROUNDS, MIN_GAIN = (
     2,
     1e-3,
 )  # iterations of a fit, and of a fit without an effect; smallest relative decrease of the cost
+LAG_STEP = 0.5  # of the time between rows: the least step of a lag for intervals
 NEUTRAL = 1e-3  # largest distance from nominal, relative to a parameter's scale
 DAMPINGS = np.array([1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0])[:BATCH]
 # An effect has to improve held-out prediction by SURE standard errors over blocks. LIKELY standard
@@ -257,29 +258,21 @@ class Target(NamedTuple):
         """Fit a model from a start vector by damped Gauss-Newton with one-sided differences."""
         problem, free_indices = self.problem, np.array(indices, int)
         vector = problem.clipped(vector)
-        for iteration in range(rounds + 1):
-            moved, step = problem.nudged(vector, indices)
-            residuals = self.residuals(np.concatenate([vector[None], moved]))
-            columns = (residuals[1:] - residuals[0]) / step[:, None, None]
-            root = np.sqrt(OUTLIER / np.maximum(np.abs(residuals[0]), OUTLIER))
+        for _ in range(rounds):
+            information, scores, cost = self.linearized(vector, indices)
             prior, pull = (
                 prior_information(problem)[free_indices],
                 (vector - problem.start)[free_indices],
             )
-            scores = np.einsum("pwn,wn->wp", columns, residuals[0] * root**2)
-            flat = (columns * root).reshape(len(free_indices), -1)
-            information = flat @ flat.T + np.diag(prior)
-            if iteration == rounds:
-                break
             candidates = self._ways(
                 vector, free_indices, information, scores.sum(axis=0) + prior * pull
             )
             costs = self.cost(self.residuals(candidates), candidates)
-            cost = self.cost(residuals[:1], vector[None])[0]
             best = int(np.argmin(costs))
             if costs[best] > cost * (1.0 - MIN_GAIN):
                 break
             vector = candidates[best]
+        information, scores, _ = self.linearized(vector, indices, LAG_STEP * self.step_s)
         whole = self._covariance(information, scores)
         room = 1e-6 * problem.scale[free_indices]
         is_inside = (vector - problem.low)[free_indices] > room
@@ -289,6 +282,31 @@ class Target(NamedTuple):
         covariance[inside] = self._covariance(information[inside], scores[:, is_inside])
         variances = np.where(is_inside, np.diag(covariance), np.diag(whole))
         return Fit(vector, tuple(indices), covariance, np.sqrt(variances))
+
+    @property
+    def step_s(self) -> float:
+        """Usual time between rows, s."""
+        return float(np.median(self.windows.record.step_s))
+
+    def linearized(
+        self, vector: np.ndarray, indices: Sequence[int], least_lag_s: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return information, scores of windows, (windows, indices), and cost of a vector.
+
+        Args:
+            vector: all parameters.
+            indices: of the free ones.
+            least_lag_s: as of ``Problem.nudged``.
+        """
+        problem = self.problem
+        moved, step = problem.nudged(vector, indices, least_lag_s=least_lag_s)
+        residuals = self.residuals(np.concatenate([vector[None], moved]))
+        columns = (residuals[1:] - residuals[0]) / step[:, None, None]
+        root = np.sqrt(OUTLIER / np.maximum(np.abs(residuals[0]), OUTLIER))
+        scores = np.einsum("pwn,wn->wp", columns, residuals[0] * root**2)
+        flat = (columns * root).reshape(len(step), -1)
+        information = flat @ flat.T + np.diag(prior_information(problem)[list(indices)])
+        return information, scores, float(self.cost(residuals[:1], vector[None])[0])
 
     def _ways(
         self,

@@ -509,7 +509,11 @@ class Problem:
         return np.clip(vectors, self.low, self.high)
 
     def nudged(
-        self, vector: np.ndarray, indices: Sequence[int], share: float = RELATIVE_STEP
+        self,
+        vector: np.ndarray,
+        indices: Sequence[int],
+        share: float = RELATIVE_STEP,
+        least_lag_s: float = 0.0,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return copies of a vector, each with one parameter moved, and the steps, for slopes.
 
@@ -520,9 +524,12 @@ class Problem:
             vector: to copy.
             indices: of the parameters to move.
             share: the step as a share of a parameter's scale.
+            least_lag_s: the smallest step of a lag, s. One far below the time between rows changes
+                nothing, so that its slope says nothing of a longer one.
         """
         indices = list(indices)
-        step = share * self.scale[indices]
+        is_lag = np.isin(indices, self.parameter_indices(TAUS))
+        step = np.maximum(share * self.scale[indices], least_lag_s * is_lag)
         step = np.where(vector[indices] + step > self.high[indices], -step, step)
         moved = np.repeat(vector[None], len(indices), axis=0)
         moved[np.arange(len(indices)), indices] += step
