@@ -39,6 +39,8 @@ JSON_NAME, MODEL_NAME, REPORT_NAME = "diagnosis.json", "extended_model.json", "r
 MAX_PICTURED = 6  # causes with the largest gain that have a picture: nobody reads more pictures
 BARS_HEIGHT_IN = 2.6
 MAX_LISTED = 3  # names in one cell
+# More says only that a sensor has hardly any noise of its own: rates derived from an attitude.
+MAX_TIMES_NOISE = 100.0
 MAX_HALF_WIDTH = 0.5  # of thrust over weight, and of a stick: with more nothing is known
 LIMITED_S = 1e-3  # a step to full stick takes longer by more than this if a limit acts
 NO_BREAK = "\u00a0"  # a space at which lines do not break
@@ -405,7 +407,10 @@ def _unexplained_parts(diagnosis: Diagnosis) -> list[Part]:
     dependences = ", ".join(unexplained.depends_on)
     parts: list[Part] = [Text(f"What is left is more than noise. It depends on: {dependences}.")]
     if unexplained.shares:
-        shares = [[name, _number(share)] for name, share in unexplained.shares.items()]
+        shares = [
+            [name, _number(share) if share < MAX_TIMES_NOISE else f"above {MAX_TIMES_NOISE:g}"]
+            for name, share in unexplained.shares.items()
+        ]
         caption = "Size of what is left (rms) by what it depends on, in units of the sensor noise"
         parts.append(Table(["channel: dependence", "times the sensor noise"], shares, caption))
     return parts

@@ -1,8 +1,9 @@
 """Whether a cause matters: a significant cause may still be too small to be named.
 
 A cause matters if a parameter differs from the nominal model's by a notable size (an effect's
-``notable``; for the base, the sizes here), or if the error of flight without it, all else refitted,
-is at least 2 % larger on held-out rows.
+``notable``; for the base, the sizes here), if the error of flight without it, all else refitted,
+is at least 2 % larger on held-out rows, or if a value of a cause of notable size is then beyond its
+95 % interval: who leaves it out gets another value wrong.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -41,16 +42,35 @@ def split_by_size(
         without: returns the vector that is refitted without a cause.
     """
     small = [cause for cause in causes if not is_notable(cause.effect, problem, vector)]
+    notable = [cause for cause in causes if cause not in small]
     full_error = flight_error(vector) if small else {}
     negligible = []
     for cause in small:
-        error = flight_error(without(cause))
-        if all(
+        reduced = without(cause)
+        error = flight_error(reduced)
+        flies_as_well = all(
             error[horizon] < (1.0 + MIN_ERROR_FRACTION) * full_error[horizon]
             for horizon in full_error
-        ):
+        )
+        if flies_as_well and not any(is_bent(one, problem, vector, reduced) for one in notable):
             negligible.append(cause)
     return tuple(cause for cause in causes if cause not in negligible), tuple(negligible)
+
+
+def is_bent(cause: Cause, problem: Problem, vector: np.ndarray, reduced: np.ndarray) -> bool:
+    """Return whether a reduced model has a value of a cause beyond the interval that it has.
+
+    Coefficients of the thrust curve trade off, so that theirs tell nothing.
+    """
+    prefix = f"{cause.effect}." if cause.effect in BY_NAME else ""
+    for name, estimate in cause.parameters.items():
+        field = prefix + name
+        if field in problem.names and field not in THRUST_COEFFS:
+            index = problem.names.index(field)
+            low, high = estimate.ci95
+            if low <= vector[index] <= high and not low <= reduced[index] <= high:
+                return True
+    return False
 
 
 def is_notable(name: str, problem: Problem, vector: np.ndarray) -> bool:

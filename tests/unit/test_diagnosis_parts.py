@@ -24,6 +24,7 @@ from flytrack_sysid.diagnosis.onset import windowed
 from flytrack_sysid.diagnosis.refinement import Fit, Refined
 from flytrack_sysid.diagnosis.report import describe_verdict
 from flytrack_sysid.diagnosis.result import Cause, Estimated
+from flytrack_sysid.diagnosis.size import is_bent
 from flytrack_sysid.diagnosis.summary import collect_warnings, stand_in_notes, with_refined_values
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.inference import noise as noises
@@ -304,6 +305,23 @@ def test_logs_are_joined_by_what_they_all_have_with_a_warning(flown):
     assert joined([first]) is first
     with pytest.raises(DiagnosisError, match="logs: found none"):
         joined([])
+
+
+def test_a_cause_matters_if_another_value_is_wrong_without_it(state):
+    problem = state.problem
+    index = problem.names.index("gyro_scale.x")
+    cause = replace(
+        CAUSE, effect="gyro_scale", parameters={"x": Estimated(0.05, (0.04, 0.06), "1")}
+    )
+    vector, near, far = (problem.start.copy() for _ in range(3))
+    vector[index], near[index], far[index] = 0.05, 0.055, 0.07
+    assert not is_bent(cause, problem, vector, near)
+    assert is_bent(cause, problem, vector, far)
+    # A factor that was found between two thrust curves is no parameter of the model.
+    factor = replace(
+        CAUSE, effect="thrust_scale", parameters={"factor": Estimated(0.8, (0.7, 0.9), "1")}
+    )
+    assert not is_bent(factor, problem, problem.start, problem.start)
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.2])
