@@ -143,13 +143,21 @@ def described(
     return Likelihoods(values, len(shown), length_s, correlations, sizes)
 
 
-def compare_forces(log: FlightLog, attitude: Rotation, gravity: float) -> Likelihoods | None:
+def compare_forces(
+    log: FlightLog, attitude: Rotation, gravity: float, with_bias: bool = False
+) -> Likelihoods | None:
     """Return likelihoods by which velocity, attitude and accelerometer agree, (6, 48, 48).
 
     The first axis is the direction of up in the attitude's world, the second the frame from the
     velocity's axes to that world, the third from the accelerometer's axes to the attitude's body.
     Scales of velocity and accelerometer are free: the change of the velocity is regressed on the
     rotated force and on gravity.
+
+    Args:
+        log: a flight.
+        attitude: of its rows.
+        gravity: m/s^2.
+        with_bias: whether what a bias of the accelerometer explains is no evidence.
 
     Returns:
         likelihoods: None if there are too few windows.
@@ -160,9 +168,12 @@ def compare_forces(log: FlightLog, attitude: Rotation, gravity: float) -> Likeli
     for length_s, windows in useful_windows(log):
         changes = windows.change_of(log["v"]) / windows.durations[:, None]
         means = windows.mean_of(log, products).reshape(-1, 3, 3, 3)
+        turned = windows.mean_of(log, matrices.reshape(len(log), 9)).reshape(-1, 3, 3)
         values = weight_of(length_s) * np.array(
             [
-                _likelihoods_of_forces(changes[part], means[part], gravity)
+                _likelihoods_of_forces(
+                    changes[part], means[part], gravity, turned[part] if with_bias else None
+                )
                 for part in parts_of(len(changes))
             ]
         )
@@ -171,25 +182,31 @@ def compare_forces(log: FlightLog, attitude: Rotation, gravity: float) -> Likeli
     return most_telling(found)
 
 
-def _likelihoods_of_forces(changes: np.ndarray, means: np.ndarray, gravity: float) -> np.ndarray:
+def _likelihoods_of_forces(
+    changes: np.ndarray, means: np.ndarray, gravity: float, turned: np.ndarray | None
+) -> np.ndarray:
     """Return likelihoods as ``compare_forces`` does, from means over windows.
 
     Args:
         changes: of the velocity, over the duration, (num_windows, 3).
         means: of products of the attitude's matrix and the force, (num_windows, 3, 3, 3).
         gravity: m/s^2.
+        turned: means of the attitude's matrix, (num_windows, 3, 3), to leave out what a bias
+            explains; None to keep it.
     """
     count = len(changes)
     force = np.einsum("nijk,fjk->fni", means, FRAMES)  # (48 of the body, num_windows, 3)
     moved = np.einsum("wij,nj->wni", FRAMES, changes)  # (48 of the world, num_windows, 3)
-    up = gravity * DIRECTIONS
+    up = np.repeat(gravity * DIRECTIONS[:, None], count, axis=1)  # (6, num_windows, 3)
+    if turned is not None:
+        force, moved, up = (_without_bias(one, turned) for one in (force, moved, up))
     # Moments by axis: (up, world, body, axis), or what of these they depend on.
     yy = np.sum(moved**2, axis=1)[None, :, None]
     xx = np.sum(force**2, axis=1)[None, None]
     yx = np.einsum("wni,fni->wfi", moved, force)[None]
-    ye = np.einsum("ei,wi->ewi", up, moved.sum(axis=1))[:, :, None]
-    xe = np.einsum("ei,fi->efi", up, force.sum(axis=1))[:, None]
-    ee = (count * up**2)[:, None, None]
+    ye = np.einsum("eni,wni->ewi", up, moved)[:, :, None]
+    xe = np.einsum("eni,fni->efi", up, force)[:, None]
+    ee = np.sum(up**2, axis=1)[:, None, None]
     # moved = a force - b up: normal equations of all axes together.
     sxx, sxe, see, syx, sye = (one.sum(axis=-1) for one in (xx, xe, ee, yx, ye))
     determinant = np.maximum(sxx * see - sxe**2, STILL)
@@ -200,6 +217,17 @@ def _likelihoods_of_forces(changes: np.ndarray, means: np.ndarray, gravity: floa
     return (
         -0.5 * count * np.sum(np.log((np.maximum(residual, 0.0) + floor) / (yy + floor)), axis=-1)
     )
+
+
+def _without_bias(accelerations: np.ndarray, turned: np.ndarray) -> np.ndarray:
+    """Return accelerations, (..., num_windows, 3), without what a bias of the body's axes explains.
+
+    The bias has a prior of ``FORCE_FLOOR``, as errors of windows do.
+    """
+    axes = turned.reshape(-1, 3)
+    flat = accelerations.reshape(*accelerations.shape[:-2], -1)
+    weights = np.linalg.solve(axes.T @ axes + np.eye(3), axes.T)
+    return (flat - flat @ axes @ weights).reshape(accelerations.shape)
 
 
 def compare_thrust(log: FlightLog, attitude: Rotation, gravity: float) -> Likelihoods | None:

@@ -163,6 +163,9 @@ def _compare_forces(log: FlightLog, rates: np.ndarray) -> tuple[Pair | None, np.
         return None, forces
     values = np.stack([one.values for one in known.values()], axis=1)
     is_allowed = allowed(values)
+    if "f" in log and not is_allowed.flat[0]:  # nothing contradicts that a bias explains
+        found = [compare_forces(log, attitudes[number], GRAVITY, True) for number in known]
+        is_allowed |= allowed(np.stack([one.values for one in found if one is not None], axis=1))
     forces[:] = False
     forces[list(known)] = is_allowed
     flips = [bool(is_allowed[0, 0, flip, IDENTITY]) for flip in MIRRORS]
