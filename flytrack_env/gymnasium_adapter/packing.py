@@ -123,7 +123,7 @@ class Packed:
                 words if size == 1 else _as_pairs(words, size), dtype
             )
 
-        values = [
+        values: list[Any] = [
             self.flags if dtype.kind == "b" else restore(dtype, self.words[first:end])
             for dtype, first, end in self.layout.groups
         ]
