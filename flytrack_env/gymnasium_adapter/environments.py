@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium
+import jax
 import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
@@ -223,6 +224,7 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
             self._layout,
             simulation.packed_params.layout,
             self._renderer is not None,
+            jax.config.jax_enable_x64,  # type: ignore[attr-defined]  # added at run time
         )
 
     def _show(self) -> None:

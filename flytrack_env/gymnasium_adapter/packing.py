@@ -170,7 +170,13 @@ def make_reader(layout: Layout, first_row: int) -> Callable[[Any], tuple[Any, ..
     Args:
         layout: of scalars.
         first_row: at which their words begin in the buffer.
+
+    Raises:
+        ValueError: leaves that are no scalars.
     """
+    shapes = [shape for shape, *_ in layout.slots]
+    if any(shapes):
+        raise ValueError(f"layout: found leaves of shapes {shapes}, expected scalars")
     counts = [(end - first) // _words_per_value(dtype) for dtype, first, end in layout.groups]
     formats = [
         count * FORMATS[dtype] for count, (dtype, *_) in zip(counts, layout.groups, strict=True)

@@ -98,9 +98,19 @@ class SingleStep:
         state: layout of a state.
         params: layout of the parameters.
         has_scene: whether scenes are needed.
+        has_x64: whether JAX has 64-bit numbers, on which the layout of the results depends.
     """
 
-    def __init__(self, env: EpisodicEnvironment, state: Layout, params: Layout, has_scene: bool):
+    def __init__(
+        self,
+        env: EpisodicEnvironment,
+        state: Layout,
+        params: Layout,
+        has_scene: bool,
+        has_x64: bool,
+    ):
+        del has_x64  # JAX knows; here it tells one step from another
+
         def fly(state_words: Any, action: jax.Array, params_words: Any) -> tuple[Any, ...]:
             unpacked = from_words(params_words, params).unpack_one()
             before = from_words(state_words, state).unpack_one()

@@ -174,6 +174,20 @@ def test_vector_environment_returns_what_gymnasiums_own_does(mode, wrapper, stil
     assert {0, 1, 2, 3} <= set(num_ended)  # steps in which none, some and all episodes ended
 
 
+def test_64_bit_numbers_may_be_switched_on_between_steps():
+    env = gymnasium.make(BASE)
+    env.reset(seed=3)
+    with jax.enable_x64(True):
+        with_x64 = env.step(np.zeros(4))
+    again = env.step(np.zeros(4))
+    env.reset(seed=3)
+    expected = env.step(np.zeros(4)), env.step(np.zeros(4))
+    for found, step in zip((with_x64, again), expected, strict=True):
+        assert_allclose(found[0], step[0], atol=2e-5)
+        assert found[2:4] == step[2:4]
+        assert found[4] == pytest.approx(step[4], abs=2e-5)
+
+
 # --- Seeding ------------------------------------------------------------------------------------
 
 

@@ -49,3 +49,8 @@ def test_scalars_are_read_as_pythons_own(batch, index):
     expected = [scalars[name].item() for name in sorted(scalars)]
     assert list(numbers) == expected
     assert list(map(type, numbers)) == list(map(type, expected))
+
+
+def test_only_scalars_are_read():
+    with pytest.raises(ValueError, match=r"layout: found leaves of shapes \[\(\), .*\(2,\)"):
+        make_reader(pack(BATCH).layout, 0)
