@@ -24,6 +24,7 @@ PENDULUM = "gymnax Pendulum-v1, vmap, 1,024"
 L2F_SMALL, L2F_LARGE = "l2f full step, 1,024", "l2f full step, 4,096"
 PLAIN, BATCH = "FlyTrack vmap(step), 1,024", "FlyTrack step_batch, 4,096"
 SMALL_BATCH, DUEL = "FlyTrack step_batch, 1,024", "FlyTrackDuel-v0 step_batch, 1,024 races"
+SINGLE, MIN_SINGLE = "Gymnasium, 1, ", 0.03  # million steps per CPU second
 VARIANTS = {
     f"FlyTrack{name}-v0 vmap(step), 1,024": f"FlyTrack{name}-v0"
     for name in ("Noisy", "ActionHistory", "Randomized", "Robust")
@@ -136,13 +137,13 @@ def l2f_contestant(name: str, num_envs: int, length: int) -> Contestant:
 
 
 def gymnasium_contestant(
-    num_envs: int, length: int, autoreset_mode: str = "SameStep"
+    num_envs: int, length: int, autoreset_mode: str = "SameStep", env_id: str = "FlyTrack-v0"
 ) -> Contestant:
     """Return steps through Gymnasium, NumPy in and out, of a vector or a single environment."""
     import gymnasium
     import numpy as np
 
-    id_, shape = "flytrack_env:FlyTrack-v0", (NUM_ACTIONS, num_envs, 4)
+    id_, shape = f"flytrack_env:{env_id}", (NUM_ACTIONS, num_envs, 4)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, shape).astype(np.float32)
     if num_envs > 1:
         env: Any = gymnasium.make_vec(id_, num_envs=num_envs, autoreset_mode=autoreset_mode)
@@ -156,8 +157,8 @@ def gymnasium_contestant(
             if num_envs == 1 and (terminated or truncated):
                 env.reset()
 
-    mode = f", {autoreset_mode}" if num_envs > 1 else ""
-    return Contestant(f"Gymnasium, {num_envs:,}{mode}", num_envs * length / 1e6, run)
+    name = f"Gymnasium, {num_envs:,}, {autoreset_mode}" if num_envs > 1 else f"{SINGLE}{env_id}"
+    return Contestant(name, num_envs * length / 1e6, run)
 
 
 def contestants() -> list[Contestant]:
@@ -167,6 +168,7 @@ def contestants() -> list[Contestant]:
         jax_contestant(PLAIN, "FlyTrack-v0", 1024, 200, is_batch=False),
         jax_contestant(BATCH, "FlyTrack-v0", 4096, 200, is_batch=True),
         jax_contestant(SMALL_BATCH, "FlyTrack-v0", 1024, 200, is_batch=True),
+        jax_contestant("FlyTrack step_batch, 65,536", "FlyTrack-v0", 65536, 10, is_batch=True),
         jax_contestant(DUEL, "FlyTrackDuel-v0", 1024, 200, is_batch=True),
         *(
             jax_contestant(name, env_id, 1024, 200, is_batch=False)
@@ -175,6 +177,7 @@ def contestants() -> list[Contestant]:
         gymnasium_contestant(1024, 200),
         gymnasium_contestant(1024, 200, "NextStep"),
         gymnasium_contestant(1, 2000),
+        gymnasium_contestant(1, 2000, env_id="FlyTrackRobust-v0"),
     ]
     try:
         entries += [l2f_contestant(L2F_SMALL, 1024, 200), l2f_contestant(L2F_LARGE, 4096, 50)]
@@ -265,6 +268,9 @@ def main(repeats: int = 7, out: Path | None = None, effects: bool = False) -> No
         if peer in rates:
             ratio = f"{statistics.median(ratios(rates, name, peer)):.2g}"
             figures.append(report.Figure(f"{name} to {peer}", f"at least {goal:g}", ratio, repeats))
+    single = f"{SINGLE}FlyTrack-v0"
+    rate = f"{statistics.median(rates[single]):.2g}"
+    figures.append(report.Figure(f"{single}: M steps/s", f"at least {MIN_SINGLE:g}", rate, repeats))
     for name in VARIANTS:
         cost = statistics.median(ratios(rates, PLAIN, name))
         figures.append(cost_figure(f"cost of {name} over the plain step", cost, repeats))

@@ -7,7 +7,8 @@ removed before fusion and does not help. A conditional does: what goes into it i
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, NamedTuple, TypeVar
 
@@ -32,6 +33,30 @@ _compute_once_p = Primitive("flytrack_compute_once")
 _compute_once_p.multiple_results = True
 
 
+_unfused = ContextVar("unfused", default=False)
+
+
+@contextmanager
+def unfused() -> Iterator[None]:
+    """Trace within this context what is compiled with ``UNFUSED``: without boundaries.
+
+    For one environment: every value is computed once then, a number at a time.
+    """
+    token = _unfused.set(True)
+    try:
+        yield
+    finally:
+        _unfused.reset(token)
+
+
+def is_unfused() -> bool:
+    """Return whether what is traced now will not be fused."""
+    return _unfused.get()
+
+
+UNFUSED = {"xla_disable_hlo_passes": "fusion"}  # compiler_options of ``jax.jit``
+
+
 def compute_once(tree: Tree) -> Tree:
     """Return the same pytree of arrays, computed once for all its users.
 
@@ -40,6 +65,8 @@ def compute_once(tree: Tree) -> Tree:
     """
     leaves, structure = jax.tree.flatten(tree)
     leaves = [jnp.asarray(leaf) for leaf in leaves]
+    if is_unfused():
+        return jax.tree.unflatten(structure, leaves)
     indices = [i for i, leaf in enumerate(leaves) if leaf.size and _is_number(leaf)]
     if indices:
         fenced = _compute_once_p.bind(*(leaves[i] for i in indices))

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium
+import jax
 import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
@@ -12,8 +13,15 @@ from gymnax.environments.spaces import gymnax_space_to_gym_space
 
 from flytrack_env.env import EnvParams
 from flytrack_env.gymnasium_adapter.options import TRACK, check_names, read_start
-from flytrack_env.gymnasium_adapter.packing import Packed
-from flytrack_env.gymnasium_adapter.simulation import Simulation, begin, draw_key, step, step_batch
+from flytrack_env.gymnasium_adapter.packing import WORD, Layout
+from flytrack_env.gymnasium_adapter.simulation import (
+    Simulation,
+    SingleStep,
+    begin,
+    draw_key,
+    single_step,
+    step_batch,
+)
 from flytrack_env.messages import check_keywords
 from flytrack_env.registration import ARGUMENTS
 from flytrack_env.rendering import FlightLog, can_render, open_window
@@ -33,7 +41,7 @@ class _Adapter:
     _simulation: Simulation
     _renderer: Any
     _window: Any
-    _states: Packed | None
+    _states: Any  # packed, or the words of a single one's; None before the first reset
     _logs: dict[int, FlightLog]  # of pictures, by the environment's index
 
     def _set_up(
@@ -83,7 +91,11 @@ class _Adapter:
             self._simulation = simulation
             self._renderer = self._renderer and simulation.make_renderer()
         self._states, observations, scenes = begin(
-            simulation.compiled, words, start, simulation.packed_params
+            simulation.compiled,
+            words,
+            start,
+            simulation.packed_params,
+            self._renderer is not None,
         )
         self._log(scenes, np.ones(len(words), bool))
         return np.array(observations)
@@ -100,8 +112,9 @@ class _Adapter:
     def _check(self, name: str, actions: Any, shape: tuple[int, ...] | None) -> np.ndarray:
         """Return actions as float32, once an episode has begun and if they have that shape."""
         self._check_begun("step")
-        with np.errstate(over="ignore"):  # what is beyond float32 is infinite, and clipped as such
-            actions = np.asarray(actions, np.float32)
+        if not (isinstance(actions, np.ndarray) and actions.dtype == WORD):
+            with np.errstate(over="ignore"):  # beyond float32 is infinite, and clipped as such
+                actions = np.asarray(actions, np.float32)
         if actions.shape != shape:
             raise ValueError(f"{name}: found shape {actions.shape}, expected {shape}")
         return actions
@@ -147,6 +160,8 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 100}  # noqa: RUF012  # as Gymnasium declares it
 
+    _layout: Layout  # of a state
+
     def __init__(
         self,
         env_id: str,
@@ -178,6 +193,8 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
             return draw_key(self.np_random, (1,))
 
         observation = self._begin(options, draw)[0]
+        self._layout = self._states.layout
+        self._states = self._compiled_step().start(self._states)
         self._show()
         return observation, {}
 
@@ -191,22 +208,24 @@ class FlyTrackEnv(_Adapter, gymnasium.Env[np.ndarray, np.ndarray]):
             gymnasium.error.ResetNeeded: no episode has begun.
             ValueError: an action of another shape.
         """
-        action, simulation = (
-            self._check("action", action, self.action_space.shape),
-            self._simulation,
+        action = self._check("action", action, self.action_space.shape)
+        self._states, observation, reward, terminated, truncated, info, scene = (
+            self._compiled_step()(self._states, action, self._simulation.params_words)
         )
-        self._states, outcome = step(
-            simulation.compiled,
-            self._states,
-            action,
-            simulation.packed_params,
-            self._renderer is not None,
-        )
-        observation, reward, terminated, truncated, info, scene = outcome.to_python()
-        if scene is not None:
+        if self._renderer is not None:
             self._log([scene], NONE_BEGAN)
-        self._show()
+            self._show()
         return observation, reward, terminated, truncated, info
+
+    def _compiled_step(self) -> SingleStep:
+        simulation = self._simulation
+        return single_step(
+            simulation.compiled,
+            self._layout,
+            simulation.packed_params.layout,
+            self._renderer is not None,
+            jax.config.jax_enable_x64,  # type: ignore[attr-defined]  # added at run time
+        )
 
     def _show(self) -> None:
         """Show the state in the window, if there is one."""

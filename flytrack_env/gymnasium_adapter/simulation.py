@@ -1,6 +1,7 @@
 """An environment with parameters, and its compiled functions: batches move as few arrays."""
 
-from functools import partial
+from collections.abc import Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,23 @@ import numpy as np
 
 from flytrack_env.env import EnvParams
 from flytrack_env.episodes import EpisodicEnvironment
-from flytrack_env.fusion import one_kernel
-from flytrack_env.gymnasium_adapter.packing import Packed, pack, pack_one
+from flytrack_env.fusion import UNFUSED, has_kernels, one_kernel, unfused
+from flytrack_env.gymnasium_adapter.packing import (
+    WORD,
+    Layout,
+    Packed,
+    from_words,
+    make_reader,
+    pack,
+    pack_one,
+)
 from flytrack_env.randomness import seed_of
 from flytrack_env.registration import make
 from flytrack_env.rendering import make_renderer, scene_row
-from flytrack_env.state import unpack
+from flytrack_env.state import ACTION_SIZE, unpack
 from flytrack_env.tracks import Track, build_course, load_track
 
+MAX_INLINE_OPERATIONS = 1000  # cheap_computation of xla/pjrt/cpu/cpu_client.cc
 KEY_WORDS = 2  # uint32 words of a random key
 NOT_INFO = (
     "terminated",
@@ -39,64 +49,141 @@ def _scene(env: EpisodicEnvironment, state: Any) -> jax.Array:
     return scene_row(env.drone(state), env.race(state))
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=(0, 4))
 def begin(
-    env: EpisodicEnvironment, words: jax.Array, start: dict[str, Any], params: Packed
-) -> tuple[Packed, jax.Array, jax.Array]:
+    env: EpisodicEnvironment,
+    words: jax.Array,
+    start: dict[str, Any],
+    params: Packed,
+    has_scenes: bool,
+) -> tuple[Packed, jax.Array, jax.Array | None]:
     """Return states, observations and scenes of episodes that begin.
+
+    Scenes are None unless they are needed.
 
     Args:
         words: of their keys, (num_envs, KEY_WORDS).
         start: as of ``options.read_start``, the same for all.
     """
-    unpacked = params.unpack_one()
-
-    def begin_one(words: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
-        seed = seed_of(_make_key(words))
-        drone, gate_index = env.sample_start(seed, unpacked)
-        if "drone" in start:
-            drone, gate_index = unpack(start["drone"]), start["gate_index"]
-        if "battery_v" in start:
-            drone = drone._replace(battery_v=start["battery_v"])
-        state = env.begin(drone, gate_index, unpacked, seed)
-        return state, env.observe(None, state, None, unpacked), _scene(env, state)
-
-    states, observations, scenes = jax.vmap(begin_one)(words)
-    return pack(states), observations, scenes
-
-
-@partial(jax.jit, static_argnums=(0, 4))
-def step(
-    env: EpisodicEnvironment, state: Packed, action: jax.Array, params: Packed, has_scene: bool
-) -> tuple[Packed, Packed]:
-    """Step one environment without auto-reset, as one kernel where it can be.
-
-    Args:
-        state: a batch of one, as the results are.
-
-    Returns:
-        The state, and (observation, reward, terminated, truncated, info, scene); the scene is None
-        unless it is needed.
-    """
 
     @one_kernel
-    def step_one(state: Packed, action: jax.Array, params: Packed) -> tuple[Packed, Packed]:
+    def begin_all(words: jax.Array, start: dict[str, Any], params: Packed) -> tuple[Any, ...]:
         unpacked = params.unpack_one()
-        observation, after, reward, terminated, info = env.step_env(
-            None, state.unpack_one(), action, unpacked
-        )
-        scene = _scene(env, after) if has_scene else None
-        outcome = (
-            observation,
-            reward,
-            terminated,
-            env.is_truncated(after, unpacked),
-            info,
-            scene,
-        )
-        return pack_one(after), pack_one(outcome)
 
-    return step_one(state, action, params)
+        def begin_one(words: jax.Array) -> tuple[Any, ...]:
+            seed = seed_of(words)
+            drone, gate_index = env.sample_start(seed, unpacked)
+            if "drone" in start:
+                drone, gate_index = unpack(start["drone"]), start["gate_index"]
+            if "battery_v" in start:
+                drone = drone._replace(battery_v=start["battery_v"])
+            state = env.begin(drone, gate_index, unpacked, seed)
+            scene = _scene(env, state) if has_scenes else None
+            return state, env.observe(None, state, None, unpacked), scene
+
+        states, observations, scenes = jax.vmap(begin_one)(words)
+        return pack(states), observations, scenes
+
+    result: tuple[Packed, jax.Array, jax.Array | None] = begin_all(words, start, params)
+    return result
+
+
+class SingleStep:
+    """A step of one environment without auto-reset, as one kernel where it can be.
+
+    It takes and returns one array: the words of the state, and below them what the step before
+    returned. Each further array would cost four microseconds.
+
+    Args:
+        state: layout of a state.
+        params: layout of the parameters.
+        has_scene: whether scenes are needed.
+        has_x64: whether JAX has 64-bit numbers, on which the layout of the results depends.
+    """
+
+    def __init__(
+        self,
+        env: EpisodicEnvironment,
+        state: Layout,
+        params: Layout,
+        has_scene: bool,
+        has_x64: bool,
+    ):
+        del has_x64  # JAX knows; here it tells one step from another
+
+        def fly(state_words: Any, action: jax.Array, params_words: Any) -> tuple[Any, ...]:
+            unpacked = from_words(params_words, params).unpack_one()
+            before = from_words(state_words, state).unpack_one()
+            observation, after, reward, terminated, info = env.step_env(
+                None, before, action, unpacked
+            )
+            scene: Any = _scene(env, after) if has_scene else jnp.zeros(0)
+            numbers = reward, terminated, env.is_truncated(after, unpacked), info
+            return pack_one(after), observation, scene, pack_one(numbers)
+
+        shapes = (state.num_rows, 1), (ACTION_SIZE,), (params.num_rows, 1)
+        inputs = [jax.ShapeDtypeStruct(shape, WORD) for shape in shapes]
+        _, observation, scene, numbers = jax.eval_shape(fly, *inputs)
+        ends = np.cumsum([state.num_rows, observation.size, scene.size]).tolist()
+        self._observation, self._scene = slice(ends[0], ends[1]), slice(ends[1], ends[2])
+        self._num_rows = ends[2] + numbers.layout.num_rows
+        self._read = make_reader(numbers.layout, ends[2])
+        indices = range(len(numbers.layout.slots))
+        self._names = list(numbers.layout.structure.unflatten(indices)[-1])
+
+        def fly_words(words: Any, action: jax.Array, params_words: Any) -> jax.Array:
+            after, observation, scene, numbers = fly(words, action, params_words)
+            arrays = after.as_words(), observation[:, None], scene[:, None], numbers.as_words()
+            return jnp.concatenate([array.astype(WORD) for array in arrays])
+
+        inputs[0] = jax.ShapeDtypeStruct((self._num_rows, 1), WORD)
+        self.compiled = _compile_unfused(fly_words, inputs) or jax.jit(one_kernel(fly_words))
+
+    def start(self, state: Packed) -> np.ndarray:
+        """Return the words of a state before the first step."""
+        words = np.asarray(state.as_words())
+        return np.concatenate([words, np.zeros((self._num_rows - len(words), 1), WORD)])
+
+    def __call__(self, words: Any, action: np.ndarray, params_words: Any) -> tuple[Any, ...]:
+        """Return words, observation, reward, terminated, truncated, info and scene of a step.
+
+        In Python's own types and new arrays, but for the words.
+        """
+        words = self.compiled(words, action, params_words)
+        column = np.asarray(words)[:, 0]
+        reward, terminated, truncated, *values = self._read(column)
+        info = dict(zip(self._names, values, strict=True))
+        observation = column[self._observation].copy()
+        return words, observation, reward, terminated, truncated, info, column[self._scene]
+
+
+def _compile_unfused(function: Any, inputs: Sequence[Any]) -> Any:
+    """Return a function of few operations compiled to run on the thread that calls it, or None.
+
+    XLA's client for CPUs hands programs of ``MAX_INLINE_OPERATIONS`` or more to another thread, and
+    waiting for it costs more than this whole step. Without fusion nothing is computed twice, which
+    keeps a step without noise and randomisation below that.
+    """
+    if not has_kernels():
+        return None
+
+    def traced(*args: Any) -> Any:
+        with unfused():
+            return function(*args)
+
+    def count_operations(program: Any) -> float:
+        return float((program.cost_analysis() or {}).get("flops", np.inf))
+
+    compiled = jax.jit(one_kernel(traced), compiler_options=UNFUSED)
+    lowered = compiled.lower(*inputs)
+    # XLA's simplifications remove up to a third.
+    if count_operations(lowered) >= 1.5 * MAX_INLINE_OPERATIONS:
+        return None
+    is_inline = count_operations(lowered.compile()) < MAX_INLINE_OPERATIONS
+    return compiled if is_inline else None
+
+
+single_step = cache(SingleStep)
 
 
 @partial(jax.jit, static_argnums=(0, 7))
@@ -162,6 +249,8 @@ def _group(
     return reward, terminated, truncated, masked(~done), masked(done), final_masks
 
 
+_pack_params = jax.jit(pack_one)
+
 # By all that a compiled function depends on: id, missed gates, plant, the delay that the simulator
 # of a model remembers, and the layout of the parameters. An environment keeps its plant, and so the
 # plant's id.
@@ -190,7 +279,8 @@ class Simulation:
         self.env.check_params(self.params)
         self.step_s = float(self.params.dt)
         # As arrays of NumPy: a number of Python's and one of NumPy's would be compiled apart.
-        self.packed_params = pack_one(jax.tree.map(np.asarray, self.params))
+        self.packed_params = _pack_params(jax.tree.map(np.asarray, self.params))
+        self.params_words = self.packed_params.as_words()
         plant = overrides.get("plant")
         key = env_id, self.env.missed_gate, plant and id(plant), self.env.plant.delay_steps
         self.compiled = _COMPILED.setdefault((*key, self.packed_params.layout), self.env)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from flytrack_env.fusion import compute_once
+from flytrack_env.fusion import compute_once, is_unfused
 from flytrack_env.quaternion import Quaternion, Scalar, Vec3
 from flytrack_env.tracks.track import Track
 
@@ -72,6 +72,8 @@ class Course(NamedTuple):
         A tree of selects on the bits of the index: on a CPU under ``vmap`` this vectorises,
         which a gather does not.
         """
+        if is_unfused():  # no vmap: read where it is
+            return jax.tree.map(lambda table: _read(table, index), self.gates)
         bits = [(index & (1 << bit)) != 0 for bit in range((self.num_gates - 1).bit_length())]
 
         def select(table: jax.Array) -> jax.Array:
@@ -86,6 +88,12 @@ class Course(NamedTuple):
     def next_index(self, index: jax.Array) -> jax.Array:
         """Return the index of the gate after this one, cyclically; a scalar, as the index is."""
         return jnp.where(index + 1 >= self.num_gates, 0, index + 1)
+
+
+def _read(table: jax.Array, index: jax.Array) -> jax.Array:
+    # Unsigned, since of a signed index JAX asks whether it counts from the end.
+    unsigned = index.astype(jnp.uint32)
+    return jax.lax.dynamic_index_in_dim(jnp.asarray(table), unsigned, keepdims=False)
 
 
 class Crossing(NamedTuple):
