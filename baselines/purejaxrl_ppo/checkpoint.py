@@ -292,11 +292,13 @@ def _decode(path: Path, content: bytes) -> Checkpoint:
     if description.format != FORMAT:
         raise ValueError(f"format: found {quote_value(description.format)}, expected {FORMAT!r}")
     config = read_config("config", meta["config"]).check()
-    observation = jax.ShapeDtypeStruct((1, description.observation_size), jnp.float32)
+    network = make_network(config)
+    size = description.observation_size + network.num_state_rows
+    observation = jax.ShapeDtypeStruct((1, size), jnp.float32)
     # Of the precision it was trained in, whatever that of this process.
     is_double = any(array.dtype == np.float64 for array in arrays.values())
     with jax.enable_x64(is_double):
-        target = jax.eval_shape(make_network(config).init, jax.random.key(0), observation)
+        target = jax.eval_shape(network.init, jax.random.key(0), observation)
     policy, training = (
         {
             name.removeprefix(prefix): array

@@ -14,6 +14,7 @@ import numpy as np
 from flax import struct
 
 from baselines.purejaxrl_ppo.config import Config
+from flytrack_env.observations import OBSERVATION_SIZE
 
 Memory = Any  # what a policy remembers of an episode, a pytree; () of one that remembers nothing
 
@@ -44,6 +45,8 @@ class ActorCritic(nn.Module):
 
     Attributes:
         num_choices: number of discrete actions; 0 for continuous ones.
+        num_state_rows: number of rows at the end of an observation that the critic alone sees.
+        estimates_state: whether a linear layer estimates these rows from what the policy knows.
     """
 
     hidden_sizes: Sequence[int]
@@ -52,6 +55,8 @@ class ActorCritic(nn.Module):
     min_std: float
     num_choices: int = 0
     memory_size: int = 0
+    num_state_rows: int = 0
+    estimates_state: bool = False
 
     def setup(self) -> None:
         """Declare the layers."""
@@ -60,6 +65,8 @@ class ActorCritic(nn.Module):
         if not self.num_choices:
             start = nn.initializers.constant(np.log(self.initial_std))
             self.log_std = self.param("log_std", start, (len(self.initial_action),))
+        if self.estimates_state:
+            self.estimator = nn.Dense(self.num_state_rows)
         if self.memory_size:
             over_steps = nn.scan(
                 _Gru,
@@ -85,13 +92,22 @@ class ActorCritic(nn.Module):
         std = jnp.maximum(jnp.exp(self.log_std), self.min_std)
         return distrax.MultivariateNormalDiag(mean, jnp.broadcast_to(std, mean.shape))
 
-    def value(self, known: jax.Array) -> jax.Array:
+    def value(self, known: jax.Array, state: jax.Array) -> jax.Array:
         """Return the value, batch shape as that of what is known."""
-        return self.critic(known).squeeze(-1)
+        return self.critic(jnp.concatenate([known, state], axis=-1)).squeeze(-1)
+
+    def state_error(self, known: jax.Array, state: jax.Array) -> jax.Array:
+        """Return the mean squared error of the state's estimate, a scalar; 0 without estimate."""
+        return (
+            ((self.estimator(known) - state) ** 2).mean() if self.estimates_state else jnp.zeros(())
+        )
 
     def __call__(self, observation: jax.Array) -> tuple[distrax.Distribution, jax.Array]:
-        """Return policy and value of first observations of episodes."""
-        return self.step(self.first_memory(observation.shape[:-1]), observation)[1:]
+        """Return policy and value of first observations of episodes, having used every layer."""
+        first = self.first_memory(observation.shape[:-1])
+        known, state = self._split(observation)
+        self.state_error(self._remember(first, known)[1], state)
+        return self.step(first, observation)[1:]
 
     @nn.nowrap
     def first_memory(self, batch_shape: tuple[int, ...] = ()) -> Memory:
@@ -102,17 +118,26 @@ class ActorCritic(nn.Module):
         self, memory: Memory, observation: jax.Array
     ) -> tuple[Memory, distrax.Distribution, jax.Array]:
         """Return the memory after a step, policy and value."""
+        observation, state = self._split(observation)
         memory, known = self._remember(memory, observation)
-        return memory, self.policy(known), self.value(known)
+        return memory, self.policy(known), self.value(known, state)
+
+    def decide(self, memory: Memory, observation: jax.Array) -> tuple[Memory, distrax.Distribution]:
+        """Return the memory after a step and the policy, of what the policy observes."""
+        memory, known = self._remember(memory, observation)
+        return memory, self.policy(known)
 
     def value_of(self, memory: Memory, observation: jax.Array) -> jax.Array:
         """Return the value of an observation after what is remembered."""
-        return self.value(self._remember(memory, observation)[1])
+        observation, state = self._split(observation)
+        return self.value(self._remember(memory, observation)[1], state)
 
     def unroll(
         self, memory: Memory, observation: jax.Array, done: jax.Array
-    ) -> tuple[distrax.Distribution, jax.Array]:
-        """Return policy and value of steps: in any order, or with a memory in their order.
+    ) -> tuple[distrax.Distribution, jax.Array, jax.Array]:
+        """Return policy, value and error of the state's estimate, of steps.
+
+        In any order, or with a memory in their order.
 
         Args:
             memory: (num_envs, num_steps, memory_size), of which that of the first step counts; or
@@ -120,10 +145,16 @@ class ActorCritic(nn.Module):
             observation: (num_envs, num_steps, size) with a memory, else (num_rows, size).
             done: whether an episode ends after the step, (num_envs, num_steps).
         """
+        known, state = self._split(observation)
         if self.memory_size:
-            remembered = self.gru(memory[:, 0], (observation, done))[1]
-            observation = jnp.concatenate([observation, remembered], axis=-1)
-        return self.policy(observation), self.value(observation)
+            remembered = self.gru(memory[:, 0], (known, done))[1]
+            known = jnp.concatenate([known, remembered], axis=-1)
+        return self.policy(known), self.value(known, state), self.state_error(known, state)
+
+    def _split(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the rows that the policy sees, and those of the state."""
+        size = observation.shape[-1] - self.num_state_rows
+        return observation[..., :size], observation[..., size:]
 
     def _remember(self, memory: Memory, observation: jax.Array) -> tuple[Memory, jax.Array]:
         """Return the memory after a step, and what is known in it."""
@@ -137,8 +168,8 @@ class ActorCritic(nn.Module):
     @nn.nowrap
     def act(self, params: Any, memory: Memory, observation: jax.Array) -> tuple[Memory, jax.Array]:
         """Return the memory after a step, and the mean action, in [-1, 1]."""
-        found: Any = self.apply(params, memory, observation, method="step")
-        return found[0], jnp.clip(found[1].mode(), -1.0, 1.0)
+        memory, policy = self.apply(params, memory, observation, method="decide")  # type: ignore[misc]  # flax types it as a union
+        return memory, jnp.clip(policy.mode(), -1.0, 1.0)
 
 
 @struct.dataclass
@@ -164,4 +195,6 @@ def make_network(config: Config, num_choices: int = 0) -> ActorCritic:
         min_std=config.min_std,
         num_choices=num_choices,
         memory_size=config.memory_size,
+        num_state_rows=OBSERVATION_SIZE if config.critic_sees_state else 0,
+        estimates_state=config.state_coef > 0.0,
     )
