@@ -86,11 +86,11 @@ def make_lens(
 
 
 class Pixel(NamedTuple):
-    """Where an image shows a point: right and down of its middle, px, and whether it does (bool)."""
+    """Where an image shows a point: right and down of its middle, px; and whether it does, bool."""
 
     right_px: Scalar
     down_px: Scalar
-    is_visible: jax.Array
+    is_visible: Scalar
 
 
 def check_pixels(width_px: Any, height_px: Any, prefix: str) -> None:
@@ -215,7 +215,7 @@ def draw_frames(
 
 
 def _span_words(first: jax.Array, last: jax.Array, width: int) -> list[jax.Array]:
-    """Return words (...) uint32 whose bits are 1 from one image coordinate (...), px, to another."""
+    """Return words (...), uint32, whose bits are 1 from one coordinate (...), px, to another."""
 
     def count_before(edge: jax.Array) -> jax.Array:
         return jnp.clip(edge, 0.0, width).astype(jnp.int32)

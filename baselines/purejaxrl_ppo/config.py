@@ -104,6 +104,9 @@ class Config:
     memory_size: Annotated[int, Meta(ge=0, le=MAX_WIDTH)] = 0
     """Width of a gated recurrent unit whose memory of the episode the layers see beside the
     observation; 0: none. A policy that remembers can adapt to the drone that it flies."""
+    encoder_sizes: Annotated[tuple[Width, ...], Meta(max_length=MAX_LAYERS)] = ()
+    """Widths of tanh layers between the observation and that unit: what a camera shows is a product
+    of distances and angles, which a unit alone does not take apart."""
     critic_sees_state: bool = False
     """Whether the critic sees FlyTrack-v0's observation of the true state beside the policy's. A
     policy that has a camera only cannot know its position at once, but the critic, which is needed

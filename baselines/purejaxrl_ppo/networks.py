@@ -55,6 +55,7 @@ class ActorCritic(nn.Module):
     min_std: float
     num_choices: int = 0
     memory_size: int = 0
+    encoder_sizes: Sequence[int] = ()
     num_state_rows: int = 0
     estimates_state: bool = False
 
@@ -76,13 +77,18 @@ class ActorCritic(nn.Module):
                 out_axes=1,
             )
             self.gru = over_steps(self.memory_size)
+            if self.encoder_sizes:
+                self.encoder = nn.Sequential(self._layers(self.encoder_sizes))
 
     def _tower(self, name: str, size: int, last_scale: float) -> nn.Sequential:
-        layers: list[Any] = []
-        for width in self.hidden_sizes:
-            layers += [nn.Dense(width, kernel_init=nn.initializers.orthogonal(np.sqrt(2))), nn.tanh]
+        layers = self._layers(self.hidden_sizes)
         layers.append(nn.Dense(size, kernel_init=nn.initializers.orthogonal(last_scale)))
         return nn.Sequential(layers, name=f"{name}_tower")
+
+    @nn.nowrap
+    def _layers(self, widths: Sequence[int]) -> list[Any]:
+        init = nn.initializers.orthogonal(np.sqrt(2))
+        return [layer for width in widths for layer in (nn.Dense(width, kernel_init=init), nn.tanh)]
 
     def policy(self, known: jax.Array) -> distrax.Distribution:
         """Return the distribution over actions, batch shape as that of what is known."""
@@ -147,9 +153,13 @@ class ActorCritic(nn.Module):
         """
         known, state = self._split(observation)
         if self.memory_size:
-            remembered = self.gru(memory[:, 0], (known, done))[1]
+            remembered = self.gru(memory[:, 0], (self._encode(known), done))[1]
             known = jnp.concatenate([known, remembered], axis=-1)
         return self.policy(known), self.value(known, state), self.state_error(known, state)
+
+    def _encode(self, observation: jax.Array) -> jax.Array:
+        """Return what the recurrent unit sees of an observation."""
+        return self.encoder(observation) if self.encoder_sizes else observation
 
     def _split(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return the rows that the policy sees, and those of the state."""
@@ -160,7 +170,7 @@ class ActorCritic(nn.Module):
         """Return the memory after a step, and what is known in it."""
         if not self.memory_size:
             return memory, observation
-        rows = observation.reshape(-1, 1, observation.shape[-1])
+        rows = self._encode(observation).reshape(memory.size // self.memory_size, 1, -1)
         never = jnp.zeros(rows.shape[:2], bool)
         after = self.gru(memory.reshape(len(rows), -1), (rows, never))[0].reshape(memory.shape)
         return after, jnp.concatenate([observation, after], axis=-1)
@@ -168,7 +178,8 @@ class ActorCritic(nn.Module):
     @nn.nowrap
     def act(self, params: Any, memory: Memory, observation: jax.Array) -> tuple[Memory, jax.Array]:
         """Return the memory after a step, and the mean action, in [-1, 1]."""
-        memory, policy = self.apply(params, memory, observation, method="decide")  # type: ignore[misc]  # flax types it as a union
+        decided: Any = self.apply(params, memory, observation, method="decide")
+        memory, policy = decided
         return memory, jnp.clip(policy.mode(), -1.0, 1.0)
 
 
@@ -195,6 +206,7 @@ def make_network(config: Config, num_choices: int = 0) -> ActorCritic:
         min_std=config.min_std,
         num_choices=num_choices,
         memory_size=config.memory_size,
+        encoder_sizes=config.encoder_sizes,
         num_state_rows=OBSERVATION_SIZE if config.critic_sees_state else 0,
         estimates_state=config.state_coef > 0.0,
     )

@@ -38,7 +38,7 @@ class CornersParams(NamedTuple):
         k1, k2: radial distortion, see ``flytrack_env.camera.Lens``.
         noise_px: standard deviation of a corner's image coordinates.
         missed: probability that a visible corner is not detected in a frame.
-        swapped: probability that a gate's upper or lower two corners are mistaken for each other in a
+        swapped: probability that a gate's upper or lower two corners are taken for each other in a
             frame.
         frame_rate_hz: frames per second.
         latency_s: from exposure to observation; a frame is exposed at the step nearest to its time.
@@ -317,7 +317,7 @@ def _detect_corner(
         scales: half images per px, to the right and down.
     """
     limit = TABLE[0].limit
-    detected = compute_once(pixel.is_visible & ~is_missed)
+    detected = compute_once(jnp.asarray(pixel.is_visible & ~is_missed))
     coordinates = (
         jnp.where(detected, jnp.clip((offset_px + error_px) * scale, -limit, limit), 0.0)
         for offset_px, error_px, scale in zip(pixel[:2], errors_px, scales, strict=True)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from flytrack_env import camera
 from flytrack_env.camera import CameraPose
@@ -45,12 +46,13 @@ class GateMask(CameraView):
         super().__init__(env)
         height, width = size
         camera.check_pixels(width, height, "size: ")
+        self.size = size
         self.image_shape = (*size, 1)
 
     @property
     def observation_table(self) -> tuple[Entry, ...]:
         """The image as one entry."""
-        height, width, _ = self.image_shape
+        height, width = self.size
         name = f"mask of the gates' frames, row by row, 0 or {camera.WHITE}"
         return (Entry("mask", name, height * width, "image", "1", 1.0, float(camera.WHITE)),)
 
@@ -61,12 +63,12 @@ class GateMask(CameraView):
     def observe_drone(self, drone: Drone, state: Any, params: EnvParams) -> list[jax.Array]:
         """Return the true pose of the camera as scalars, of which ``compose`` draws the image."""
         true = self.drone(state)
-        return [*true.pos_w, *true.quat]
+        return [jnp.asarray(part) for part in (*true.pos_w, *true.quat)]
 
     def compose(self, rows: list[jax.Array], params: EnvParams) -> jax.Array:
         """Return the image that the camera shows at a pose."""
-        own, (height, width, _) = self.own_params(params), self.image_shape
+        own = self.own_params(params)
         pose = CameraPose(Vec3(*rows[:3]), Quaternion(*rows[3:]))
         return camera.draw_frames(
-            pose, params.course.gates, own.pitch_deg, own.field_of_view_deg, (height, width)
+            pose, params.course.gates, own.pitch_deg, own.field_of_view_deg, self.size
         )
