@@ -9,6 +9,7 @@ import rerun as rr
 from scipy.spatial.transform import Rotation
 
 from flytrack_env import scene
+from flytrack_env.camera import PITCH_DEG
 from flytrack_env.flown_race import FlownRace
 from flytrack_env.scene import Colour, gates_of, rotations
 from flytrack_env.state import APPLIED_ACTION, BATTERY, QUATERNION, RATES, VELOCITY, Action
@@ -186,7 +187,7 @@ class Writer:
     def _log_drone(self) -> None:
         """Log the drone's body in its own frame, and the style of its path and passes, once."""
         drone, colour = f"{self.world}/drone", self.colours[self.trajectory.name]
-        pitch = math.radians(scene.CAMERA_PITCH_DEG)
+        pitch = math.radians(PITCH_DEG)
         ray_b = CAMERA_RAY_M * np.array([math.cos(pitch), 0.0, math.sin(pitch)])
         self._log(f"{drone}/motors", rr.Points3D(scene.MOTORS_B, radii=0.06, colors=colour))
         self._log(f"{drone}/arms", rr.LineStrips3D(scene.ARMS_B, radii=0.025, colors=colour))

@@ -10,8 +10,13 @@ from flytrack_env.params import EnvParams
 from flytrack_env.wrappers.base import Wrapper
 
 
+# Starts in flight face the gate more nearly than FlyTrack's, 90 and 60 degrees: of those the camera
+# shows no gate in a third, so that a policy has nothing to steer by.
+MAX_START_YAW_DEG, MAX_START_TILT_DEG = 30.0, 30.0
+
+
 class CameraView(Wrapper):
-    """Replaces FlyTrack's observation by what its camera shows.
+    """Replaces FlyTrack's observation by what its camera shows, and turns starts to the gate.
 
     Attributes:
         ranges: of its parameters.
@@ -21,6 +26,15 @@ class CameraView(Wrapper):
     """
 
     ranges: Mapping[str, Range]
+
+    @property
+    def default_params(self) -> EnvParams:  # type: ignore[override]  # of gymnax: see EpisodicEnvironment
+        """The inner environment's, with the camera, and with starts that face the gate."""
+        params = super().default_params
+        facing = params.reset._replace(
+            course_yaw_deg=MAX_START_YAW_DEG, course_tilt_deg=MAX_START_TILT_DEG
+        )
+        return params.replace(reset=facing)
 
     def refusal(self, inside: EpisodicEnvironment) -> str | None:
         """Return why not: another observation inside, or what every wrapper refuses."""
