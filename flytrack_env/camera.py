@@ -208,7 +208,8 @@ def draw_frames(
                 last = jnp.where(is_left, last, jnp.minimum(last, edge))
         spans.append(_span_words(first, last, width))
     frames = [outer & ~inner for outer, inner in zip(*spans, strict=True)]
-    rows = jnp.stack([_any_of(words) for words in frames], axis=-1)
+    # Fenced, so that a word is not computed again for each of its bits.
+    rows = compute_once(jnp.stack([_any_of(words) for words in frames], axis=-1))
     bits = (rows[..., None] >> jnp.arange(WORD_BITS, dtype=jnp.uint32)) & 1
     pixels = bits.reshape(height, -1)[:, :width, None]
     return pixels.astype(jnp.uint8) * jnp.uint8(WHITE)

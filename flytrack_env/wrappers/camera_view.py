@@ -9,7 +9,6 @@ from flytrack_env.observations import OBSERVATION
 from flytrack_env.params import EnvParams
 from flytrack_env.wrappers.base import Wrapper
 
-
 # Starts in flight face the gate more nearly than FlyTrack's, 90 and 60 degrees: of those the camera
 # shows no gate in a third, so that a policy has nothing to steer by.
 MAX_START_YAW_DEG, MAX_START_TILT_DEG = 30.0, 30.0
