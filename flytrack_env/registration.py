@@ -17,6 +17,7 @@ from flytrack_env.multi_drone.rules import MAX_DRONES
 from flytrack_env.wrappers import (
     NOISY_DETECTOR,
     ActionHistory,
+    DetectorRandomization,
     DomainRandomization,
     GateCorners,
     GateMask,
@@ -66,7 +67,13 @@ ENVIRONMENTS: dict[str, Variant] = {
     "FlyTrackCornersRobust-v0": Variant(
         "The same with another drone and another camera in every episode, and the last three "
         "commands.",
-        wrappers=(DomainRandomization, NOISY_CORNERS, ObservationNoise, HISTORY),
+        wrappers=(
+            DomainRandomization,
+            NOISY_CORNERS,
+            DetectorRandomization,
+            ObservationNoise,
+            HISTORY,
+        ),
     ),
     "FlyTrackMask-v0": Variant(
         "The race seen as a binary image of the gates' frames.", wrappers=(GateMask,)

@@ -3,6 +3,10 @@
 from flytrack_env.wrappers.action_delay import ActionDelay
 from flytrack_env.wrappers.action_history import ActionHistory
 from flytrack_env.wrappers.base import Wrapper, WrapperError, layers_of
+from flytrack_env.wrappers.detector_randomization import (
+    DetectorRandomization,
+    DetectorRandomizationParams,
+)
 from flytrack_env.wrappers.domain_randomization import DomainRandomization, RandomizationParams
 from flytrack_env.wrappers.episode_statistics import EpisodeStatistics
 from flytrack_env.wrappers.gate_corners import NOISY_DETECTOR, CornersParams, GateCorners
@@ -16,6 +20,8 @@ __all__ = [
     "ActionDelay",
     "ActionHistory",
     "CornersParams",
+    "DetectorRandomization",
+    "DetectorRandomizationParams",
     "DomainRandomization",
     "DroneRaceEnv",
     "EpisodeStatistics",

@@ -23,12 +23,14 @@ MAKERS = {
     "delay": wrappers.ActionDelay,
     "randomization": wrappers.DomainRandomization,
     "corners": wrappers.GateCorners,
+    "detector": wrappers.DetectorRandomization,
     "mask": partial(wrappers.GateMask, size=(8, 8)),
     "state": wrappers.StateObservation,
     "statistics": wrappers.EpisodeStatistics,
     "legacy": wrappers.LegacyStep,
     "log": LogWrapper,
 }
+DETECTOR = wrappers.DetectorRandomization
 OTHER_STEP = ("legacy", "log")
 ROWS = {"commanded": 8, "applied": 4, "state": OBSERVATION_SIZE}
 CAMERAS = {"corners": (31,), "mask": (8, 8, 1)}
@@ -41,7 +43,10 @@ def test_every_public_wrapper_is_tried():
         for export in exported
         if isinstance(export, type) and issubclass(export, wrappers.Wrapper)
     }
-    assert public - {wrappers.Wrapper} < {type(make(FlyTrack())) for make in MAKERS.values()}
+    assert public - {wrappers.Wrapper} < {
+        type(make(wrappers.GateCorners(FlyTrack()) if make is DETECTOR else FlyTrack()))
+        for make in MAKERS.values()
+    }
 
 
 def reasons_against(name, inside):
@@ -57,6 +62,7 @@ def reasons_against(name, inside):
     reasons = {
         "both have the name": name in inside,
         "the history would hold the delayed commands": name == "delay" and "commanded" in inside,
+        "found no GateCorners inside": name == "detector" and "corners" not in inside,
         "it replaces FlyTrack's observation": name in CAMERAS
         and any(inner in CAMERAS or inner in ROWS for inner in inside),
         "an image has no rows": name in (*ROWS, "noise") and "mask" in inside,

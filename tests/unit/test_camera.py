@@ -7,12 +7,26 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from PIL.Image import open as open_image
 
 from benchmarks.hidden import ray_caster
 from benchmarks.hidden.ray_caster import Image
 from flytrack_env import FlyTrack, camera
+from flytrack_env.flown_camera import film
+from flytrack_env.pictures import make_flight, write_camera_view
 from flytrack_env.quaternion import Quaternion, Vec3
-from flytrack_env.wrappers import CornersParams, GateCorners, GateMask
+from flytrack_env.references import ghost_rollout, shipped_references
+from flytrack_env.state import Action
+from flytrack_env.viz_rerun import Trajectory, write_recording
+from flytrack_env.wrappers import (
+    NOISY_DETECTOR,
+    CornersParams,
+    DetectorRandomization,
+    GateCorners,
+    GateMask,
+    ObservationNoise,
+    StateObservation,
+)
 from tests.support.coasting import Coasting, coasting_env, drone_at
 from tests.support.compiling import quick_jit
 from tests.support.wrapped_flights import arrays
@@ -220,3 +234,52 @@ def test_images_too_small_or_too_large_are_refused(size):
     with pytest.raises(ValueError, match="field_of_view_deg: found 180"):
         own = env.own_defaults()._replace(field_of_view_deg=180.0)
         env.check_params(env.with_own_params(env.default_params, own))
+
+
+# --- Around the detector ------------------------------------------------------------------------
+
+
+def test_a_detector_is_drawn_for_an_episode_within_its_ranges():
+    env = DetectorRandomization(GateCorners(coasting_env(30.0, 40.0), NOISY_DETECTOR))
+    params, drone = env.default_params, drone_at((0.0, 0.0, 2.0), (20.0, 0.0, 0.0))
+
+    def detectors(seed):
+        state = env.begin(drone, 0, params, seed)
+        later = env.advance(state, Action(0.0, 0.0, 0.0, 0.0), params)[0]
+        return env.detector(state, params), env.detector(later, params)
+
+    first, later = jax.vmap(detectors)(jnp.arange(500, dtype=jnp.uint32))
+    for name, value in first._asdict().items():
+        assert_array_equal(value, getattr(later, name))
+        own, half = getattr(NOISY_DETECTOR, name), {"pitch_deg": 3.0, "field_of_view_deg": 5.0}
+        is_error = name in ("noise_px", "missed", "swapped", "latency_s")
+        low, high = (0.0, own) if is_error else (own - half.get(name, 0), own + half.get(name, 0))
+        assert_allclose([value.min(), value.max()], [low, high], atol=0.02 * (high - low))
+    wide = params.wrappers["detector_randomization"]._replace(field_of_view_deg=60.0)
+    with pytest.raises(ValueError, match="field_of_view_deg: found 180"):
+        env.check_params(params.replace(wrappers={**params.wrappers, env.key: wide}))
+
+
+def test_the_state_beside_corners_is_that_of_the_drone():
+    env = StateObservation(ObservationNoise(GateCorners(FlyTrack(plant=Coasting()))))
+    drone = drone_at((14.0, 2.5, 1.5), (-8.0, 1.0, 0.5))
+    rows = env.observe(None, env.begin(drone, 0, env.default_params), None, env.default_params)
+    plain = FlyTrack(plant=Coasting())
+    state = plain.begin(drone, 0, plain.default_params)
+    assert_allclose(rows[31:], plain.observe(None, state, None, plain.default_params), atol=1e-6)
+
+
+def test_what_a_camera_saw_is_shown_in_recordings_and_pictures(tmp_path):
+    track = FlyTrack().track
+    states, actions = ghost_rollout(shipped_references(track, ("nominal",)), 24)
+    flight = make_flight("ghost", states, actions, track)
+    with open_image(write_camera_view(flight, tmp_path)) as gif:
+        assert gif.n_frames == 6 and gif.size == (960, 360)
+    sizes = []
+    for with_camera in (False, True):
+        path = tmp_path / f"{with_camera}.rrd"
+        flown = [Trajectory("ghost", states, actions)]
+        write_recording(path, flown, track, with_camera=with_camera)
+        sizes.append(path.stat().st_size)
+    seen = film(states, flight.race.gate, track)
+    assert sizes[1] > sizes[0] + 64 and seen.is_visible[0].any() and seen.masks[0].any()
