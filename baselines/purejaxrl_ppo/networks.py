@@ -16,6 +16,7 @@ from flax import struct
 from baselines.purejaxrl_ppo.config import Config
 from flytrack_env.observations import OBSERVATION_SIZE
 
+IMAGE_AXES, NUM_FEATURES = 3, 64
 Memory = Any  # what a policy remembers of an episode, a pytree; () of one that remembers nothing
 
 
@@ -38,6 +39,18 @@ class _Gru(nn.Module):
         return jnp.where(done[..., None], 0.0, memory), memory
 
 
+class _Convolutions(nn.Module):
+    """Patches of 8 x 8 pixels, then groups of four of them, then a layer: features of an image."""
+
+    @nn.compact
+    def __call__(self, image: jax.Array) -> jax.Array:
+        """Return features, (..., 64), of images (..., height, width, channels), uint8."""
+        values = image.astype(jnp.float32) * (1.0 / 255.0)
+        for size, width in ((8, 16), (2, 32)):
+            values = nn.tanh(nn.Conv(width, (size, size), strides=(size, size))(values))
+        return nn.tanh(nn.Dense(NUM_FEATURES)(values.reshape(*values.shape[:-IMAGE_AXES], -1)))
+
+
 class ActorCritic(nn.Module):
     """Policy and value of an observation and, if the network has one, a memory of the episode.
 
@@ -46,6 +59,7 @@ class ActorCritic(nn.Module):
     Attributes:
         num_choices: number of discrete actions; 0 for continuous ones.
         num_state_rows: number of rows at the end of an observation that the critic alone sees.
+        sees_image: whether an observation is an image, which convolutions make features of.
         estimates_state: whether a linear layer estimates these rows from what the policy knows.
     """
 
@@ -58,6 +72,7 @@ class ActorCritic(nn.Module):
     encoder_sizes: Sequence[int] = ()
     num_state_rows: int = 0
     estimates_state: bool = False
+    sees_image: bool = False
 
     def setup(self) -> None:
         """Declare the layers."""
@@ -68,6 +83,8 @@ class ActorCritic(nn.Module):
             self.log_std = self.param("log_std", start, (len(self.initial_action),))
         if self.estimates_state:
             self.estimator = nn.Dense(self.num_state_rows)
+        if self.sees_image:
+            self.convolutions = _Convolutions()
         if self.memory_size:
             over_steps = nn.scan(
                 _Gru,
@@ -98,9 +115,10 @@ class ActorCritic(nn.Module):
         std = jnp.maximum(jnp.exp(self.log_std), self.min_std)
         return distrax.MultivariateNormalDiag(mean, jnp.broadcast_to(std, mean.shape))
 
-    def value(self, known: jax.Array, state: jax.Array) -> jax.Array:
-        """Return the value, batch shape as that of what is known."""
-        return self.critic(jnp.concatenate([known, state], axis=-1)).squeeze(-1)
+    def value(self, known: jax.Array, state: jax.Array | None = None) -> jax.Array:
+        """Return the value, batch shape as that of what is known; state: that the critic sees."""
+        seen = known if state is None else jnp.concatenate([known, state], axis=-1)
+        return self.critic(seen).squeeze(-1)
 
     def state_error(self, known: jax.Array, state: jax.Array) -> jax.Array:
         """Return the mean squared error of the state's estimate, a scalar; 0 without estimate."""
@@ -110,8 +128,8 @@ class ActorCritic(nn.Module):
 
     def __call__(self, observation: jax.Array) -> tuple[distrax.Distribution, jax.Array]:
         """Return policy and value of first observations of episodes, having used every layer."""
-        first = self.first_memory(observation.shape[:-1])
-        known, state = self._split(observation)
+        first = self.first_memory(self._batch_shape(observation))
+        known, state = self._split(self._look(observation))
         self.state_error(self._remember(first, known)[1], state)
         return self.step(first, observation)[1:]
 
@@ -124,18 +142,18 @@ class ActorCritic(nn.Module):
         self, memory: Memory, observation: jax.Array
     ) -> tuple[Memory, distrax.Distribution, jax.Array]:
         """Return the memory after a step, policy and value."""
-        observation, state = self._split(observation)
+        observation, state = self._split(self._look(observation))
         memory, known = self._remember(memory, observation)
         return memory, self.policy(known), self.value(known, state)
 
     def decide(self, memory: Memory, observation: jax.Array) -> tuple[Memory, distrax.Distribution]:
         """Return the memory after a step and the policy, of what the policy observes."""
-        memory, known = self._remember(memory, observation)
+        memory, known = self._remember(memory, self._look(observation))
         return memory, self.policy(known)
 
     def value_of(self, memory: Memory, observation: jax.Array) -> jax.Array:
         """Return the value of an observation after what is remembered."""
-        observation, state = self._split(observation)
+        observation, state = self._split(self._look(observation))
         return self.value(self._remember(memory, observation)[1], state)
 
     def unroll(
@@ -151,7 +169,7 @@ class ActorCritic(nn.Module):
             observation: (num_envs, num_steps, size) with a memory, else (num_rows, size).
             done: whether an episode ends after the step, (num_envs, num_steps).
         """
-        known, state = self._split(observation)
+        known, state = self._split(self._look(observation))
         if self.memory_size:
             remembered = self.gru(memory[:, 0], (self._encode(known), done))[1]
             known = jnp.concatenate([known, remembered], axis=-1)
@@ -160,6 +178,13 @@ class ActorCritic(nn.Module):
     def _encode(self, observation: jax.Array) -> jax.Array:
         """Return what the recurrent unit sees of an observation."""
         return self.encoder(observation) if self.encoder_sizes else observation
+
+    def _look(self, observation: jax.Array) -> jax.Array:
+        """Return an observation as rows: an image's features."""
+        return self.convolutions(observation) if self.sees_image else observation
+
+    def _batch_shape(self, observation: jax.Array) -> tuple[int, ...]:
+        return observation.shape[: -IMAGE_AXES if self.sees_image else -1]
 
     def _split(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return the rows that the policy sees, and those of the state."""
@@ -194,10 +219,11 @@ class Policy:
     params: Any
 
 
-def make_network(config: Config, num_choices: int = 0) -> ActorCritic:
+def make_network(config: Config, num_choices: int = 0, sees_image: bool = False) -> ActorCritic:
     """Return the network that a configuration describes.
 
-    num_choices: number of discrete actions; 0 for continuous ones.
+    num_choices: number of discrete actions; 0 for continuous ones. sees_image: whether an
+    observation is an image.
     """
     return ActorCritic(
         hidden_sizes=config.hidden_sizes,
@@ -209,4 +235,5 @@ def make_network(config: Config, num_choices: int = 0) -> ActorCritic:
         encoder_sizes=config.encoder_sizes,
         num_state_rows=OBSERVATION_SIZE if config.critic_sees_state else 0,
         estimates_state=config.state_coef > 0.0,
+        sees_image=sees_image,
     )

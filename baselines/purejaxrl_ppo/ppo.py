@@ -37,7 +37,7 @@ from gymnax.environments import spaces
 
 from baselines.purejaxrl_ppo.config import Config
 from baselines.purejaxrl_ppo.metrics import summarize_episodes, summarize_race
-from baselines.purejaxrl_ppo.networks import ActorCritic, Memory, make_network
+from baselines.purejaxrl_ppo.networks import IMAGE_AXES, ActorCritic, Memory, make_network
 from flytrack_env.wrappers import StateObservation
 
 Metrics = dict[str, jax.Array]
@@ -200,14 +200,16 @@ def make_network_for(env: Any, env_params: Any, config: Config) -> ActorCritic:
         ValueError: ``initial_action`` of another length than the environment's actions.
     """
     space = env.action_space(env_params)
+    observation, _ = jax.eval_shape(env.reset, jax.random.key(0), env_params)
+    sees_image = observation.ndim == IMAGE_AXES
     if isinstance(space, spaces.Discrete):
-        return make_network(config, int(space.n))
+        return make_network(config, int(space.n), sees_image)
     if space.shape != (len(config.initial_action),):
         raise ValueError(
             f"initial_action: found {len(config.initial_action)} values, expected the "
             f"environment's action shape {space.shape}"
         )
-    return make_network(config)
+    return make_network(config, sees_image=sees_image)
 
 
 def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
