@@ -40,15 +40,32 @@ class _Gru(nn.Module):
 
 
 class _Convolutions(nn.Module):
-    """Patches of 8 x 8 pixels, then groups of four of them, then a layer: features of an image."""
+    """Features of an image: convolutions of 8 x 8 pixels, then of 2 x 2 of these, then a layer.
+
+    They do not overlap, and are written as products of matrices: in the loops of a training, XLA's
+    convolutions took eleven times as long on a CPU (4.8 s an update of 8,192 steps, not 0.43).
+    """
 
     @nn.compact
     def __call__(self, image: jax.Array) -> jax.Array:
         """Return features, (..., 64), of images (..., height, width, channels), uint8."""
         values = image.astype(jnp.float32) * (1.0 / 255.0)
         for size, width in ((8, 16), (2, 32)):
-            values = nn.tanh(nn.Conv(width, (size, size), strides=(size, size))(values))
+            values = nn.tanh(nn.Dense(width)(_patches(values, size)))
         return nn.tanh(nn.Dense(NUM_FEATURES)(values.reshape(*values.shape[:-IMAGE_AXES], -1)))
+
+
+def _patches(image: jax.Array, size: int) -> jax.Array:
+    """Return the patches of images as rows, (..., height / size, width / size, size^2 channels).
+
+    Images are filled up with zeros to whole patches.
+    """
+    *batch, height, width, channels = image.shape
+    missing = [(0, -length % size) for length in (height, width)]
+    image = jnp.pad(image, [(0, 0)] * len(batch) + [*missing, (0, 0)])
+    rows, columns = -(-height // size), -(-width // size)
+    split = image.reshape(*batch, rows, size, columns, size, channels)
+    return split.swapaxes(-4, -3).reshape(*batch, rows, columns, size * size * channels)
 
 
 class ActorCritic(nn.Module):
