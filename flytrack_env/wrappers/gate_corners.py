@@ -282,24 +282,31 @@ class GateCorners(CameraView):
 
 def _draw_sides(own: CornersParams, draws: Draws) -> list[tuple[jax.Array, jax.Array]]:
     """Return for each gate -1 if the upper, and if the lower corners are exchanged, else 1."""
-    low, high = 0.5 * own.swapped, 1.0 - 0.5 * own.swapped
+    half = compute_once(_threshold(0.5 * own.swapped))
     return [
-        (jnp.where(draw < low, -1.0, 1.0), jnp.where(draw > high, -1.0, 1.0))
-        for draw in _uniform_halves(draws, "swapped")
+        (
+            jnp.where(draw < half, -1.0, 1.0),
+            jnp.where(draw >= jnp.uint32(2**HALF_BITS) - half, -1.0, 1.0),
+        )
+        for draw in _halves(draws.word("swapped"))
     ]
-
-
-def _uniform_halves(draws: Draws, name: str) -> tuple[jax.Array, jax.Array]:
-    """Return two uniform numbers in [0, 1), multiples of 2^-16, of the halves of one word."""
-    word = draws.word(name)
-    high, low = word >> HALF_BITS, word & (2**HALF_BITS - 1)
-    return high.astype(jnp.float32) * 2.0**-HALF_BITS, low.astype(jnp.float32) * 2.0**-HALF_BITS
 
 
 def _draw_missed(own: CornersParams, draws: Draws, gate: int) -> list[jax.Array]:
     """Return whether each corner of a gate is missed."""
-    pairs = (_uniform_halves(draws, f"missed_{gate}_{pair}") for pair in range(NUM_CORNERS // 2))
-    return [draw < own.missed for pair in pairs for draw in pair]
+    threshold = compute_once(_threshold(own.missed))
+    words = [draws.word(f"missed_{gate}_{pair}") for pair in range(NUM_CORNERS // 2)]
+    return [half < threshold for word in words for half in _halves(word)]
+
+
+def _halves(word: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return two random uint32 below 2^16 of one word: a hash costs as much as a corner."""
+    return word >> HALF_BITS, word & (2**HALF_BITS - 1)
+
+
+def _threshold(probability: Scalar) -> jax.Array:
+    """Return the uint32 below which such a half lies with a probability, in steps of 2^-16."""
+    return jnp.round(probability * 2.0**HALF_BITS).astype(jnp.uint32)
 
 
 def _detect_corner(
