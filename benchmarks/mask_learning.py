@@ -5,6 +5,7 @@ trains PPO on ``FlyTrackMask-v0`` and prints returns and gates over the training
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +15,13 @@ from benchmarks import report
 
 ENV_ID = "FlyTrackMask-v0"
 # Fewer environments than for numbers, as an update holds 4 kB of image a step.
-SETTINGS = {"memory_size": 64, "num_envs": 256, "num_steps": 32, "num_minibatches": 16}
-RATES = {"learning_rate": 1e-3, "gate_margin": 0.0}
+SETTINGS: dict[str, Any] = {
+    "memory_size": 64,
+    "num_envs": 256,
+    "num_steps": 32,
+    "num_minibatches": 16,
+}
+RATES: dict[str, Any] = {"learning_rate": 1e-3, "gate_margin": 0.0}
 ROWS = 8  # of the table
 
 
