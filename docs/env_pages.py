@@ -88,6 +88,7 @@ def env_page(env_id: str) -> str:
         ],
         is_randomised="domain_randomization" in (params.wrappers or {}),
         size=observation.size,
+        image=None if env.image_shape is None else " x ".join(map(str, env.image_shape)),
         observation=observation_rows(env),
         terms={term.__name__: sentence(term.__doc__) for term in TERMS},
         causes={name: causes[name] for name in Causes._fields},

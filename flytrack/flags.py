@@ -54,6 +54,9 @@ class Show:
     """Fly the time-optimal flight beside them in the recording."""
     ghost_model: Literal["nominal", "black_box"] = "nominal"
     """Drone for which the time-optimal flight is optimal."""
+    camera: bool = False
+    """Also show what the drone's camera sees, gates' corners and mask: in the recording, and of
+    each as GIF beside the view from behind."""
     animation: bool = False
     """Also write the fastest flying lap of each beside the time-optimal one as GIF."""
 

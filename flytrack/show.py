@@ -4,7 +4,13 @@ from pathlib import Path
 
 from flytrack.flags import Show
 from flytrack_env.files import fresh_folder
-from flytrack_env.pictures import read_flights, write_animation, write_pictures
+from flytrack_env.pictures import (
+    make_flight,
+    read_flights,
+    write_animation,
+    write_camera_view,
+    write_pictures,
+)
 from flytrack_env.references import ghost_rollout, shipped_reference, shipped_references
 from flytrack_env.rollout import load_named_rollouts
 from flytrack_env.tracks import load_track
@@ -35,10 +41,15 @@ def run_show(flags: Show) -> None:
     )
     folder = flags.out or fresh_folder(DEFAULT_OUT)
     folder.mkdir(parents=True, exist_ok=True)
-    write_recording(folder / RECORDING, recorded, track)
+    write_recording(folder / RECORDING, recorded, track, with_camera=flags.camera)
     paths = [folder / RECORDING, *write_pictures(flights, folder)]
     if optimal is not None:
         paths += [write_animation(flight, optimal, folder) for flight in flights]
+    if flags.camera:
+        shown = flights or [
+            make_flight(one.name, one.states, one.actions, track) for one in recorded
+        ]
+        paths += [write_camera_view(flight, folder) for flight in shown]
     print(f"shown: {', '.join(one.name for one in recorded)}, {num_steps} steps on {track.name}")
     for path in paths:
         print(f"{path}: {path.stat().st_size} bytes")

@@ -73,6 +73,8 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         plant: what moves the drone.
         missed_gate: "terminate" or "fly_on".
         env_id: as registered.
+        image_shape: height, width and channels of an observation that is an image of uint8; None
+            where it is a vector of float32.
     """
 
     _supports_transition_gradients = True
@@ -80,6 +82,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     plant: Plant
     missed_gate: str
     env_id = "FlyTrack-v0"
+    image_shape: tuple[int, int, int] | None = None
 
     # The hooks.
 
@@ -134,6 +137,13 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         """Return the observation where sensors report ``drone``: a float32 scalar per row."""
         raise NotImplementedError
 
+    def compose(self, rows: list[jax.Array], params: EnvParams) -> jax.Array:
+        """Return the observation that the rows of ``observe_drone`` are made into: the stack.
+
+        Called outside of the step's kernel.
+        """
+        return jnp.stack(rows)
+
     def is_truncated(self, state: Any, params: EnvParams) -> jax.Array:
         """Return whether the episode is cut off, by the time limit, a bool scalar."""
         raise NotImplementedError
@@ -159,7 +169,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         track, plant, size = (
             self.track.name,
             type(self.plant).__name__,
-            self.observation_space().shape[0],
+            " x ".join(map(str, self.observation_space().shape)),
         )
         return (
             f"<{self.env_id}: track {track}, plant {plant}, effects {effects}, "
@@ -176,7 +186,9 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         return spaces.Box(-1.0, 1.0, (ACTION_SIZE,), jnp.float32)
 
     def observation_space(self, params: EnvParams | None = None) -> spaces.Box:
-        """The observation's table as a box."""
+        """The observation's table as a box; of an image, its shape in uint8."""
+        if self.image_shape is not None:
+            return spaces.Box(0, 255, self.image_shape, jnp.uint8)
         return observation_box(self.observation_table)
 
     def observe(
@@ -184,7 +196,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     ) -> jax.Array:
         """Return the observation of a state, (size,) float32; key and action are unused."""
         del key, action
-        return jnp.stack(self._rows(state, params))
+        return self.compose(self._rows(state, params), params)
 
     def step_env(  # type: ignore[override]  # actions are arrays here
         self, key: jax.Array | None, state: Any, action: jax.Array, params: EnvParams
@@ -202,7 +214,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
         rows, next_state, reward, flags, info = one_kernel(self._transition)(
             state, clip_action(action, self._dtype(state)), params
         )
-        return jnp.stack(rows), next_state, reward, flags["terminated"], info
+        return self.compose(rows, params), next_state, reward, flags["terminated"], info
 
     def reset(  # type: ignore[override]  # gymnax's is compiled; this one checks, then calls it
         self, key: jax.Array, params: EnvParams | None = None
@@ -229,7 +241,7 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
     def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, Any]:
         """Return observation, (size,) float32, and state of a new episode; nothing is checked."""
         rows, state = vary_like(self._begin_from(seed_of(key), params), (key, params))
-        return jnp.stack(rows), state
+        return self.compose(rows, params), state
 
     def _begin_from(self, seed: jax.Array, params: EnvParams) -> tuple[list[jax.Array], Any]:
         """Return observation, row by row, and state of a new episode, from one random word."""
@@ -323,5 +335,6 @@ class EpisodicEnvironment(environment.Environment[Any, EnvParams]):  # type: ign
             seed, state, clip_action(action, self._dtype(state)), params, has_ended
         )
         rows, final_rows, state, reward, flags, info = outcome
-        info = {**info, **flags, "final_observation": jnp.stack(final_rows)}
-        return jnp.stack(rows), state, reward, flags["terminated"], flags["truncated"], info
+        info = {**info, **flags, "final_observation": self.compose(final_rows, params)}
+        observation = self.compose(rows, params)
+        return observation, state, reward, flags["terminated"], flags["truncated"], info

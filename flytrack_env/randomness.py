@@ -99,13 +99,26 @@ class Draws:
         stretched by an odd polynomial: noise is drawn in every step, twice, and the inverse
         distribution function would cost more than the rest of the observation.
         """
+        return self.normal_pair(name)[0]
+
+    def normal_pair(self, name: str) -> tuple[jax.Array, jax.Array]:
+        """Return two such numbers that are uncorrelated, for little more than one.
+
+        They are a sum and a difference of the same bytes, so that one is seldom large where the
+        other is; the first is that of ``normal``.
+        """
         word = self.word(name)
         pairs = (word & EVEN_BYTES) + ((word >> 8) & EVEN_BYTES)
-        total = ((pairs & 0xFFFF) + (pairs >> 16)).astype(jnp.float32)
-        centred = (total - 2.0 * 255.0) * (1.0 / BYTES_DEVIATION)
-        square = centred * centred
-        return centred * (NORMAL[0] + square * (NORMAL[1] + square * NORMAL[2]))
+        low, high = ((pairs & 0xFFFF).astype(jnp.float32), (pairs >> 16).astype(jnp.float32))
+        return _stretch(low + high - 2.0 * 255.0), _stretch(low - high)
 
     def index(self, name: str, count: int) -> jax.Array:
         """Return an int32 in [0, count)."""
         return jnp.minimum(self.uniform(name, 0.0, count).astype(jnp.int32), count - 1)
+
+
+def _stretch(total: jax.Array) -> jax.Array:
+    """Return an approximately standard normal of the sum of four bytes less its mean."""
+    centred = total * (1.0 / BYTES_DEVIATION)
+    square = centred * centred
+    return centred * (NORMAL[0] + square * (NORMAL[1] + square * NORMAL[2]))

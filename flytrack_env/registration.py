@@ -14,7 +14,15 @@ from flytrack_env.messages import check_keywords
 from flytrack_env.multi_drone import MultiDroneRace, Opponent, Versus, idle
 from flytrack_env.multi_drone.ghosts import Ghost, time_optimal_ghost
 from flytrack_env.multi_drone.rules import MAX_DRONES
-from flytrack_env.wrappers import ActionHistory, DomainRandomization, ObservationNoise
+from flytrack_env.wrappers import (
+    NOISY_DETECTOR,
+    ActionHistory,
+    DetectorRandomization,
+    DomainRandomization,
+    GateCorners,
+    GateMask,
+    ObservationNoise,
+)
 
 
 class Variant(NamedTuple):
@@ -28,6 +36,8 @@ class Variant(NamedTuple):
 ARGUMENTS = tuple(inspect.signature(FlyTrack).parameters)  # of make, by name
 GHOST_DELAY_S = 0.3
 HISTORY = partial(ActionHistory, length=3)
+LAST_ACTION = partial(ActionHistory, length=1)
+NOISY_CORNERS = partial(GateCorners, detector=NOISY_DETECTOR)
 
 ENVIRONMENTS: dict[str, Variant] = {
     "FlyTrack-v0": Variant("The race with perfect sensors and one known drone."),
@@ -44,6 +54,29 @@ ENVIRONMENTS: dict[str, Variant] = {
     "FlyTrackRobust-v0": Variant(
         "All of it: another drone in every episode, noisy sensors, the last three commands.",
         wrappers=(DomainRandomization, ObservationNoise, HISTORY),
+    ),
+    "FlyTrackCorners-v0": Variant(
+        "The race seen by a perfect gate detector: corners in a camera's image, gyro, "
+        "accelerometer, battery and the last command.",
+        wrappers=(GateCorners, LAST_ACTION),
+    ),
+    "FlyTrackCornersNoisy-v0": Variant(
+        "The race seen by a gate detector that is late, noisy and misses corners.",
+        wrappers=(NOISY_CORNERS, ObservationNoise, LAST_ACTION),
+    ),
+    "FlyTrackCornersRobust-v0": Variant(
+        "The same with another drone and another camera in every episode, and the last three "
+        "commands.",
+        wrappers=(
+            DomainRandomization,
+            NOISY_CORNERS,
+            DetectorRandomization,
+            ObservationNoise,
+            HISTORY,
+        ),
+    ),
+    "FlyTrackMask-v0": Variant(
+        "The race seen as a binary image of the gates' frames.", wrappers=(GateMask,)
     ),
 }
 

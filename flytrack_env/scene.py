@@ -54,7 +54,6 @@ MOTORS_B = np.array(
 )
 ARMS_B = MOTORS_B[[[0, 3], [1, 2]]]
 ROTOR_M = 0.08  # radius
-CAMERA_PITCH_DEG = 40.0  # upwards
 
 
 class Gates(NamedTuple):

@@ -62,6 +62,7 @@ class _Description(msgspec.Struct):
     track: str
     missed_gate: str
     observation_size: Width
+    image_shape: tuple[Width, Width, Width] | None = None
 
 
 class _Progress(msgspec.Struct):
@@ -106,7 +107,7 @@ class Checkpoint(NamedTuple):
     @property
     def network(self) -> ActorCritic:
         """The network that the parameters belong to."""
-        return make_network(self.config)
+        return make_network(self.config, sees_image=self.meta.get("image_shape") is not None)
 
     @property
     def policy(self) -> Policy:
@@ -116,7 +117,7 @@ class Checkpoint(NamedTuple):
     def check_fits(self, env: Any) -> None:
         """Raise CheckpointError unless the policy's input is the observation, row by row."""
         shape = env.observation_space(env.default_params).shape
-        if shape != (self.observation_size,):
+        if shape != tuple(self.meta.get("image_shape") or (self.observation_size,)):
             raise CheckpointError(
                 f"checkpoint: trained on observations of size {self.observation_size} "
                 f"({self.env_id}), but the environment's have shape {shape}"
@@ -292,11 +293,16 @@ def _decode(path: Path, content: bytes) -> Checkpoint:
     if description.format != FORMAT:
         raise ValueError(f"format: found {quote_value(description.format)}, expected {FORMAT!r}")
     config = read_config("config", meta["config"]).check()
-    observation = jax.ShapeDtypeStruct((1, description.observation_size), jnp.float32)
+    image = description.image_shape
+    network = make_network(config, sees_image=image is not None)
+    size = description.observation_size + network.num_state_rows
+    observation = jax.ShapeDtypeStruct(
+        (1, *(image or (size,))), jnp.uint8 if image else jnp.float32
+    )
     # Of the precision it was trained in, whatever that of this process.
     is_double = any(array.dtype == np.float64 for array in arrays.values())
     with jax.enable_x64(is_double):
-        target = jax.eval_shape(make_network(config).init, jax.random.key(0), observation)
+        target = jax.eval_shape(network.init, jax.random.key(0), observation)
     policy, training = (
         {
             name.removeprefix(prefix): array
@@ -360,6 +366,7 @@ def describe_run(env: Any, env_id: str, track: str, config: Config, seed: int) -
         "track_data": dataclasses.asdict(env.track),
         "missed_gate": env.missed_gate,
         "observation_size": int(env.observation_space().shape[0]),
+        "image_shape": env.image_shape,
         "observation": observation_layout(env),
         "seed": seed,
         "model": model_as_json(params.model),

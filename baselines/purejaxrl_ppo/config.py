@@ -104,6 +104,17 @@ class Config:
     memory_size: Annotated[int, Meta(ge=0, le=MAX_WIDTH)] = 0
     """Width of a gated recurrent unit whose memory of the episode the layers see beside the
     observation; 0: none. A policy that remembers can adapt to the drone that it flies."""
+    encoder_sizes: Annotated[tuple[Width, ...], Meta(max_length=MAX_LAYERS)] = ()
+    """Widths of tanh layers between the observation and that unit: what a camera shows is a product
+    of distances and angles, which a unit alone does not take apart."""
+    critic_sees_state: bool = False
+    """Whether the critic sees FlyTrack-v0's observation of the true state beside the policy's. A
+    policy that has a camera only cannot know its position at once, but the critic, which is needed
+    in training only, need not guess it."""
+    state_coef: NonNegativeFloat = 0.0
+    """Weight of the mean squared error of the state that a linear layer reads from what the policy
+    knows; 0: no such layer. Needs critic_sees_state. The error teaches the memory to hold position,
+    velocity and attitude long before rewards would."""
     initial_std: PositiveFloat = 0.5
     """Initial standard deviation of the actions, independent of the state. PureJaxRL: 1."""
     min_std: NonNegativeFloat = 0.05
@@ -155,6 +166,10 @@ class Config:
             raise ConfigError(
                 f"total_timesteps: found {config.total_timesteps}, expected at least one update of "
                 f"{config.batch_size} steps (num_envs x num_steps)"
+            )
+        if config.state_coef and not config.critic_sees_state:
+            raise ConfigError(
+                f"state_coef: found {config.state_coef}, expected 0 without critic_sees_state"
             )
         is_by_env = config.memory_size > 0
         rows, what = (

@@ -132,6 +132,11 @@ def policy_of(checkpoint: Checkpoint, name: str, track: str | None = None) -> Ex
             "policy that remembers can be exported yet"
         )
     env = simulated_env(checkpoint, track)
+    if env.observation_table[: len(OBSERVATION)] != OBSERVATION:
+        raise CheckpointError(
+            f"{name}: observation: found that of {checkpoint.env_id}, expected one that begins "
+            "with FlyTrack-v0's"
+        )
     past = env.observation_table[len(OBSERVATION) :]
     unknown = [entry.key for entry in past if entry.key.rpartition("_")[0] not in KINDS_OF_PAST]
     if unknown:

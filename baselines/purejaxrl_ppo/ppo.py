@@ -19,6 +19,9 @@ the reason for each, and the setting (``config.py``) that switches it off:
   ``final_learning_rate_fraction = 0``).
 - The network may remember (``memory_size = 0``: it does not), so that it can adapt to the drone it
   flies.
+- The critic may see the state while the policy has sensors only (``critic_sees_state = false``: it
+  does not), so that it need not guess what the policy's memory has yet to find out. The memory may
+  be taught the state by an estimate of it (``state_coef = 0``: it is not).
 - One update is a function of its own (``Algorithm``), so that a run can be logged, stored and
   resumed between updates; ``make_train`` is PureJaxRL's: one ``jit``, a ``scan`` over updates.
 """
@@ -34,7 +37,8 @@ from gymnax.environments import spaces
 
 from baselines.purejaxrl_ppo.config import Config
 from baselines.purejaxrl_ppo.metrics import summarize_episodes, summarize_race
-from baselines.purejaxrl_ppo.networks import ActorCritic, Memory, make_network
+from baselines.purejaxrl_ppo.networks import IMAGE_AXES, ActorCritic, Memory, make_network
+from flytrack_env.wrappers import StateObservation
 
 Metrics = dict[str, jax.Array]
 
@@ -144,7 +148,7 @@ def ppo_loss(
     config: Config,
 ) -> tuple[jax.Array, Metrics]:
     """Return the clipped objective plus clipped value loss of a minibatch, and its parts."""
-    policy, value = network.apply(
+    policy, value, state_error = network.apply(
         network_params, batch.memory, batch.observation, batch.done, method="unroll"
     )
     log_prob = policy.log_prob(batch.action)
@@ -160,10 +164,13 @@ def ppo_loss(
     policy_loss = -jnp.minimum(ratio * advantage, clipped_ratio * advantage).mean()
     entropy = policy.entropy().mean()
     loss = policy_loss + config.value_coef * value_loss - config.entropy_coef * entropy
+    if config.state_coef:
+        loss = loss + config.state_coef * state_error
     parts = {
         "policy_loss": policy_loss,
         "value_loss": value_loss,
         "entropy": entropy,
+        "state_error": state_error,
         "approx_kl": ((ratio - 1.0) - log_ratio).mean(),
         "clip_fraction": (jnp.abs(ratio - 1.0) > config.clip_eps).mean(),
     }
@@ -193,14 +200,16 @@ def make_network_for(env: Any, env_params: Any, config: Config) -> ActorCritic:
         ValueError: ``initial_action`` of another length than the environment's actions.
     """
     space = env.action_space(env_params)
+    observation, _ = jax.eval_shape(env.reset, jax.random.key(0), env_params)
+    sees_image = observation.ndim == IMAGE_AXES
     if isinstance(space, spaces.Discrete):
-        return make_network(config, int(space.n))
+        return make_network(config, int(space.n), sees_image)
     if space.shape != (len(config.initial_action),):
         raise ValueError(
             f"initial_action: found {len(config.initial_action)} values, expected the "
             f"environment's action shape {space.shape}"
         )
-    return make_network(config)
+    return make_network(config, sees_image=sees_image)
 
 
 def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
@@ -210,6 +219,8 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
         ValueError: a configuration that cannot be trained with.
     """
     config.check()
+    if config.critic_sees_state:
+        env = StateObservation(env)
     network: Any = make_network_for(env, env_params, config)
     optimizer, schedule = make_optimizer(config), make_schedule(config)
     step_all = choose_step(env, config)

@@ -100,7 +100,8 @@ class MultiDroneRace:
             others on a grid that leaves the line free.
 
     Raises:
-        ValueError: another number of drones, value of ``over`` or place of a ghost.
+        ValueError: an image as observation, or another number of drones, value of ``over`` or place
+            of a ghost.
         TypeError: an environment that is none of FlyTrack's.
     """
 
@@ -115,6 +116,8 @@ class MultiDroneRace:
             raise TypeError(
                 f"env: found {type(env).__name__}, expected FlyTrack or a wrapper around it"
             )
+        if env.image_shape is not None:
+            raise ValueError("env: found an image as observation, expected one made of rows")
         check_num_drones(num_drones)
         if over not in ("all", "first"):
             raise ValueError(f"over: found {over!r}, expected 'all' or 'first'")

@@ -8,8 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from flytrack_env.extras import check_installed
 from flytrack_env.files import write_atomically
+from flytrack_env.flown_camera import film
 from flytrack_env.flown_race import STEP_S
 from flytrack_env.pictures.flight import Flight, Meeting, make_flight, read_flights
 from flytrack_env.references import Reference
@@ -26,6 +29,7 @@ __all__ = [
     "make_flight",
     "read_flights",
     "write_animation",
+    "write_camera_view",
     "write_pictures",
 ]
 
@@ -95,4 +99,28 @@ def write_animation(flight: Flight, reference: Reference, folder: str | Path) ->
     path = Path(folder) / f"{flight.name}.gif"
     gate_ids = [gate.id for gate in flight.track.gates]
     write_atomically(path, make_gif(build_course(flight.track), gate_ids, laps))
+    return path
+
+
+def write_camera_view(flight: Flight, folder: str | Path) -> Path:
+    """Write ``NAME_camera.gif``, the flight from behind and by its own camera; return its path.
+
+    Of a flight with a complete flying lap its fastest one, else all of it.
+
+    Raises:
+        ImportError, OSError: Pillow is not installed, or the file cannot be written.
+    """
+    check_installed("render", "animations of flights", "PIL")
+    from flytrack_env.rendering.onboard import make_onboard_gif
+
+    rows = slice(0, len(flight.states))
+    if flight.fastest_flying_lap is not None:
+        start, end = (round(gate_pass.time_s / STEP_S) for gate_pass in flight.fastest_flying_lap)
+        rows = slice(start, end + 1)
+    states, gates = flight.states[rows], flight.race.gate[rows]
+    laps = np.zeros((len(states), 3))  # the views show neither laps nor their times
+    scenes = np.concatenate([states, gates[:, None], laps], axis=1).astype(np.float32)
+    path = Path(folder) / f"{flight.name}_camera.gif"
+    shown = film(states, gates, flight.track)
+    write_atomically(path, make_onboard_gif(build_course(flight.track), scenes, shown))
     return path

@@ -29,7 +29,7 @@ GRID_M = 5.0
 RECENT_STEPS = 50  # of the path that are bright
 GATE_COLOUR = scene.blend(scene.NEXT_GATE, scene.BACKGROUND, 0.25)
 TEXT_SIZE, GATE_TEXT_SIZE = 22, 16
-NUM_COLOURS = 128
+NUM_COLOURS, NUM_SAMPLED = 128, 8  # colours, and frames that they are chosen from
 
 
 class Lap(NamedTuple):
@@ -52,9 +52,18 @@ def make_gif(course: Course, gate_ids: Sequence[int], laps: Sequence[Lap]) -> by
     last = max(len(lap.states) for lap in laps) - 1
     rows = [*range(0, last, STEPS_PER_FRAME), last]
     frames = [view.draw(laps, row) for row in rows]
-    palette = frames[-1].quantize(NUM_COLOURS, dither=Image.Dither.NONE)
+    return save_gif(frames, 10 * STEPS_PER_FRAME)
+
+
+def save_gif(frames: Sequence[Image.Image], frame_ms: int) -> bytes:
+    """Return pictures as an animated GIF; each is shown that long, ms, the last one longer."""
+    sampled = frames[:: -(-len(frames) // NUM_SAMPLED)]
+    sheet = Image.new("RGB", (sampled[0].width, len(sampled) * sampled[0].height))
+    for index, frame in enumerate(sampled):
+        sheet.paste(frame, (0, index * frame.height))
+    palette = sheet.quantize(NUM_COLOURS, dither=Image.Dither.NONE)
     indexed = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    durations_ms = [10 * STEPS_PER_FRAME] * (len(rows) - 1) + [LAST_FRAME_MS]
+    durations_ms = [frame_ms] * (len(frames) - 1) + [LAST_FRAME_MS]
     content = io.BytesIO()
     indexed[0].save(
         content,

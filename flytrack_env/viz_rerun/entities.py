@@ -9,12 +9,16 @@ import rerun as rr
 from scipy.spatial.transform import Rotation
 
 from flytrack_env import scene
+from flytrack_env.camera import FIELD_OF_VIEW_DEG, PITCH_DEG
+from flytrack_env.flown_camera import HEIGHT_PX, MASK_PX, WIDTH_PX, film
 from flytrack_env.flown_race import FlownRace
 from flytrack_env.scene import Colour, gates_of, rotations
 from flytrack_env.state import APPLIED_ACTION, BATTERY, QUATERNION, RATES, VELOCITY, Action
 from flytrack_env.tracks import Track, build_course
 from flytrack_env.viz_rerun.trajectory import Trajectory
 
+CORNERS, MASK = "camera_corners", "camera_mask"  # entities below the drone's
+MASK_EVERY = 4  # steps: a mask is 4 kB
 CAMERA_RAY_M, DIRECTION_M = 0.3, 1.0
 SCALED_FORCE = 0.1  # m of an arrow per m/s^2
 DIM = 0.6  # of the commanded action's line beside the applied one's
@@ -186,7 +190,7 @@ class Writer:
     def _log_drone(self) -> None:
         """Log the drone's body in its own frame, and the style of its path and passes, once."""
         drone, colour = f"{self.world}/drone", self.colours[self.trajectory.name]
-        pitch = math.radians(scene.CAMERA_PITCH_DEG)
+        pitch = math.radians(PITCH_DEG)
         ray_b = CAMERA_RAY_M * np.array([math.cos(pitch), 0.0, math.sin(pitch)])
         self._log(f"{drone}/motors", rr.Points3D(scene.MOTORS_B, radii=0.06, colors=colour))
         self._log(f"{drone}/arms", rr.LineStrips3D(scene.ARMS_B, radii=0.025, colors=colour))
@@ -201,6 +205,46 @@ class Writer:
         self._log(f"{self.world}/passes", rr.Points3D.from_fields(radii=PASS_RADIUS, colors=colour))
         laps = rr.Points3D.from_fields(radii=LAP_RADIUS, colors=colour, show_labels=True)
         self._log(f"{self.world}/laps", laps)
+
+    def send_camera(self) -> None:
+        """Send what the camera sees, where the race is known: corners, and masks at 25 Hz.
+
+        Each is the image of a pinhole in the drone's frame.
+        """
+        if self.race is None or self.track is None:
+            return
+        shown = film(self.trajectory.states, self.race.gate, self.track)
+        half_pitch = 0.5 * math.radians(PITCH_DEG)
+        up = rr.Transform3D(
+            quaternion=rr.Quaternion(xyzw=[0.0, -math.sin(half_pitch), 0.0, math.cos(half_pitch)])
+        )
+        for name, width, height in ((CORNERS, WIDTH_PX, HEIGHT_PX), (MASK, MASK_PX, MASK_PX)):
+            entity = f"{self.world}/drone/{name}"
+            focal_px = 0.5 * width / math.tan(0.5 * math.radians(FIELD_OF_VIEW_DEG))
+            pinhole = rr.Pinhole(
+                focal_length=focal_px,
+                width=width,
+                height=height,
+                camera_xyz=rr.ViewCoordinates.FLU,
+                image_plane_distance=CAMERA_RAY_M,
+            )
+            self._log(entity, up)
+            self._log(entity, pinhole)
+        points = [row[flags] for row, flags in zip(shown.corners_px, shown.is_visible, strict=True)]
+        shades = np.repeat([scene.NEXT_GATE, scene.CAMERA], 4, axis=0).reshape(2, 4, 3)
+        colours = np.concatenate([shades[flags] for flags in shown.is_visible])
+        columns = rr.Points2D.columns(positions=np.concatenate(points), colors=colours)
+        lengths = [len(row) for row in points]
+        corners = f"{self.world}/drone/{CORNERS}/points"
+        self._log(corners, rr.Points2D.from_fields(radii=PASS_RADIUS))
+        self._send(corners, self.all_rows, columns.partition(lengths))
+        rows = self.all_rows[::MASK_EVERY]
+        picture = rr.components.ImageFormat(
+            width=MASK_PX, height=MASK_PX, color_model="L", channel_datatype="U8"
+        )
+        masks = shown.masks[rows].reshape(len(rows), -1)
+        columns = rr.Image.columns(buffer=masks, format=[picture] * len(rows))
+        self._send(f"{self.world}/drone/{MASK}", rows, columns)
 
     def _send_poses(self) -> None:
         """Send the drone's pose, and for the view from behind a level frame, x ahead."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -12,7 +13,7 @@ from flytrack_env.files import write_atomically
 from flytrack_env.scene import FLIGHT_COLOURS
 from flytrack_env.state import ACTION_SIZE, STATE_SIZE, Action
 from flytrack_env.tracks import Track
-from flytrack_env.viz_rerun.entities import Writer, centres_of, log_course, log_once
+from flytrack_env.viz_rerun.entities import CORNERS, MASK, Writer, centres_of, log_course, log_once
 from flytrack_env.viz_rerun.trajectory import Trajectory, checked, track_of_gates
 
 APP_ID = "flytrack_viz"
@@ -72,7 +73,11 @@ def visualize_state_action_sequence(
 
 
 def write_recording(
-    path: str | Path, flights: Sequence[Trajectory], track: Track | None, app_id: str = APP_ID
+    path: str | Path,
+    flights: Sequence[Trajectory],
+    track: Track | None,
+    app_id: str = APP_ID,
+    with_camera: bool = False,
 ) -> None:
     """Write flights on one time line as a Rerun recording.
 
@@ -82,6 +87,8 @@ def write_recording(
         flights: at least one, of different names; the first has the entities of the handout, others
             their own below ``flights/NAME``.
         track: None shows no gates.
+        with_camera: whether what the cameras of the flights see is recorded, of flights at 100 Hz
+            on a track with gates.
 
     Raises:
         ValueError: no flights, two of one name, a flight that cannot be shown (as for
@@ -91,7 +98,7 @@ def write_recording(
     names = [flight.name for flight in flights]
     if len(set(names)) != len(names) or not names:
         raise ValueError(f"flights: found names {names}, expected at least one, each once")
-    content = _record(flights, track, app_id)
+    content = _record(flights, track, app_id, with_camera)
     try:
         write_atomically(path, content)
     except OSError as error:
@@ -99,7 +106,9 @@ def write_recording(
         raise ValueError(f"recording_path {path}: {reason}") from error
 
 
-def _record(flights: Sequence[Trajectory], track: Track | None, app_id: str) -> bytes:
+def _record(
+    flights: Sequence[Trajectory], track: Track | None, app_id: str, with_camera: bool
+) -> bytes:
     """Return the content of a recording; Rerun's own writer would wait forever on a full disk."""
     recording = rr.RecordingStream(app_id)
     if not rr.is_enabled(recording):
@@ -115,7 +124,7 @@ def _record(flights: Sequence[Trajectory], track: Track | None, app_id: str) -> 
         for index, flight in enumerate(flights)
     ]
     memory = recording.memory_recording()
-    recording.send_blueprint(make_blueprint(writers, centres_of(track), len(colours)))
+    recording.send_blueprint(make_blueprint(writers, centres_of(track), len(colours), with_camera))
     log_course(recording, track)
     points = [(0.0, float(index)) for index in range(len(colours))]
     key = rr.Points2D(
@@ -126,6 +135,8 @@ def _record(flights: Sequence[Trajectory], track: Track | None, app_id: str) -> 
     log_once(recording, "about", about)
     for writer in writers:
         writer.write("" if len(flights) == 1 else f"{writer.trajectory.name}: ")
+        if with_camera:
+            writer.send_camera()
     return memory.drain_as_bytes()
 
 
@@ -158,13 +169,14 @@ def _plot(title: str, lines: Sequence[str], writers: Sequence[Writer]) -> rrb.Ti
 
 
 def make_blueprint(
-    writers: Sequence[Writer], gates_w: np.ndarray, num_colours: int
+    writers: Sequence[Writer], gates_w: np.ndarray, num_colours: int, with_camera: bool = False
 ) -> rrb.Blueprint:
     """Return the layout of a recording.
 
     Args:
         gates_w: centres (num_gates, 3), world, m.
         num_colours: rows of the key.
+        with_camera: whether there are views of the first flight's camera.
     """
     paths = {plot.path for writer in writers for plot in writer.lines}
     plots = []
@@ -182,15 +194,18 @@ def make_blueprint(
         [BESIDE, ALONG] if np.ptp(positions[:, 1]) > np.ptp(positions[:, 0]) else [ALONG, -BESIDE]
     )
     eye_w = middle + size * np.array([*beside, ABOVE])
-    chases = [
+    chases: list[Any] = [
         _view(
             f"follow {writer.trajectory.name}", f"/{writer.world}/chase", BEHIND_M, (0.0, 0.0, 0.0)
         )
         for writer in writers
     ]
+    if with_camera:
+        origins = (f"/{writers[0].world}/drone/{name}" for name in (CORNERS, MASK))
+        chases += [rrb.Spatial2DView(origin=one, name=one.rpartition("/")[2]) for one in origins]
     left = rrb.Vertical(
         _view("course", "/world", eye_w, middle),
-        rrb.Tabs(*chases) if len(chases) > 1 else chases[0],
+        (rrb.Horizontal if with_camera else rrb.Tabs)(*chases) if len(chases) > 1 else chases[0],
         rrb.Horizontal(
             rrb.TextDocumentView(origin="/about", name="flights"),
             rrb.TextLogView(origin="/", contents="/events/**", name="events", columns=body),

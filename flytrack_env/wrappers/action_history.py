@@ -33,6 +33,8 @@ class ActionHistory(Wrapper):
         WrapperError: as ``Wrapper``.
     """
 
+    needs_rows = True
+
     def __init__(self, env: EpisodicEnvironment, length: int = 3, kind: str = "commanded"):
         if length < 1:
             raise ValueError(f"length: found {length}, expected at least 1")

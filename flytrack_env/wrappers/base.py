@@ -6,20 +6,29 @@ each has one state of its own around the inner state, created when an episode be
 in any order that makes sense; any other is refused.
 """
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import Range
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.observations import Entry
 from flytrack_env.params import EnvParams
 from flytrack_env.race import Race
-from flytrack_env.state import Drone
+from flytrack_env.state import Action, Drone
 
 
 class WrapperError(ValueError):
     """An order of wrappers that makes no sense; the message says why."""
+
+
+class InnerState(NamedTuple):
+    """The state of a wrapper that remembers nothing."""
+
+    inner: Any
 
 
 class Wrapper(EpisodicEnvironment):
@@ -30,6 +39,7 @@ class Wrapper(EpisodicEnvironment):
     Attributes:
         key: its name, and that of its parameters in ``EnvParams.wrappers``; no two wrappers of an
             environment share one.
+        needs_rows: whether it adds to rows of the observation, so that no image may be inside.
 
     Raises:
         WrapperError: anything but FlyTrack or a wrapper of ours, the same wrapper twice, or one
@@ -37,6 +47,7 @@ class Wrapper(EpisodicEnvironment):
     """
 
     key: str
+    needs_rows = False
 
     def __init__(self, env: EpisodicEnvironment):
         super().__init__()
@@ -54,12 +65,15 @@ class Wrapper(EpisodicEnvironment):
         self._transition_gradients_enabled = env.transition_gradients_enabled
         self.env = env
         self.track, self.plant, self.missed_gate = env.track, env.plant, env.missed_gate
+        self.image_shape = env.image_shape
         self.env_id = f"{name}({env.env_id})"
 
     def refusal(self, inside: EpisodicEnvironment) -> str | None:
         """Return why this wrapper may not go around an inner one, however deep; None if it may."""
         if isinstance(inside, Wrapper) and inside.key == self.key:
             return f"both have the name {self.key!r}, which identifies their parameters and draws"
+        if self.needs_rows and inside.image_shape is not None:
+            return "an image has no rows that it could change or add to"
         return None
 
     def own_defaults(self) -> Any:
@@ -109,9 +123,24 @@ class Wrapper(EpisodicEnvironment):
         """Return a drone that begins an episode, and the gate to fly first."""
         return self.env.sample_start(seed, params)
 
+    def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> Any:
+        """Return the state of an episode that begins."""
+        return InnerState(self.env.begin(drone, gate_index, params, seed))
+
+    def advance(
+        self, state: Any, command: Action, params: EnvParams
+    ) -> tuple[Any, jax.Array, jax.Array, dict[str, Any]]:
+        """Return the outcome of the inner environment."""
+        inner, reward, terminated, info = self.env.advance(state.inner, command, params)
+        return InnerState(inner), reward, terminated, info
+
     def observe_drone(self, drone: Drone, state: Any, params: EnvParams) -> list[jax.Array]:
         """Return the inner environment's observation."""
         return self.env.observe_drone(drone, state.inner, params)
+
+    def compose(self, rows: list[jax.Array], params: EnvParams) -> jax.Array:
+        """Return the inner environment's observation of its rows."""
+        return self.env.compose(rows, params)
 
     def is_truncated(self, state: Any, params: EnvParams) -> jax.Array:
         """Return whether the time limit is reached."""
@@ -129,6 +158,16 @@ class Wrapper(EpisodicEnvironment):
                 f"params.wrappers[{self.key!r}]: found {found!r}, "
                 f"expected {type(defaults).__name__}, as in this environment's default_params"
             )
+
+    def check_ranges(self, params: EnvParams, ranges: Mapping[str, Range]) -> None:
+        """Raise ValueError, naming the field, unless each own parameter is within its range."""
+        for name, value in self.own_params(params)._asdict().items():
+            low, high, unit = ranges[name]
+            if not np.all((np.asarray(value) >= low) & (np.asarray(value) <= high)):
+                raise ValueError(
+                    f"params.wrappers[{self.key!r}].{name}: found {value}, "
+                    f"expected {low:g} to {high:g} {unit}"
+                )
 
 
 def layers_of(env: EpisodicEnvironment) -> list[EpisodicEnvironment]:

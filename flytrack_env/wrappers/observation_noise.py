@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from flytrack_env.effects import Range
 from flytrack_env.fusion import compute_once
@@ -25,12 +24,14 @@ class NoiseParams(NamedTuple):
         position_m, velocity_m_per_s: world.
         attitude_deg: a turn about each body axis.
         rates_rad_per_s: body.
+        acceleration_m_per_s2: of an accelerometer, body, where one is observed.
     """
 
     position_m: Scalar = 0.02
     velocity_m_per_s: Scalar = 0.05
     attitude_deg: Scalar = 0.5
     rates_rad_per_s: Scalar = 0.1
+    acceleration_m_per_s2: Scalar = 0.5
 
 
 RANGES: Mapping[str, Range] = {
@@ -38,6 +39,7 @@ RANGES: Mapping[str, Range] = {
     "velocity_m_per_s": Range(0.0, 1e6, "m/s"),
     "attitude_deg": Range(0.0, 180.0, "deg"),
     "rates_rad_per_s": Range(0.0, 1e6, "rad/s"),
+    "acceleration_m_per_s2": Range(0.0, 1e6, "m/s^2"),
 }
 
 
@@ -57,6 +59,7 @@ class ObservationNoise(Wrapper):
     """
 
     key = "observation_noise"
+    needs_rows = True
 
     def own_defaults(self) -> NoiseParams:
         """Return the default standard deviations."""
@@ -65,13 +68,7 @@ class ObservationNoise(Wrapper):
     def check_params(self, params: EnvParams) -> None:
         """Raise ValueError for a deviation beyond ``RANGES``, or what the inner check refuses."""
         super().check_params(params)
-        for name, value in self.own_params(params)._asdict().items():
-            bounds = RANGES[name]
-            if not np.all((np.asarray(value) >= bounds.low) & (np.asarray(value) <= bounds.high)):
-                expected = f"finite and >= 0, at most {bounds.high:g} {bounds.unit}"
-                raise ValueError(
-                    f"params.wrappers[{self.key!r}].{name}: found {value}, expected {expected}"
-                )
+        self.check_ranges(params, RANGES)
 
     def begin(self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0) -> NoisyState:
         """Return the state of an episode that begins, with noise of its own."""
@@ -99,6 +96,7 @@ class ObservationNoise(Wrapper):
             "position": noise.position_m,
             "velocity": noise.velocity_m_per_s,
             "rates": noise.rates_rad_per_s,
+            "accelerometer": noise.acceleration_m_per_s2,
         }
         row = 0
         for entry in self.observation_table:

@@ -31,6 +31,7 @@ RUN = (
     "identification.md",
     "real_logs.md",
     "check.md",
+    "camera.md",
 )
 RUN = (FAST, *RUN, "diagnosis.md", "quick_start.md", "faq.md")
 

@@ -33,7 +33,10 @@ MISSING = ((), ("pygame",), ("pygame", "PIL"))
 # An id, and packages that are not installed.
 CHECKED = [
     *((BASE, missing) for missing in MISSING),
-    pytest.param("FlyTrackRobust-v0", (), marks=pytest.mark.slow),
+    *(
+        pytest.param(f"FlyTrack{name}-v0", (), marks=pytest.mark.slow)
+        for name in ("Robust", "CornersRobust", "Mask")
+    ),
 ]
 CRASH = np.full(4, np.nan, np.float32)  # an action that ends the episode
 

@@ -47,10 +47,9 @@ def test_every_id_follows_gymnaxs_protocol(env_id):
         env.step, key, begun[1], action
     )
     assert (observation, state) == begun and info["final_observation"] == observation
-    assert (observation.shape, observation.dtype) == (
-        env.observation_space(params).shape,
-        np.float32,
-    )
+    space = env.observation_space(params)
+    assert (observation.shape, observation.dtype) == (space.shape, space.dtype)
+    assert observation.dtype == (np.float32 if env.image_shape is None else np.uint8)
     assert reward == jax.ShapeDtypeStruct((), np.float32)
     assert terminated == truncated == jax.ShapeDtypeStruct((), bool)
     assert {*CAUSES, *RACE, "terminated", "truncated"} < info.keys()

@@ -22,12 +22,18 @@ MAKERS = {
     "applied": partial(wrappers.ActionHistory, length=1, kind="applied"),
     "delay": wrappers.ActionDelay,
     "randomization": wrappers.DomainRandomization,
+    "corners": wrappers.GateCorners,
+    "detector": wrappers.DetectorRandomization,
+    "mask": partial(wrappers.GateMask, size=(8, 8)),
+    "state": wrappers.StateObservation,
     "statistics": wrappers.EpisodeStatistics,
     "legacy": wrappers.LegacyStep,
     "log": LogWrapper,
 }
+DETECTOR = wrappers.DetectorRandomization
 OTHER_STEP = ("legacy", "log")
-ROWS = {"commanded": 8, "applied": 4}
+ROWS = {"commanded": 8, "applied": 4, "state": OBSERVATION_SIZE}
+CAMERAS = {"corners": (31,), "mask": (8, 8, 1)}
 
 
 def test_every_public_wrapper_is_tried():
@@ -37,7 +43,10 @@ def test_every_public_wrapper_is_tried():
         for export in exported
         if isinstance(export, type) and issubclass(export, wrappers.Wrapper)
     }
-    assert public - {wrappers.Wrapper} < {type(make(FlyTrack())) for make in MAKERS.values()}
+    assert public - {wrappers.Wrapper} < {
+        type(make(wrappers.GateCorners(FlyTrack()) if make is DETECTOR else FlyTrack()))
+        for make in MAKERS.values()
+    }
 
 
 def reasons_against(name, inside):
@@ -50,10 +59,15 @@ def reasons_against(name, inside):
         return [
             "found (LegacyStep|LogWrapper) inside, expected FlyTrack or a wrapper that acts before"
         ]
-    is_late = name == "delay" and "commanded" in inside
-    return ["both have the name"] * (name in inside) + [
-        "the history would hold the delayed commands"
-    ] * is_late
+    reasons = {
+        "both have the name": name in inside,
+        "the history would hold the delayed commands": name == "delay" and "commanded" in inside,
+        "found no GateCorners inside": name == "detector" and "corners" not in inside,
+        "it replaces FlyTrack's observation": name in CAMERAS
+        and any(inner in CAMERAS or inner in ROWS for inner in inside),
+        "an image has no rows": name in (*ROWS, "noise") and "mask" in inside,
+    }
+    return [reason for reason, holds in reasons.items() if holds]
 
 
 def test_any_three_compose_or_are_refused_with_the_reason():
@@ -72,9 +86,9 @@ def test_any_three_compose_or_are_refused_with_the_reason():
             if not set(order) & set(OTHER_STEP):
                 keys = [entry.key for entry in env.observation_table]
                 assert len(set(keys)) == len(keys)
-                assert env.observation_space().shape == (
-                    OBSERVATION_SIZE + sum(ROWS.get(n, 0) for n in order),
-                )
+                size, *rest = next((CAMERAS[n] for n in order if n in CAMERAS), (OBSERVATION_SIZE,))
+                size += sum(ROWS.get(n, 0) for n in order)
+                assert env.observation_space().shape == (size, *rest)
                 env.check_params(env.default_params)
 
 

@@ -8,8 +8,13 @@ from flax import struct
 from gymnax.environments import environment, spaces
 from numpy.testing import assert_allclose, assert_array_equal
 
-from baselines.purejaxrl_ppo import Config, make_train, ppo
+from baselines.purejaxrl_ppo import Config, load_checkpoint, make_network, make_train, ppo
+from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
 from baselines.purejaxrl_ppo.metrics import summarize_episodes
+from flytrack_env import FlyTrack
+from flytrack_env.observations import OBSERVATION_SIZE
+from flytrack_env.wrappers import GateMask
+from tests.support.coasting import Coasting
 from tests.support.compiling import quick_jit
 
 
@@ -113,6 +118,45 @@ def test_memory_tells_what_no_observation_shows():
             network.apply(params, memory, unseen[0, 0], method="value_of"), value, atol=1e-5
         )
         memory, _ = network.act(params, memory, unseen[0, 0])
+
+
+def test_a_critic_sees_the_state_and_the_policy_does_not():
+    config = tiny(memory_size=8, encoder_sizes=(8,), critic_sees_state=True, state_coef=1.0)
+    network = make_network(config)
+    size = OBSERVATION_SIZE + 3
+    rows = jax.random.normal(jax.random.key(1), (5, size))
+    params = network.init(jax.random.key(0), rows)
+    memory = network.first_memory((5,))
+    _, policy, value = network.apply(params, memory, rows, method="step")
+    _, action = network.act(params, memory, rows[:, :3])
+    assert_allclose(jnp.clip(policy.mode(), -1.0, 1.0), action, atol=1e-6)
+    moved = rows.at[:, 3:].add(1.0)
+    _, same_policy, other_value = network.apply(params, memory, moved, method="step")
+    assert_array_equal(same_policy.mode(), policy.mode())
+    assert (np.abs(other_value - value) > 1e-3).all()
+    # The error of the state's estimate teaches what the memory is made of.
+    steps, done = rows[:, None], jnp.zeros((5, 1), bool)
+    arguments = memory[:, None], steps, done
+    gradient = jax.grad(lambda p: network.apply(p, *arguments, method="unroll")[2])(params)
+    kernels = [gradient["params"][part] for part in ("encoder", "estimator")]
+    assert all(np.abs(leaf).max() > 0.0 for leaf in jax.tree.leaves(kernels))
+
+
+def test_an_image_is_seen_by_convolutions_and_flown_by_what_is_stored(tmp_path):
+    env = GateMask(FlyTrack(plant=Coasting()), size=(16, 16))
+    config = Config(hidden_sizes=(8,), memory_size=4)
+    network = ppo.make_network_for(env, env.default_params, config)
+    image, _ = env.reset(jax.random.key(0))
+    params = network.init(jax.random.key(0), image[None])
+    description = {"env_id": "FlyTrackMask-v0", "track": "flytrack", "missed_gate": "terminate"}
+    shapes = {"observation_size": 16, "image_shape": (16, 16, 1)}
+    save_checkpoint(tmp_path / "a.safetensors", params, config, description | shapes)
+    checkpoint = load_checkpoint(tmp_path / "a.safetensors")
+    checkpoint.check_fits(env)
+    memory, action = network.act(params, network.first_memory(), image)
+    again = checkpoint.network.act(checkpoint.params, checkpoint.network.first_memory(), image)
+    assert_array_equal(memory, again[0])
+    assert action.shape == (4,) and (np.asarray(action) == again[1]).all()
 
 
 def test_rewarded_action_is_learnt():

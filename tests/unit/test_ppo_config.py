@@ -16,7 +16,8 @@ from tests.support.tables import table
 def changed(value):
     """Return a value of the same type that is valid and not the default."""
     if isinstance(value, tuple):
-        return (*(2 * size for size in value), type(value[0])(3))
+        kind = type(value[0]) if value else int
+        return (*(2 * size for size in value), kind(3))
     if isinstance(value, float):
         return value / 2 if value else 0.5
     return not value if isinstance(value, bool) else value + 1

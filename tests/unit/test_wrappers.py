@@ -42,7 +42,7 @@ from tests.support.wrapped_flights import (
 )
 
 SIZE = 29  # of FlyTrack's own observation; behind it, one applied and three commanded actions
-NO_NOISE = NoiseParams(0.0, 0.0, 0.0, 0.0)
+NO_NOISE = NoiseParams(0.0, 0.0, 0.0, 0.0, 0.0)
 LATE_S = 0.013
 
 
@@ -241,7 +241,7 @@ REFUSALS = [
     (
         ObservationNoise,
         NO_NOISE._replace(position_m=-0.1),
-        r"\.position_m: found -0.1, expected finite",
+        r"\.position_m: found -0.1, expected 0 to",
     ),
 ]
 

@@ -1,0 +1,96 @@
+"""A flight from behind, beside what the drone's own camera sees, as an animated GIF."""
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from flytrack_env import camera, scene
+from flytrack_env.flown_camera import HEIGHT_PX, WIDTH_PX, Film
+from flytrack_env.rendering.animation import save_gif
+from flytrack_env.rendering.camera import Camera
+from flytrack_env.rendering.flight_log import FlightLog
+from flytrack_env.rendering.views import PIXEL, ChaseView, draw_gate
+from flytrack_env.scene import gates_of, ground_grid, rotations
+from flytrack_env.state import POSITION, QUATERNION
+from flytrack_env.tracks import Course
+
+STEPS_PER_FRAME = 4  # of 0.01 s
+VIEW_WIDTH, VIEW_HEIGHT = WIDTH_PX * 3 // 4, HEIGHT_PX * 3 // 4  # of each half of a picture
+MASK_WIDTH = 128
+MARGIN, DOT = 8, 4
+GRID_M = 2.0
+
+
+class OnboardView:
+    """Draws what the drone's camera sees: gates, ground, and the corners that it is given."""
+
+    def __init__(self, course: Course):
+        self.gates = gates_of(course)
+        low, high = (np.array(corner, float) for corner in (course.bounds_low, course.bounds_high))
+        self.grid_w = ground_grid(low, high, GRID_M)
+        corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
+        self.floor_w = np.array([(x, y, low[2]) for x, y in corners])
+
+    def draw(self, state: np.ndarray, corners_px: np.ndarray, visible: np.ndarray) -> Image.Image:
+        """Return the picture of a state (21,); corners and flags as in a row of ``Film``."""
+        width, height = PIXEL * VIEW_WIDTH, PIXEL * VIEW_HEIGHT
+        picture = Image.new("RGB", (width, height), scene.SKY)
+        draw = ImageDraw.Draw(picture)
+        view = _camera_of(state, width, height)
+        floor = view.polygon(view.look(self.floor_w))
+        if floor:
+            draw.polygon(floor, scene.GROUND)
+        for line in view.look(self.grid_w):
+            draw.line(view.polygon(line), scene.GROUND_GRID, PIXEL)
+        gates_c = view.look(np.concatenate([self.gates.outer, self.gates.inner], axis=1))
+        for index in np.argsort(-np.linalg.norm(gates_c.mean(axis=1), axis=1)):
+            draw_gate(draw, view, gates_c[index], scene.GATE)
+        scale = width / WIDTH_PX
+        for gate, colour in enumerate((scene.NEXT_GATE, scene.CAMERA)):
+            for right, down in scale * corners_px[gate][visible[gate]]:
+                reach = DOT * PIXEL
+                dot = [right - reach, down - reach, right + reach, down + reach]
+                draw.ellipse(dot, colour, outline=scene.BACKGROUND, width=PIXEL)
+        return picture.reduce(PIXEL)
+
+
+def _camera_of(state: np.ndarray, width: int, height: int) -> Camera:
+    """Return the drone's camera, which tilts with it, for a picture of this size, px."""
+    focal_px = 0.5 * width / np.tan(0.5 * np.radians(camera.FIELD_OF_VIEW_DEG))
+    x_w, y_w, z_w = rotations(state[QUATERNION]).T
+    pitch = np.radians(camera.PITCH_DEG)
+    forward_w = np.cos(pitch) * x_w + np.sin(pitch) * z_w
+    view = Camera(state[POSITION], forward_w, np.array([0.5 * width, 0.5 * height]), focal_px)
+    view.axes = np.stack([-y_w, np.sin(pitch) * x_w - np.cos(pitch) * z_w, forward_w])
+    return view
+
+
+def make_onboard_gif(course: Course, rows: np.ndarray, film: Film) -> bytes:
+    """Return a flight as an animated GIF, 960 x 360 pixels, at the speed at which it was flown.
+
+    From behind at the left; at the right what the camera sees, with the corners in it, and the mask
+    in a corner.
+
+    Args:
+        course: that was flown.
+        rows: of the flight's log, (T, SCENE_SIZE).
+        film: what the camera saw in each.
+    """
+    chase = ChaseView(course, gates_of(course), 0, PIXEL * VIEW_WIDTH, PIXEL * VIEW_HEIGHT)
+    onboard, log, frames = OnboardView(course), FlightLog(0.01), []
+    for index, row in enumerate(rows):
+        log.append(row)
+        if index % STEPS_PER_FRAME:
+            continue
+        behind = Image.new("RGB", (PIXEL * VIEW_WIDTH, PIXEL * VIEW_HEIGHT))
+        chase.draw(behind, log)
+        picture = Image.new("RGB", (2 * VIEW_WIDTH, VIEW_HEIGHT))
+        picture.paste(behind.reduce(PIXEL), (0, 0))
+        seen = onboard.draw(row.astype(float), film.corners_px[index], film.is_visible[index])
+        picture.paste(seen, (VIEW_WIDTH, 0))
+        mask = Image.fromarray(film.masks[index]).resize(
+            (MASK_WIDTH, MASK_WIDTH), Image.Resampling.NEAREST
+        )
+        corner_px = 2 * VIEW_WIDTH - MASK_WIDTH - MARGIN, VIEW_HEIGHT - MASK_WIDTH - MARGIN
+        picture.paste(mask.convert("RGB"), corner_px)
+        frames.append(picture)
+    return save_gif(frames, 10 * STEPS_PER_FRAME)
