@@ -126,6 +126,7 @@ class SingleStep:
         _, observation, scene, numbers = jax.eval_shape(fly, *inputs)
         ends = np.cumsum([state.num_rows, observation.size, scene.size]).tolist()
         self._observation, self._scene = slice(ends[0], ends[1]), slice(ends[1], ends[2])
+        self._shape, self._dtype = observation.shape, observation.dtype
         self._num_rows = ends[2] + numbers.layout.num_rows
         self._read = make_reader(numbers.layout, ends[2])
         indices = range(len(numbers.layout.slots))
@@ -133,7 +134,8 @@ class SingleStep:
 
         def fly_words(words: Any, action: jax.Array, params_words: Any) -> jax.Array:
             after, observation, scene, numbers = fly(words, action, params_words)
-            arrays = after.as_words(), observation[:, None], scene[:, None], numbers.as_words()
+            rows = observation.reshape(-1, 1), scene[:, None]
+            arrays = after.as_words(), *rows, numbers.as_words()
             return jnp.concatenate([array.astype(WORD) for array in arrays])
 
         inputs[0] = jax.ShapeDtypeStruct((self._num_rows, 1), WORD)
@@ -153,7 +155,7 @@ class SingleStep:
         column = np.asarray(words)[:, 0]
         reward, terminated, truncated, *values = self._read(column)
         info = dict(zip(self._names, values, strict=True))
-        observation = column[self._observation].copy()
+        observation = column[self._observation].reshape(self._shape).astype(self._dtype)
         return words, observation, reward, terminated, truncated, info, column[self._scene]
 
 
