@@ -164,16 +164,15 @@ def ppo_loss(
     policy_loss = -jnp.minimum(ratio * advantage, clipped_ratio * advantage).mean()
     entropy = policy.entropy().mean()
     loss = policy_loss + config.value_coef * value_loss - config.entropy_coef * entropy
-    if config.state_coef:
-        loss = loss + config.state_coef * state_error
     parts = {
         "policy_loss": policy_loss,
         "value_loss": value_loss,
         "entropy": entropy,
-        "state_error": state_error,
         "approx_kl": ((ratio - 1.0) - log_ratio).mean(),
         "clip_fraction": (jnp.abs(ratio - 1.0) > config.clip_eps).mean(),
     }
+    if config.state_coef:
+        loss, parts["state_error"] = loss + config.state_coef * state_error, state_error
     return loss, parts
 
 

@@ -22,7 +22,7 @@ EXPERIMENT = "flytrack"
 # Groups in which MLflow shows metrics; all others are of the race.
 GROUPS = {
     **dict.fromkeys(("policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction"), "ppo"),
-    **dict.fromkeys(("explained_variance", "learning_rate"), "ppo"),
+    **dict.fromkeys(("state_error", "explained_variance", "learning_rate"), "ppo"),
     "steps_per_second": "time",
 }
 EVERY_STEP = "ppo/learning_rate"  # a metric that is recorded at every step
