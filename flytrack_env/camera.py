@@ -133,7 +133,8 @@ def opening_corners(
         axes: of the camera, world.
         pos_w: of the camera, m.
         gate: whose opening it is.
-        top_side, bottom_side: -1 exchanges the upper or the lower two corners.
+        top_side: -1 exchanges the upper two corners.
+        bottom_side: -1 exchanges the lower two corners.
     """
     centre, left, up = compute_once(
         (

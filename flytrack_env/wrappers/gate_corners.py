@@ -34,7 +34,8 @@ class CornersParams(NamedTuple):
     Attributes:
         field_of_view_deg: horizontal, without distortion.
         pitch_deg: of the optical axis above body x.
-        width_px, height_px: resolution.
+        width_px: columns of the image.
+        height_px: rows of the image.
         k1, k2: radial distortion, see ``flytrack_env.camera.Lens``.
         noise_px: standard deviation of a corner's image coordinates.
         missed: probability that a visible corner is not detected in a frame.
