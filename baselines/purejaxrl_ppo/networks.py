@@ -137,11 +137,11 @@ class ActorCritic(nn.Module):
         seen = known if state is None else jnp.concatenate([known, state], axis=-1)
         return self.critic(seen).squeeze(-1)
 
-    def state_error(self, known: jax.Array, state: jax.Array) -> jax.Array:
+    def state_error(self, known: jax.Array, state: jax.Array | None) -> jax.Array:
         """Return the mean squared error of the state's estimate, a scalar; 0 without estimate."""
-        return (
-            ((self.estimator(known) - state) ** 2).mean() if self.estimates_state else jnp.zeros(())
-        )
+        if state is None or not self.estimates_state:
+            return jnp.zeros(())
+        return ((self.estimator(known) - state) ** 2).mean()
 
     def __call__(self, observation: jax.Array) -> tuple[distrax.Distribution, jax.Array]:
         """Return policy and value of first observations of episodes, having used every layer."""
@@ -203,8 +203,10 @@ class ActorCritic(nn.Module):
     def _batch_shape(self, observation: jax.Array) -> tuple[int, ...]:
         return observation.shape[: -IMAGE_AXES if self.sees_image else -1]
 
-    def _split(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the rows that the policy sees, and those of the state."""
+    def _split(self, observation: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+        """Return the rows that the policy sees, and those of the state if there are any."""
+        if not self.num_state_rows:
+            return observation, None
         size = observation.shape[-1] - self.num_state_rows
         return observation[..., :size], observation[..., size:]
 
