@@ -33,7 +33,7 @@ BAD_DETECTOR = {"noise_px": 2.0, "missed": 0.05, "latency_s": 0.02}
 STEPS, FLIGHTS, LAPS, FLIGHT_SEED = 2500, 256, 3, 100
 
 
-def corners_of(image: Image, position: Any, quaternion: Any, gate: Any) -> tuple[Any, Any]:
+def project_corners(image: Image, position: Any, quaternion: Any, gate: Any) -> tuple[Any, Any]:
     """Return the corners of a gate, right and down in px, (4, 2), and whether they are visible."""
     import jax.numpy as jnp
 
@@ -61,13 +61,13 @@ def corner_figures(num_poses: int) -> list[report.Figure]:
     positions, quaternions = positions.astype(np.float32), quaternions.astype(np.float32)
     for name, image in IMAGES.items():
         find = jax.jit(
-            jax.vmap(lambda p, q, i, image=image: corners_of(image, p, q, course.gate(i)))
+            jax.vmap(lambda p, q, i, image=image: project_corners(image, p, q, course.gate(i)))
         )
-        found, is_visible = map(np.asarray, find(positions, quaternions, indices))
+        projected, is_visible = map(np.asarray, find(positions, quaternions, indices))
         poses = positions.astype(float), quaternions.astype(float)
         expected, _ = ray_caster.find_corners(*poses, gates, indices, image)
         is_inside = (np.abs(expected) <= np.array([image.width, image.height]) / 2.0).all(axis=-1)
-        errors_px = np.abs(found - expected).max(axis=-1)[is_visible & is_inside]
+        errors_px = np.abs(projected - expected).max(axis=-1)[is_visible & is_inside]
         figures += [
             report.Figure(
                 f"corners, {name}: largest error (px)",
@@ -129,8 +129,8 @@ def gradient_figure() -> report.Figure:
         course = jax.tree.map(lambda leaf: np.asarray(leaf, float), env.default_params.course)
 
         def value(pose: Any, index: Any) -> Any:
-            found, is_visible = corners_of(image, pose[:3], pose[3:], course.gate(index))
-            return (weights * found).sum(), is_visible.all()
+            projected, is_visible = project_corners(image, pose[:3], pose[3:], course.gate(index))
+            return (weights * projected).sum(), is_visible.all()
 
         poses = np.concatenate([positions, quaternions], axis=1)
         evaluate = jax.jit(jax.vmap(jax.value_and_grad(value, has_aux=True)))

@@ -63,25 +63,25 @@ def measure(trial: Trial) -> dict[str, Any]:
     """Diagnose a flight: causes with equivalents, values and times to half response."""
     flight = flights()[trial.flight]
     start = process_time()
-    found = diagnose(flight.log, flight.nominal_model())
+    diagnosis = diagnose(flight.log, flight.nominal_model())
     return {
         "cpu_s": process_time() - start,
-        "verdict": found.verdict,
-        "causes": {cause.effect: sorted(cause.equivalent) for cause in found.causes},
+        "verdict": diagnosis.verdict,
+        "causes": {cause.effect: sorted(cause.equivalent) for cause in diagnosis.causes},
         "values": {
             f"{cause.effect}.{name}": [value.value, *value.ci95]
-            for cause in found.causes
+            for cause in diagnosis.causes
             for name, value in cause.parameters.items()
         },
         "lift": {
             name: [value.value, *value.ci95]
-            for lift in [found.lift.get("extended")]
+            for lift in [diagnosis.lift.get("extended")]
             if lift is not None
             for name, value in (("ratio", lift.thrust_to_weight), ("hover", lift.hover))
         },
         "half_responses_s": {
             stick: [response.time, *response.ci95]
-            for stick, response in found.half_response_s.get("extended", {}).items()
+            for stick, response in diagnosis.half_response_s.get("extended", {}).items()
             if response.ci95 is not None
         },
     }

@@ -210,7 +210,7 @@ def draw_frames(
         spans.append(_span_words(first, last, width))
     frames = [outer & ~inner for outer, inner in zip(*spans, strict=True)]
     # Fenced, so that a word is not computed again for each of its bits.
-    rows = compute_once(jnp.stack([_any_of(words) for words in frames], axis=-1))
+    rows = compute_once(jnp.stack([_union(words) for words in frames], axis=-1))
     bits = (rows[..., None] >> jnp.arange(WORD_BITS, dtype=jnp.uint32)) & 1
     pixels = bits.reshape(height, -1)[:, :width, None]
     return pixels.astype(jnp.uint8) * jnp.uint8(WHITE)
@@ -233,9 +233,9 @@ def _span_words(first: jax.Array, last: jax.Array, width: int) -> list[jax.Array
     return [below(end, word) & ~below(begin, word) for word in range(num_words)]
 
 
-def _any_of(words: jax.Array) -> jax.Array:
+def _union(words: jax.Array) -> jax.Array:
     """Return the bits that any of words (count, ...) has; unrolled, which XLA vectorises."""
-    union = words[0]
+    bits = words[0]
     for word in words[1:]:
-        union = union | word
-    return union
+        bits = bits | word
+    return bits

@@ -35,7 +35,7 @@ class OnboardView:
         width, height = PIXEL * VIEW_WIDTH, PIXEL * VIEW_HEIGHT
         picture = Image.new("RGB", (width, height), scene.SKY)
         draw = ImageDraw.Draw(picture)
-        view = _camera_of(state, width, height)
+        view = _onboard_camera(state, width, height)
         floor = view.polygon(view.look(self.floor_w))
         if floor:
             draw.polygon(floor, scene.GROUND)
@@ -53,7 +53,7 @@ class OnboardView:
         return picture.reduce(PIXEL)
 
 
-def _camera_of(state: np.ndarray, width: int, height: int) -> Camera:
+def _onboard_camera(state: np.ndarray, width: int, height: int) -> Camera:
     """Return the drone's camera, which tilts with it, for a picture of this size, px."""
     focal_px = 0.5 * width / np.tan(0.5 * np.radians(camera.FIELD_OF_VIEW_DEG))
     x_w, y_w, z_w = rotations(state[QUATERNION]).T

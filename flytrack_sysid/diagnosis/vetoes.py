@@ -330,7 +330,8 @@ VETOES: tuple[Veto, ...] = (
     not_seen_at_rest,
     seen_once,
 )
-# Why a rule rejects an effect, by its name; what held-out rows contradict is told otherwise.
+# Reasons that a warning gives for a rejection, by rule. Effects that held-out rows contradict have
+# a warning of their own (``summary.collect_warnings``).
 REASONS = {
     "stands_in_for_unknown": "what remains unexplained could pass for it",
     "not_seen_at_rest": (
