@@ -1,12 +1,14 @@
 """Flights of one craft, diagnosed apart: ``python -m benchmarks.repeatability``.
 
 Each measured flight is diagnosed alone, with the nominal model that is imported with it. A name is
-a statement about the craft only if another flight of the same craft gives it too. Results are
+a statement about the craft only if another flight of the same craft gives it too. Plants, each with
+an effect of the list and another law outside it, fly twice for a minute, differently. Results are
 appended to docs/results/repeatability.jsonl, and a later run of the same commit resumes there;
 ``--page`` writes docs/results/repeatability.md from them.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from itertools import combinations
 from time import process_time
@@ -14,11 +16,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks import hidden
+from benchmarks.diagnosis import AMPLITUDES, SECONDS, model_of
+from benchmarks.hidden.oracle import known
 from benchmarks.real.crazyflie import DATA
 from benchmarks.report import RESULTS, command, fill_page, lines_of_commit, record_trials, table
 from benchmarks.seams.measured import measured_flights
-from flytrack_sysid import Imported, diagnose
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.motion import Motion
+from flytrack_sysid import FlightLog, Imported, diagnose
 from flytrack_sysid.inference.parameters import STICKS
+from flytrack_sysid.split import held_out_rows
 
 LINES = RESULTS / "repeatability.jsonl"
 SHORTEST_S = 14.0
@@ -28,6 +36,9 @@ CRAFT = {  # and the beginnings of its flights' names
     "Crazyflie of ARPL, motors": ("cf_arpl_motors/",),
     "NanoBench, one trajectory twice": ("nanobench/B3_", "nanobench/B9_"),
 }
+PLANT = "plant "  # begins the name of a simulated craft
+SEED = 57  # no rule was made on it
+VISIBLE, SEPARABLE = 30.0, 20.0  # lambda and lambda_sep of an effect that a log can show
 Line = Mapping[str, Any]
 
 
@@ -36,6 +47,20 @@ class Trial(NamedTuple):
 
     craft: str
     flight: str
+
+
+class Flight(NamedTuple):
+    """A flight, the model that its team believes in, and what the log could show of the truth.
+
+    Attributes:
+        log: the flight.
+        model: nominal.
+        effect: the hidden effect that the log can show; empty if it cannot, or nobody knows.
+    """
+
+    log: FlightLog
+    model: ModelParameters
+    effect: str
 
 
 @cache
@@ -49,9 +74,38 @@ def flights() -> dict[str, Imported]:
     }
 
 
-def trials() -> list[Trial]:
-    """Return the flights of each craft."""
-    return [
+def simulated(trial: Trial) -> Flight:
+    """Return a flight of a plant with an effect of the list and a law outside it."""
+    plant, flight = int(trial.craft.removeprefix(PLANT)), int(trial.flight)
+    rng = np.random.default_rng([SEED, plant])
+    truth = replace(hidden.draw_truth(rng, 1), motion="fine", step_s=0.01)
+    amplitude = hidden.log_uniform(*AMPLITUDES, rng)
+    outside = hidden.draw_outside(rng, amplitude=amplitude)
+    rng = np.random.default_rng([SEED, plant, flight])
+    listed = hidden.fly(truth, SECONDS, rng)
+    log = hidden.measure(listed, "sensors", rng)
+    model = model_of(truth)
+    true_model = model._replace(motion=Motion.CONTINUOUS)
+    ((effect, shown),) = known(listed, log, ~held_out_rows(log), true_model, truth.effects).items()
+    is_shown = shown.lambda_ > VISIBLE and shown.lambda_sep > SEPARABLE
+    rng = np.random.default_rng([SEED, plant, flight])
+    clean = hidden.fly(replace(truth, outside=outside), SECONDS, rng)
+    log = hidden.measure(clean, "sensors", rng)
+    return Flight(log, model, effect if is_shown else "")
+
+
+def measured(trial: Trial) -> Flight:
+    """Return a measured flight with its nominal model."""
+    flight = flights()[trial.flight]
+    return Flight(flight.log, flight.nominal_model(), "")
+
+
+def trials(plants: int) -> list[Trial]:
+    """Return the flights of each craft, two of each plant."""
+    simulated = [
+        Trial(f"{PLANT}{plant}", str(flight)) for plant in range(plants) for flight in range(2)
+    ]
+    return simulated + [
         Trial(craft, name)
         for craft, beginnings in CRAFT.items()
         for name in flights()
@@ -61,10 +115,11 @@ def trials() -> list[Trial]:
 
 def measure(trial: Trial) -> dict[str, Any]:
     """Diagnose a flight: causes with equivalents, values and times to half response."""
-    flight = flights()[trial.flight]
+    flight = (simulated if trial.craft.startswith(PLANT) else measured)(trial)
     start = process_time()
-    diagnosis = diagnose(flight.log, flight.nominal_model())
+    diagnosis = diagnose(flight.log, flight.model)
     return {
+        "effect": flight.effect,
         "cpu_s": process_time() - start,
         "verdict": diagnosis.verdict,
         "causes": {cause.effect: sorted(cause.equivalent) for cause in diagnosis.causes},
@@ -104,7 +159,9 @@ def overlaps(one: list[float], other: list[float]) -> bool:
 
 def compare(lines: Sequence[Line]) -> list[Any]:
     """Return a row of the page: how alike the flights of a craft are."""
-    pairs = list(combinations(lines, 2))
+    pairs = [
+        (one, other) for one, other in combinations(lines, 2) if one["craft"] == other["craft"]
+    ]
     values = [
         overlaps(one[name][key], other[name][key])
         for one, other in pairs
@@ -130,6 +187,12 @@ def compare(lines: Sequence[Line]) -> list[Any]:
     ]
 
 
+def is_in_class(line: Line) -> bool:
+    """Return whether the effect that a log shows is a cause or an equivalent of one."""
+    causes = line["causes"]
+    return line["effect"] in causes or any(line["effect"] in alike for alike in causes.values())
+
+
 def is_coefficient(name: str) -> bool:
     """Return whether a value is a coefficient of the thrust curve: these trade off."""
     return name.startswith("thrust_curve.c")
@@ -139,11 +202,15 @@ def write_page() -> None:
     """Write docs/results/repeatability.md from the lines of the last commit."""
     lines = [line for line in lines_of_commit(LINES) if "error" not in line]
     by_craft = {craft: [line for line in lines if line["craft"] == craft] for craft in CRAFT}
+    plants = [line for line in lines if line["craft"].startswith(PLANT)]
+    by_craft["Simulated, each plant twice"] = plants
+    shown = [line for line in plants if line["effect"]]
     header = "craft | flights | pairs with the same names | the same class | values that overlap"
     header += "".join(f" | {stick}, ms" for stick in STICKS)
     names = [
         [line["flight"].partition("/")[2], ", ".join(sorted(line["causes"])) or "none"]
         for line in lines
+        if line["craft"] in CRAFT
     ]
     fill_page(
         RESULTS / "repeatability.md",
@@ -151,20 +218,26 @@ def write_page() -> None:
         crafts=table(header, [[craft, *compare(of)] for craft, of in by_craft.items() if of]),
         flights=table("flight | names", names),
         shortest=f"{SHORTEST_S:g}",
+        length=f"{SECONDS:g}",
+        seed=SEED,
+        visible=f"{VISIBLE:g}",
+        separable=f"{SEPARABLE:g}",
+        found=sum(map(is_in_class, shown)),
+        shown=len(shown),
         seconds=f"{np.median([line['cpu_s'] for line in lines]):.0f}",
         commit=lines[-1]["commit"],
     )
 
 
-def main(page: bool = False) -> None:
+def main(page: bool = False, plants: int = 10) -> None:
     """Diagnose flights.
 
-    page: write the page from the lines instead.
+    page: write the page from the lines instead. plants: the number of simulated craft.
     """
     if page:
         write_page()
         return
-    record_trials(LINES, trials(), measure)
+    record_trials(LINES, trials(plants), measure)
 
 
 if __name__ == "__main__":

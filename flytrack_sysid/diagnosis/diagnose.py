@@ -302,12 +302,10 @@ def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
     refined = refine(
         selection.state, selection.base, last_model, log, parts.held_out[since], is_explained
     )
-    kept = (
-        candidate
-        for candidate in model.candidates
-        if candidate in refined.kept or candidate not in last_model.candidates
-    )
-    return refined._replace(kept=tuple(kept))
+    kept = {candidate.effect: candidate for candidate in refined.kept}
+    kept |= {one.effect: one for one in model.candidates if one not in last_model.candidates}
+    in_order = [kept[name] for one in model.candidates if (name := one.effect) in kept]
+    return refined._replace(kept=tuple(in_order))
 
 
 class NamedModel(NamedTuple):

@@ -6,7 +6,9 @@ therefore
 
 1. starts free flights of 0.1 to 2 s from measured states (multiple shooting),
 2. fits all parameters to the flights on the training rows,
-3. removes effects that make no held-out flight better, or any horizon worse.
+3. removes effects that make no flight better that was not fitted, or any horizon worse: flights of
+   held-out rows, and to first order those of each block of training rows without this block,
+4. holds parameters at nominal that an effect does not need.
 
 It also fits a placebo, which predicts from the state at the start alone, without the commands.
 Where the placebo predicts as well as the models, the flights contain no evidence about the response
@@ -68,9 +70,9 @@ MAX_ROUNDS, REFIT_ROUNDS, MIN_GAIN = (
 LAG_STEP = 0.5  # of the time between rows: the least step of a lag for intervals
 NEUTRAL = 1e-3  # largest distance from nominal, relative to a parameter's scale
 DAMPINGS = np.array([1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0])[:BATCH]
-# An effect has to improve held-out prediction by SURE standard errors over blocks. LIKELY standard
-# errors are enough where it is worth the share WORTHWHILE of the error: single steps have shown it
-# already.
+# An effect has to improve the prediction of blocks by SURE standard errors over them. LIKELY
+# standard errors are enough where it is worth the share WORTHWHILE of the error: single steps have
+# shown it already.
 SURE, LIKELY, WORTHWHILE = 2.0, 1.0, 0.02
 SURE_OF_COMMANDS = 1.64  # the same for the better of the models over the placebo, one-sided 95 %
 # A horizon is worse if the ratio of its error to the base's is above LIKELY_WORSE, and if it is
@@ -220,12 +222,21 @@ class Fit(NamedTuple):
             their range are held there, and have none.
         half_widths: half of the 95 % interval of each free index; of those at the end of their
             range as if it went on.
+        losses: cost of each block of windows without a fit to this block, (blocks,), to first
+            order (Takeuchi, "Distribution of informational statistics and a criterion of model
+            fitting", Suri-Kagaku 153, 1976).
     """
 
     vector: np.ndarray
     indices: tuple[int, ...]
     covariance: np.ndarray
     half_widths: np.ndarray
+    losses: np.ndarray
+
+
+def huber_loss(residuals: np.ndarray) -> np.ndarray:
+    """Return the Huber loss of relative errors, summed over the last axis; small ones' squares."""
+    return 2.0 * special.huber(OUTLIER, residuals).sum(axis=-1)
 
 
 class Target(NamedTuple):
@@ -251,7 +262,7 @@ class Target(NamedTuple):
 
     def cost(self, residuals: np.ndarray, vectors: np.ndarray) -> np.ndarray:
         """Return the Huber loss plus the weak prior of each model, (num_vectors,)."""
-        robust = 2.0 * special.huber(OUTLIER, residuals).sum(axis=(1, 2))
+        robust = huber_loss(residuals).sum(axis=1)
         return robust + np.square(vectors - self.problem.start) @ prior_information(self.problem)
 
     def fitted(self, vector: np.ndarray, indices: Sequence[int], rounds: int) -> Fit:
@@ -281,7 +292,14 @@ class Target(NamedTuple):
         covariance = np.zeros_like(whole)
         covariance[inside] = self._covariance(information[inside], scores[:, is_inside])
         variances = np.where(is_inside, np.diag(covariance), np.diag(whole))
-        return Fit(vector, tuple(indices), covariance, np.sqrt(variances))
+        by_block = self.windows.sums_by_block(scores[:, is_inside])
+        moved = solve(information[inside], by_block.T).T
+        losses = self.losses(vector) + 2.0 * (by_block * moved).sum(axis=1)
+        return Fit(vector, tuple(indices), covariance, np.sqrt(variances), losses)
+
+    def losses(self, vector: np.ndarray) -> np.ndarray:
+        """Return the cost of each block of windows, (blocks,)."""
+        return self.windows.sums_by_block(huber_loss(self.residuals(vector[None])[0]))
 
     @property
     def step_s(self) -> float:
@@ -634,8 +652,8 @@ class _Refinement(NamedTuple):
         while any(candidate.effect in self.acting for candidate in kept):
             tried = [candidate for candidate in kept if candidate.effect in self.acting]
             fits = [self._without(target, fit, kept, candidate) for candidate in tried]
-            losses = flight_test.losses(fit.vector, *(reduced_fit.vector for reduced_fit in fits))
-            sure = np.array([sureness(reduced_losses - losses[0]) for reduced_losses in losses[1:]])
+            losses = np.stack([self._losses(target, one) for one in (fit, *fits)])
+            sure = sureness((losses[1:] - losses[0]).T)
             worth = np.sqrt(losses[1:].sum(axis=1) / losses[0].sum()) - 1.0
             needed = np.where(
                 (worth >= WORTHWHILE) & (sure >= LIKELY), np.maximum(sure, SURE), sure
@@ -662,7 +680,36 @@ class _Refinement(NamedTuple):
             candidate.effect in self.acting for candidate in kept
         ):  # the base from single steps stands
             return refined._replace(kept=tuple(kept), fit=None, removed=tuple(removed), without={})
+        if not self.is_explained:
+            fit, kept = self._narrowed(target, fit, kept)
         return refined._replace(kept=tuple(kept), fit=fit, removed=tuple(removed), without=without)
+
+    def _narrowed(
+        self, target: Target, fit: Fit, kept: Sequence[Candidate]
+    ) -> tuple[Fit, list[Candidate]]:
+        """Return a fit and its effects without parameters that effects do not need.
+
+        Some parameters of an effect trade off: each may be nominal, and not all of them. Others
+        end at a bound, since nothing in the flights depends on them. They are held at nominal.
+        """
+        kept = list(kept)
+        for number, candidate in enumerate(kept):
+            while (field := superfluous(target.problem, fit, kept[number])) is not None:
+                fields = tuple(name for name in kept[number].fields if name != field)
+                probes = tuple(probe for probe in candidate.probes if probe.field != field)
+                others = [*kept]
+                others[number] = candidate._replace(fields=fields, probes=probes)
+                vector = target.problem.at_start(fit.vector, [field])
+                held = target.fitted(vector, self.indices(target.problem, others), MAX_ROUNDS)
+                if sureness(self._losses(target, held) - self._losses(target, fit)) >= SURE:
+                    break
+                fit, kept = held, others
+        return fit, kept
+
+    def _losses(self, target: Target, fit: Fit) -> np.ndarray:
+        """Return the costs of all blocks, none of which the model was fitted to, (blocks,)."""
+        held_out = target._replace(windows=self.flight_test.windows)
+        return np.concatenate([fit.losses, held_out.losses(fit.vector)])
 
     def _without(
         self, target: Target, fit: Fit, kept: Sequence[Candidate], removed: Candidate
@@ -695,6 +742,25 @@ def _is_neutral(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> 
     ]
     indices = problem.parameter_indices(scaled_fields)
     return bool(np.all(np.abs(vector - problem.start)[indices] < NEUTRAL * problem.scale[indices]))
+
+
+def superfluous(problem: Problem, fit: Fit, candidate: Candidate) -> str | None:
+    """Return a parameter that an effect may not need, if there is one beside others.
+
+    It is at a bound, or the nearest to its nominal value where all may be nominal.
+    """
+    half = dict(zip(fit.indices, fit.half_widths, strict=True))
+    change = np.abs(fit.vector - problem.start)
+    indices = problem.parameter_indices(candidate.fields)
+    shown = [index for index in indices if half.get(index, 0.0) > 0.0]
+    if len(shown) < 2:
+        return None
+    stuck = at_bounds(problem, fit.vector, [problem.names[index] for index in shown])
+    if stuck:
+        return stuck[0]
+    if any(change[index] > half[index] for index in shown):
+        return None
+    return problem.names[min(shown, key=lambda index: change[index] / half[index])]
 
 
 def _probed(problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate]) -> np.ndarray:

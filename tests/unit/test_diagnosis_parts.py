@@ -407,7 +407,7 @@ def test_a_value_that_no_flight_depends_on_is_not_told(state):
     indices = tuple(problem.parameter_indices([f"command_delay.{name}" for name in names]))
     moved = problem.start.copy()
     moved[indices[0]] = 0.01
-    fit = Fit(moved, indices, np.diag([1e-6, 0.0]), np.array([1e-3, 0.0]))
+    fit = Fit(moved, indices, np.diag([1e-6, 0.0]), np.array([1e-3, 0.0]), np.zeros(1))
     told = {name: Estimated(0.01, (0.0, 0.02), "s") for name in names}
     cause = replace(CAUSE, effect="command_delay", parameters=told)
     refined = Refined((), fit, None, (), {}, problem, None)
@@ -420,7 +420,7 @@ def test_a_cause_lists_all_that_was_fitted_and_goes_where_flights_show_none_of_i
     """A delay of nothing and of thrust alone is one of thrust; one of neither is no cause."""
     problem, names = state.problem, ("delay_s", "thrust_extra_s")
     indices = tuple(problem.parameter_indices([f"command_delay.{name}" for name in names]))
-    fit = Fit(problem.start, indices, np.eye(2), np.array([0.02, 0.02]))
+    fit = Fit(problem.start, indices, np.eye(2), np.array([0.02, 0.02]), np.zeros(1))
     cause = replace(
         CAUSE, effect="command_delay", parameters={"delay_s": Estimated(0.01, (0.0, 0.02), "s")}
     )

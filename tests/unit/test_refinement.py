@@ -6,7 +6,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
-from flytrack_sysid.diagnosis.refinement import FlightTest, errors_at, refine, sample_windows
+from flytrack_sysid.diagnosis.refinement import (
+    Fit,
+    FlightTest,
+    errors_at,
+    refine,
+    sample_windows,
+    superfluous,
+)
 from flytrack_sysid.inference.chunks import cut_chunks
 from flytrack_sysid.inference.free_flight import QUANTITIES
 from flytrack_sysid.inference.problem import Problem
@@ -21,6 +28,8 @@ SECONDS = 40.0
 TRUE_DRAG = {"d_x": 0.4, "d_y": 0.4, "d_z": 0.2}
 DRAG = next(one for one in CANDIDATES if one.effect == "linear_drag")
 BIAS = next(one for one in CANDIDATES if one.effect == "accelerometer_bias")
+SCALE = next(one for one in CANDIDATES if one.effect == "rate_scale")
+DELAY = next(one for one in CANDIDATES if one.effect == "command_delay" and len(one.fields) > 2)
 CIRCLE_S, RADIUS_M = 4.0, 1.0
 
 
@@ -65,6 +74,44 @@ def test_values_are_refined_by_flights(dragged):
         found.removal_costs["linear_drag"] > 0.1 and "accelerometer_bias" not in found.removal_costs
     )
     assert found.flight_test.worst_ratio(found.fit.vector) < 1.0
+
+
+def test_an_effect_that_no_block_of_flights_needs_is_removed(dragged):
+    _, log, problem, earlier = dragged
+    vector = earlier.fit.vector.copy()
+    vector[problem.names.index("rate_scale.roll")] = 1.02
+    with jax.enable_x64(True):
+        base = FittedModel((), problem.start, 0.0, ())
+        model = base._replace(candidates=(DRAG, SCALE), vector=vector)
+        found = refine(SearchState(problem), base, model, log, held_out_rows(log), False)
+    assert [one.effect for one in found.kept] == ["linear_drag"] and found.removed == (
+        "rate_scale",
+    )
+
+
+@pytest.mark.parametrize(
+    ("values", "halves", "expected"),
+    [
+        ((0.005, 0.0, 0.025), (0.03, 0.0, 0.031), "command_delay.delay_s"),  # of two, the nearer
+        ((0.005, 0.0, 0.025), (0.03, 0.0, 0.004), None),  # the delay of thrust is sure
+        ((0.0, 0.0, 0.025), (0.0, 0.0, 0.031), None),  # the only one that flights show
+        ((0.005, 0.06, 0.025), (0.003, 0.01, 0.004), "command_delay.yaw_extra_s"),  # at a bound
+    ],
+)
+def test_a_parameter_is_superfluous_beside_others_at_a_bound_or_where_all_may_be_nominal(
+    dragged, values, halves, expected
+):
+    problem = dragged[2]
+    indices = problem.parameter_indices(DELAY.fields)
+    assert [field.split(".")[1] for field in DELAY.fields] == [
+        "delay_s",
+        "yaw_extra_s",
+        "thrust_extra_s",
+    ]
+    vector = problem.start.copy()
+    vector[indices] = values
+    fit = Fit(vector, tuple(indices), np.zeros((3, 3)), np.array(halves), np.zeros(1))
+    assert superfluous(problem, fit, DELAY) == expected
 
 
 @pytest.mark.parametrize("step_s", slow_but([0.01], [0.01, 0.005]))

@@ -28,6 +28,7 @@ def test_a_craft_counts_pairs_values_and_widths():
     def line(causes, low_s):
         values = {"linear_drag.b_xy": [0.2, 0.1, 0.3], "thrust_curve.c0": [low_s, low_s, low_s]}
         return {
+            "craft": "one",
             "causes": {name: [] for name in causes},
             "values": values,
             "lift": {},
