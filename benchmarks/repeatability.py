@@ -123,6 +123,7 @@ def measure(trial: Trial) -> dict[str, Any]:
         "cpu_s": process_time() - start,
         "verdict": diagnosis.verdict,
         "causes": {cause.effect: sorted(cause.equivalent) for cause in diagnosis.causes},
+        "unsettled": list(diagnosis.unsettled),
         "values": {
             f"{cause.effect}.{name}": [value.value, *value.ci95]
             for cause in diagnosis.causes
@@ -142,14 +143,24 @@ def measure(trial: Trial) -> dict[str, Any]:
     }
 
 
-def is_same_class(one: Mapping[str, list[str]], other: Mapping[str, list[str]]) -> bool:
+def is_same_class(one: Line, other: Line) -> bool:
     """Return whether each cause of either is a cause or an equivalent of one of the other."""
 
-    def covers(some: Mapping[str, list[str]], names: Iterable[str]) -> bool:
-        known = {name for cause, equivalent in some.items() for name in (cause, *equivalent)}
+    def covers(some: Line, names: Iterable[str]) -> bool:
+        known = {name for cause, alike in some["causes"].items() for name in (cause, *alike)}
         return set(names) <= known
 
-    return covers(one, other) and covers(other, one)
+    return covers(one, other["causes"]) and covers(other, one["causes"])
+
+
+def agree(one: Line, other: Line) -> bool:
+    """Return whether neither names what the other neither names nor leaves open."""
+
+    def leaves_open(some: Line) -> set[str]:
+        alike = (name for equivalents in some["causes"].values() for name in equivalents)
+        return {*some["causes"], *alike, *some["unsettled"]}
+
+    return set(one["causes"]) <= leaves_open(other) and set(other["causes"]) <= leaves_open(one)
 
 
 def overlaps(one: list[float], other: list[float]) -> bool:
@@ -177,11 +188,13 @@ def compare(lines: Sequence[Line]) -> list[Any]:
         )
     ]
     same = [set(one["causes"]) == set(other["causes"]) for one, other in pairs]
-    same_class = [is_same_class(one["causes"], other["causes"]) for one, other in pairs]
+    same_class = [is_same_class(one, other) for one, other in pairs]
+    no_contradiction = [agree(one, other) for one, other in pairs]
     return [
         len(lines),
         f"{sum(same)} of {len(pairs)}",
         f"{sum(same_class)} of {len(pairs)}",
+        f"{sum(no_contradiction)} of {len(pairs)}",
         f"{sum(values)} of {len(values)}",
         *("none" if half is None else f"± {half:.1f}" for half in halves),
     ]
@@ -205,7 +218,8 @@ def write_page() -> None:
     plants = [line for line in lines if line["craft"].startswith(PLANT)]
     by_craft["Simulated, each plant twice"] = plants
     shown = [line for line in plants if line["effect"]]
-    header = "craft | flights | pairs with the same names | the same class | values that overlap"
+    header = "craft | flights | pairs with the same names | the same class | none denied"
+    header += " | values that overlap"
     header += "".join(f" | {stick}, ms" for stick in STICKS)
     names = [
         [line["flight"].partition("/")[2], ", ".join(sorted(line["causes"])) or "none"]

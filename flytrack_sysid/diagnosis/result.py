@@ -242,6 +242,8 @@ class Diagnosis:
         warnings: what a reader must know before trusting the causes.
         negligible: causes that are significant, but too small to matter.
         beyond: causes that are not named since a value is at the end of its searched range.
+        unsettled: effects and base parameters that the log suggests, and does not settle; warnings
+            say why.
         prediction: errors of free flight.
         changed: parameters whose value in the extended model differs from the nominal one.
         half_response_s: by model (nominal, refitted_base, extended) and by stick.
@@ -265,6 +267,7 @@ class Diagnosis:
     warnings: tuple[str, ...] = ()
     negligible: tuple[Cause, ...] = ()
     beyond: tuple[Cause, ...] = ()
+    unsettled: tuple[str, ...] = ()
     prediction: Prediction = Prediction()
     changed: tuple[Changed, ...] = ()
     half_response_s: Mapping[str, Mapping[str, HalfResponse]] = field(default_factory=dict)
@@ -290,6 +293,7 @@ class Diagnosis:
             "causes": causes,
             "negligible": negligible,
             "beyond_the_list": beyond,
+            "unsettled": list(self.unsettled),
             "unexplained": unexplained,
             "not_identifiable": limits,
             "motion": self.extended.motion.value,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.repeatability import compare, is_same_class, overlaps
+from benchmarks.repeatability import agree, compare, is_same_class, overlaps
 
 
 @pytest.mark.parametrize(
@@ -16,7 +16,16 @@ from benchmarks.repeatability import compare, is_same_class, overlaps
     ],
 )
 def test_causes_are_of_one_class_if_each_is_an_equivalent_of_the_other(one, other, expected):
+    one, other = ({"causes": causes, "unsettled": []} for causes in (one, other))
     assert is_same_class(one, other) is expected and is_same_class(other, one) is expected
+    assert agree(one, other) >= expected
+
+
+def test_flights_agree_where_one_leaves_open_what_the_other_names():
+    one = {"causes": {"wind": []}, "unsettled": []}
+    other = {"causes": {}, "unsettled": ["wind", "linear_drag"]}
+    assert agree(one, other) and agree(other, one) and not is_same_class(one, other)
+    assert not agree(one, {"causes": {}, "unsettled": []})
 
 
 def test_intervals_overlap_where_they_share_a_value():
@@ -29,6 +38,7 @@ def test_a_craft_counts_pairs_values_and_widths():
         values = {"linear_drag.b_xy": [0.2, 0.1, 0.3], "thrust_curve.c0": [low_s, low_s, low_s]}
         return {
             "craft": "one",
+            "unsettled": [],
             "causes": {name: [] for name in causes},
             "values": values,
             "lift": {},
@@ -36,6 +46,6 @@ def test_a_craft_counts_pairs_values_and_widths():
         }
 
     lines = [line(["linear_drag"], 0.02), line(["linear_drag"], 0.021), line(["wind"], 0.03)]
-    flights, same, same_class, overlapping, roll, pitch, *_ = compare(lines)
-    assert (flights, same, same_class, overlapping) == (3, "1 of 3", "1 of 3", "4 of 6")
+    flights, *alike, overlapping, roll, pitch, _, _ = compare(lines)
+    assert (flights, alike, overlapping) == (3, 3 * ["1 of 3"], "4 of 6")
     assert (roll, pitch) == ("± 1.0", "none")
