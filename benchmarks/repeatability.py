@@ -123,6 +123,7 @@ def measure(trial: Trial) -> dict[str, Any]:
         "cpu_s": process_time() - start,
         "verdict": diagnosis.verdict,
         "causes": {cause.effect: sorted(cause.equivalent) for cause in diagnosis.causes},
+        "negligible": [cause.effect for cause in diagnosis.negligible],
         "unsettled": list(diagnosis.unsettled),
         "values": {
             f"{cause.effect}.{name}": [value.value, *value.ci95]
@@ -201,9 +202,9 @@ def compare(lines: Sequence[Line]) -> list[Any]:
 
 
 def is_in_class(line: Line) -> bool:
-    """Return whether the effect that a log shows is a cause or an equivalent of one."""
-    causes = line["causes"]
-    return line["effect"] in causes or any(line["effect"] in alike for alike in causes.values())
+    """Return whether the effect that a log shows is a cause, an equivalent or negligible."""
+    alike = (name for equivalents in line["causes"].values() for name in equivalents)
+    return line["effect"] in {*line["causes"], *alike, *line["negligible"]}
 
 
 def is_coefficient(name: str) -> bool:
