@@ -11,7 +11,7 @@ Times are those of one clock. A log whose time goes back is of several flights, 
 for changes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ from flytrack_sysid.diagnosis.result import Estimated
 from flytrack_sysid.diagnosis.vetoes import Selection, select
 from flytrack_sysid.inference import noise as noises
 from flytrack_sysid.inference.chunks import CHUNK_S, Chunks, count_lead_in
+from flytrack_sysid.inference.parameters import range_of
 from flytrack_sysid.inference.problem import Problem, Window, robust_square
 from flytrack_sysid.inference.score_test import (
     Candidate,
@@ -86,8 +87,8 @@ def windowed_gains(
     given: Sequence[int],
     changing: Sequence[int],
     weights: np.ndarray,
-) -> np.ndarray:
-    """Return the first-order gain of columns that act with a weight in each block, (hypotheses,).
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first-order gain of columns that act with a weight in each block, and their steps.
 
     Args:
         score: by block, (blocks, columns).
@@ -95,6 +96,9 @@ def windowed_gains(
         given: the columns that are free throughout.
         changing: the columns that act with the weights.
         weights: (hypotheses, blocks).
+
+    Returns:
+        Gains, (hypotheses,), and steps, (hypotheses, changing).
     """
     given, changing = list(given), list(changing)
     free = information[:, given][:, :, given].sum(axis=0)
@@ -110,9 +114,8 @@ def windowed_gains(
     size = np.maximum(np.diagonal(unprojected, axis1=1, axis2=2), 1e-300)
     projected = unprojected - np.swapaxes(across, 1, 2) @ share
     projected = projected + RIDGE * size[:, None] * np.eye(len(changing))
-    return np.einsum(
-        "ho,ho->h", projected_score, np.linalg.solve(projected, projected_score[..., None])[..., 0]
-    )
+    steps = np.linalg.solve(projected, projected_score[..., None])[..., 0]
+    return np.einsum("ho,ho->h", projected_score, steps), steps
 
 
 class Hypothesis(NamedTuple):
@@ -124,6 +127,7 @@ class Hypothesis(NamedTuple):
         row: of the record, at which the effect begins or ends; 0 if it drifts.
         gain: of chi2 to first order, over its inflation.
         num_parameters: the number that change.
+        steps: by parameter, how much it grows; where the effect is named.
     """
 
     candidate: Candidate
@@ -131,6 +135,7 @@ class Hypothesis(NamedTuple):
     row: int
     gain: float
     num_parameters: int
+    steps: Mapping[str, float]
 
     @property
     def margin(self) -> float:
@@ -199,15 +204,23 @@ def _change_of(
     after = (start >= changes[:, None]).astype(float)
     ramp = (start - start.min()) / max(np.ptp(start), 1)
     weights = {"start": after, "end": 1.0 - after, "drift": ramp[None]}
-    gains = {
+    found = {
         way: windowed_gains(score, information, given, changing, one)
         for way, one in weights.items()
     }
-    way = max(gains, key=lambda one: gains[one].max())
-    index = int(np.argmax(gains[way]))
+    way = max(found, key=lambda one: found[one][0].max())
+    gains, steps = found[way]
+    index = int(np.argmax(gains))
     inflation = _inflation(score, information, given, changing, weights[way][index])
     row = int(changes[index]) if way != "drift" else 0
-    return Hypothesis(candidate, way, row, float(gains[way][index]) / inflation, len(changing))
+    names = [linearization.problem.names[linearization.indices[column]] for column in columns]
+    growth = -steps[index] if way == "end" else steps[index]
+    by_name = {
+        names[columns.index(column)]: float(step)
+        for column, step in zip(changing, growth, strict=True)
+        if is_named
+    }
+    return Hypothesis(candidate, way, row, float(gains[index]) / inflation, len(changing), by_name)
 
 
 def _inflation(
@@ -399,9 +412,15 @@ def describe_changes(
         effect = change.candidate.effect
         if change.margin > 0.0 and effect in selection.model.effects:
             how = "drifts" if change.way == "drift" else "changes"
-            notes.append(f"{effect} {how} within the log: its value is a mean")
+            sizes = ", ".join(map(_growth, change.steps, change.steps.values()))
+            notes.append(f"{effect} {how} within the log ({sizes}): its value is a mean")
             break
     return notes
+
+
+def _growth(field: str, step: float) -> str:
+    unit = range_of(field).unit
+    return f"{field.split('.')[-1]} {step:+.2g}" + ("" if unit == "1" else f" {unit}")
 
 
 def moved(problem: Problem, row: int, to: int) -> Problem:

@@ -28,7 +28,9 @@ def scores(rng):
 
 def test_changes_are_found_by_chance_as_rarely_as_the_threshold_says():
     rng = np.random.default_rng(1)
-    largest = np.array([windowed_gains(*scores(rng), GIVEN, OWN, AFTER).max() for _ in range(600)])
+    largest = np.array(
+        [windowed_gains(*scores(rng), GIVEN, OWN, AFTER)[0].max() for _ in range(600)]
+    )
     share = np.mean(largest > threshold(len(OWN), TRIMMED, chance=0.05))
     assert 0.015 < share < 0.07  # the tail is that of a change at any instant, not at whole seconds
     assert threshold(1) > 20.0 and threshold(3) > threshold(1)
@@ -39,8 +41,11 @@ def test_a_slow_drift_gains_more_as_a_drift_than_as_a_step():
     score, information = scores(rng)
     ramp = np.arange(BLOCKS) / BLOCKS
     score += information[:, 2] * ramp[:, None]
-    gains = windowed_gains(score, information, [0, 1, 2], [2], np.concatenate([AFTER, ramp[None]]))
+    gains, steps = windowed_gains(
+        score, information, [0, 1, 2], [2], np.concatenate([AFTER, ramp[None]])
+    )
     assert gains[-1] > gains[:-1].max()
+    assert steps[-1, 0] == pytest.approx(1.0, abs=0.3)
 
 
 def test_only_logs_of_one_clock_can_show_when():
