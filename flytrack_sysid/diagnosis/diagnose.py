@@ -423,7 +423,7 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
         causes=causes,
         negligible=named.negligible,
         beyond=beyond,
-        unsettled=summary.unsettled(selection, vetted.rejected, named.neutral),
+        unsettled=summary.unsettled(selection, vetted.rejected, (*named.neutral, *refined.removed)),
         unexplained=all_unexplained,
         not_identifiable=summary.not_identifiable(
             selection.state,

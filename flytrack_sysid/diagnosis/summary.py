@@ -641,18 +641,18 @@ def given_law_notes(problem: Problem, unexplained: Unexplained) -> list[str]:
 
 
 def unsettled(
-    selection: vetoes.Selection, rejected: Mapping[str, vetoes.Veto], neutral: Sequence[str]
+    selection: vetoes.Selection, rejected: Mapping[str, vetoes.Veto], unflown: Sequence[str]
 ) -> tuple[str, ...]:
     """Return names that the log suggests and does not settle, each once.
 
     Args:
         selection: of the extended model.
         rejected: the veto of each rejected effect. Those that held-out rows contradict are settled.
-        neutral: causes that flights do not show.
+        unflown: what single steps show, and free flights do not.
     """
     stand_ins = (name for name in selection.stand_ins if name in BASE_CAUSES)
     doubted = (name for name, veto in rejected.items() if veto.__name__ in vetoes.REASONS)
-    return tuple(dict.fromkeys((*stand_ins, *doubted, *neutral)))
+    return tuple(dict.fromkeys((*stand_ins, *doubted, *unflown)))
 
 
 def neutral_notes(names: Sequence[str]) -> list[str]:
