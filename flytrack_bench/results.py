@@ -93,12 +93,7 @@ def fly_task(task: Task, suite: Suite, policy: Policy) -> dict[str, Any]:
 
 def end_shares(outcomes: Outcomes) -> dict[str, float]:
     """Return the share of flights that each cause ended before they finished, the largest first."""
-    causes: dict[str, Any] = dict(outcomes.causes._asdict())
-    causes["time_limit"] = ~np.any(list(causes.values()), axis=0)
-    shares = {
-        name: float(np.mean(happened & ~outcomes.is_complete()))
-        for name, happened in causes.items()
-    }
+    shares = {name: float(np.mean(is_ended)) for name, is_ended in outcomes.ends().items()}
     return {
         name: round(share, 6)
         for name, share in sorted(shares.items(), key=lambda one: -one[1])

@@ -86,6 +86,8 @@ def test_missing_tools_and_other_files_are_one_sentence(tmp_path, monkeypatch, c
     other.write_bytes(b"other")
     with pytest.raises(FirmwareError, match="found sha256 d9298a10d1b0735837"):
         build(lambda line: None, other)
+    with pytest.raises(FirmwareError, match="nowhere: cannot be read: "):
+        build(lambda line: None, tmp_path / "nowhere")
     monkeypatch.setattr(shutil, "which", lambda tool: None)
     assert "gcc is not installed" in refused(capsys, "firmware", "build")
     assert not [path for path in cache_folder().parent.iterdir()]
