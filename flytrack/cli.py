@@ -52,7 +52,11 @@ def _own(name: str, extra: str, module: str, flags: str, summary: str) -> Comman
 IDENTIFICATION = ("sysid", "identification", "flags")
 COMMANDS = {
     "demo": _own(
-        "demo", "train", "demo", "flags", "Identify the shipped black box, train, fly on it"
+        "demo",
+        "train",
+        "demo",
+        "flags",
+        "Identify the shipped black box, train, fly, adapt",
     ),
     "train": Command(
         "Train a policy with PPO",
