@@ -30,7 +30,6 @@ from flytrack_env.model_file import model_as_json, model_from_json
 from flytrack_sysid import Diagnosis, FlightLog, LogError, diagnose
 from flytrack_sysid.check import check_log
 from flytrack_sysid.diagnosis import text_of
-from flytrack_sysid.diagnosis.first_look import FirstLook
 from flytrack_sysid.diagnosis.plausible import PlausibleModels, find_plausible_models
 from flytrack_sysid.inference.parameters import from_vector, to_vector
 from flytrack_sysid.log import usual_step
@@ -46,7 +45,6 @@ STICK_QUANTILE = 0.95
 OTHER_CRAFT = 2
 NUM_STEPS, NUM_LAPS = 2500, 3  # of a flight that is judged
 NUMBERS = ("tau", "thrust_coeffs", "max_rate", "m", "g", "battery_drain_v_per_min")  # of a model
-AGREES = "the log agrees with the model that the policy was made for"
 STREAMS = ("judge", "polish")
 Report = Callable[[int, int], None]
 
@@ -129,7 +127,6 @@ def adapt(
     settings: Settings = Settings(),  # noqa: B008, a tuple of constants
     accept: bool = False,
     report: Callable[[str], Report] = lambda unit: lambda done, total: None,
-    show: Callable[[FirstLook], None] = lambda look: None,
 ) -> Adapted:
     """Return a policy adapted to the plant that flew a log.
 
@@ -140,14 +137,13 @@ def adapt(
         settings: see ``Settings``.
         accept: adapt although the log contradicts itself or the policy's model.
         report: from a unit, what is called with the number done and of all.
-        show: called with the first look of the diagnosis.
 
     Raises:
         CheckpointError: a policy of another observation, or without its model.
         LogError: a log of no race, or of another craft.
     """
     model = check_inputs(log, checkpoint, accept)
-    diagnosis = diagnose(log, model, report=report("stages"), show=show)
+    diagnosis = diagnose(log, model, report=report("stages"))
     if not is_different(diagnosis):
         return Adapted(diagnosis, checkpoint, False)
     models = find_plausible_models(diagnosis)
@@ -306,7 +302,8 @@ def describe_adapted(found: Adapted) -> str:
     """Return what was wrong, what it cost, and what is expected of the new policy, as text."""
     lines = [text_of(found.diagnosis), ""]
     if found.known is None or found.old is None:
-        return "\n".join([*lines, f"Nothing to adapt to: {AGREES}. The policy is unchanged."])
+        nothing = "Nothing to adapt to: the log agrees with the model that the policy was made for."
+        return "\n".join([*lines, f"{nothing} The policy is unchanged."])
     flights = {"old policy, its own model": found.known, "old policy, this plant": found.old}
     if found.new is not None:
         flights["new policy, this plant"] = found.new
