@@ -205,8 +205,7 @@ def write_page(lines: list[dict[str, Any]]) -> None:
         starts=STARTS,
         figures=report.figures_table(figures(whole, judged)),
         not_run=f"{len(plants)} of {planned} pairs of plant and motion were flown "
-        f"before the run was stopped, {len(plants) - len(whole)} of them refused as a log; the "
-        "command resumes there.",
+        f"before the run was stopped, {len(plants) - len(whole)} of them refused as a log.",
         plants=plants_table(plants),
         unchanged=text,
         commit=lines[-1]["commit"],
