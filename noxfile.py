@@ -32,7 +32,6 @@ HEADLESS = {
     "PYTHONPATH": "",
 }
 TEST_TOOLS = ("pytest>=9", "hypothesis>=6.150", "pillow", "pyulog>=1.2", "orangebox>=0.4,<0.5")
-CHAMPION = ROOT / "baselines" / "purejaxrl_ppo" / "champion" / "flytrack.safetensors"
 
 FLY_EVERY_ID = """
 import gymnasium, gymnax, jax, flytrack_env
@@ -55,9 +54,9 @@ for extra, module in (("sysid", "flytrack_sysid"), ("train", "baselines.purejaxr
         importlib.import_module(module)
 """
 LOAD_CHAMPION = """
-from importlib import resources
 from baselines.purejaxrl_ppo import load_checkpoint
-load_checkpoint(next((resources.files("baselines.purejaxrl_ppo") / "champion").glob("flytrack.*")))
+for name in ("champion", "robust"):
+    load_checkpoint(name)
 """
 SAVE_GHOST = """
 import numpy as np
@@ -107,7 +106,7 @@ USES = {
     "train": (
         f"flytrack train {SIZES} --out small",
         "flytrack demo --quick",
-        f"flytrack eval --checkpoint {CHAMPION} --steps 300",
+        "flytrack eval --checkpoint champion --steps 300",
         LOAD_CHAMPION,
     ),
     "sysid": (
@@ -124,7 +123,7 @@ USES = {
     "render": (RENDER,),
     "multi": (RACE_IN_OTHER_LIBRARIES,),
     "fly": (FLY_BY_HAND,),
-    "export": (f"flytrack export {CHAMPION} --onnx policy.onnx --c policy.h",),
+    "export": ("flytrack export champion --onnx policy.onnx --c policy.h",),
     "optimal": ("python -m benchmarks.time_optimal --tracks speedway --kinds flying --out made",),
     "speed": ("from benchmarks.env_speed import l2f_contestant as l2f; l2f('l2f', 1024, 8).run()",),
 }

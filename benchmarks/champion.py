@@ -10,7 +10,6 @@ baselines/purejaxrl_ppo/champion; a page compares all with the time-optimal flig
 """
 
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -19,7 +18,7 @@ import jax.numpy as jnp
 
 import flytrack_env
 from baselines.purejaxrl_ppo import Config, load_checkpoint
-from baselines.purejaxrl_ppo.checkpoint import save_checkpoint
+from baselines.purejaxrl_ppo.checkpoint import SHIPPED, save_checkpoint
 from baselines.purejaxrl_ppo.checkpoint_env import draw_model
 from baselines.purejaxrl_ppo.evaluate import EvaluationSettings, Report, evaluate
 from baselines.purejaxrl_ppo.polish import Settings, polish
@@ -29,8 +28,8 @@ from flytrack_env import blackbox
 from flytrack_env.files import write_atomically
 from flytrack_env.progress import ProgressBar
 
-FOLDER = report.ROOT / "baselines" / "purejaxrl_ppo" / "champion"
-CHAMPION = FOLDER / "flytrack.safetensors"
+FOLDER = SHIPPED["champion"].parent
+CHAMPION = SHIPPED["champion"]
 MODEL = report.ROOT / "benchmarks" / "data" / "time_optimal" / "black_box.json"
 # Gates are all that counts, wherever they are passed and however hard the sticks are thrown.
 REWARD = {"gate_pass": 5.0, "off_centre": 0.0, "body_rates": 0.0, "action_change": 0.0}
@@ -135,7 +134,7 @@ def train(name: str, seed: int) -> tuple[Path, Path]:
         trained = load_checkpoint(before)
         env = flytrack_env.make("FlyTrack-v0", model=MODEL)
         model = jax.tree.map(jnp.asarray, env.default_params.model)
-        draw = partial(draw_model, model=model) if recipe.is_robust else None
+        draw = (lambda key, done: draw_model(key, model)) if recipe.is_robust else None
         started_s = time.perf_counter()
         policy = polish(env, trained.policy, seed, recipe.settings, draw, ProgressBar("updates"))
         seconds = time.perf_counter() - started_s

@@ -52,7 +52,11 @@ def _own(name: str, extra: str, module: str, flags: str, summary: str) -> Comman
 IDENTIFICATION = ("sysid", "identification", "flags")
 COMMANDS = {
     "demo": _own(
-        "demo", "train", "demo", "flags", "Identify the shipped black box, train, fly on it"
+        "demo",
+        "train",
+        "demo",
+        "flags",
+        "Identify the shipped black box, train, fly, adapt",
     ),
     "train": Command(
         "Train a policy with PPO",
@@ -75,6 +79,7 @@ COMMANDS = {
         "validate", *IDENTIFICATION, "Judge a model on flight that it was not fitted to"
     ),
     "diagnose": _own("diagnose", *IDENTIFICATION, "Name what a model gets wrong, and extend it"),
+    "adapt": _own("adapt", "train", "adapt", "flags", "Make a better policy from a log of flight"),
     "plan": _own("plan", *IDENTIFICATION, "Plan flights that settle what a log left open"),
     "check": _own("check", *IDENTIFICATION, "Find units, signs, frames and clocks that contradict"),
     "import": _own("import", *IDENTIFICATION, "Convert logs of real flights into a flight log"),

@@ -1,4 +1,4 @@
-"""What ``flytrack demo`` does: collect, identify, train from scratch, fly."""
+"""What ``flytrack demo`` does: collect, identify, train from scratch, fly, adapt, fly again."""
 
 import dataclasses
 import json
@@ -8,10 +8,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from baselines.purejaxrl_ppo import Config
-from baselines.purejaxrl_ppo.checkpoint import FINAL, checkpoints_in
-from baselines.purejaxrl_ppo.evaluate import EvaluationSettings, evaluate
-from baselines.purejaxrl_ppo.flights import CANNOT_RECORD, can_record, fly_many, score
+from baselines.purejaxrl_ppo import Checkpoint, Config
+from baselines.purejaxrl_ppo.checkpoint import FINAL, checkpoints_in, save_checkpoint
+from baselines.purejaxrl_ppo.checkpoint_env import plant_env
+from baselines.purejaxrl_ppo.evaluate import EvaluationSettings, Report, evaluate
+from baselines.purejaxrl_ppo.flights import (
+    CANNOT_RECORD,
+    Rollout,
+    Score,
+    can_record,
+    fly_many,
+    score,
+)
 from baselines.purejaxrl_ppo.monitor import draw_position_density
 from baselines.purejaxrl_ppo.training import train_policy
 from flytrack.flags import Demo
@@ -19,11 +27,14 @@ from flytrack_env import blackbox, save_model
 from flytrack_env.files import fresh_folder, write_atomically
 from flytrack_env.pictures import read_flights, write_pictures
 from flytrack_env.progress import ProgressBar
+from flytrack_loop import fly_log
+from flytrack_loop.adapt import adapt, describe_adapted
 from flytrack_sysid import Validation, collect, fit, held_out_rows, load_log, save_log, validate
 from flytrack_sysid.validate import NAMES
 
 DEFAULT_OUT = Path("runs/demo")
 NUM_LAPS = 3
+LOG_SECONDS = 10.0  # of the policy's own flight, which it is adapted to
 
 
 class Size(NamedTuple):
@@ -88,23 +99,22 @@ def run_demo(flags: Demo) -> None:
     out = flags.out or fresh_folder(DEFAULT_OUT)
     out.mkdir(parents=True, exist_ok=True)
 
-    print(f"1/4 collect and identify: {black_box}")
+    print(f"1/5 collect and identify: {black_box}")
     validations = identify(black_box, out, seed, size.minutes)
     describe_identification(validations)
 
-    print("2/4 train PPO from scratch on the identified model")
+    print("2/5 train PPO from scratch on the identified model")
     checkpoint, _ = train_policy(out, config, seed, model=out / "model.json")
 
-    print("3/4 fly the checkpoint on the black box")
+    print("3/5 fly the checkpoint on the black box")
     settings = EvaluationSettings(
         out / FINAL, size.num_steps, black_box=black_box, seed=seed, out=out / "rollout.npy"
     )
     report = evaluate(settings)
     report.write()
     print(report.text)
-    env = report.env
     flown = (seed, size.num_episodes, size.num_steps, NUM_LAPS)
-    flights = fly_many(env, checkpoint.policy, *flown)
+    flights = fly_many(report.env, checkpoint.policy, *flown)
     result = score(flights.outcome)
 
     summary: dict[str, Any] = {
@@ -114,27 +124,70 @@ def run_demo(flags: Demo) -> None:
         "training_steps": checkpoint.meta["steps"],
         "training_seconds": checkpoint.meta["seconds"],
         "rollout": report.numbers["first_flight"],
-        "noisy_starts": {
-            "episodes": size.num_episodes,
-            "laps": NUM_LAPS,
-            # JSON has no NaN: a time without a lap is null.
-            **{name: None if np.isnan(v) else v for name, v in result._asdict().items()},
-        },
-        "seconds": round(time.perf_counter() - started, 1),
+        "noisy_starts": {"episodes": size.num_episodes, "laps": NUM_LAPS, **as_json(result)},
     }
+    adapted = adapt_to_flight(out, checkpoint, black_box, flown)
+    summary["adapted"] = adapted and as_json(adapted)
+    summary["seconds"] = round(time.perf_counter() - started, 1)
     write_atomically(out / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
-    print("4/4 draw")
-    draw_position_density(
-        out / "position_density.png", flights.positions(), env.track, size.num_episodes
-    )
-    write_pictures(read_flights([out / "rollout.npy"], env.track), out)
+    print("5/5 draw")
+    draw(out, report, flights, size.num_episodes)
+    print(describe_race(result, size.num_episodes))
+    if adapted is not None:
+        print(f"adapted to its flight: {describe_race(adapted, size.num_episodes)}")
+    print(f"written: {out}/ in {summary['seconds']} s")
+
+
+def adapt_to_flight(
+    out: Path, checkpoint: Checkpoint, black_box: Path, flown: tuple[int, int, int, int]
+) -> Score | None:
+    """Log some seconds of the policy's own flight, adapt it to them, and fly it again.
+
+    Args:
+        out: folder of the log and the new policy.
+        checkpoint: the policy.
+        black_box: file of the plant.
+        flown: seed, noisy starts, steps and laps of the race.
+
+    Returns:
+        The race of the new policy; None where there is none.
+    """
+    print(f"4/5 log {LOG_SECONDS:g} s of its flight, see what differs, adapt the policy, fly again")
+    plant = blackbox.load(black_box)
+    try:
+        log = fly_log(plant, checkpoint, flown[0], LOG_SECONDS, noise=1.0)
+        save_log(out / "race_log.npz", log)
+        found = adapt(log, checkpoint, flown[0], report=ProgressBar)
+    except ValueError as error:  # a policy that learned nothing flies nothing to learn from
+        print(f"not adapted: {error}")
+        return None
+    print(describe_adapted(found))
+    if not found.is_new:
+        return None
+    new = found.checkpoint
+    save_checkpoint(out / "adapted.safetensors", new.params, new.config, new.meta)
+    return score(fly_many(plant_env(new, plant), new.policy, *flown).outcome)
+
+
+def draw(out: Path, report: Report, flights: Rollout, num_episodes: int) -> None:
+    """Write pictures of the flights and, where Rerun is installed, a recording of the first."""
+    track = report.env.track
+    draw_position_density(out / "position_density.png", flights.positions(), track, num_episodes)
+    write_pictures(read_flights([out / "rollout.npy"], track), out)
     if can_record():
         report.record(out / "rollout.rrd", with_ghost=True)
     else:
         print(f"no recording: {CANNOT_RECORD}")
-    print(
-        f"{result.success:.1%} of {size.num_episodes} noisy starts finish {NUM_LAPS} laps "
-        f"on the black box; first lap {result.first_lap_s:.2f} s, "
-        f"flying lap {result.flying_lap_s:.2f} s"
+
+
+def as_json(result: Score) -> dict[str, float | None]:
+    """Return a race as JSON values, which have no NaN: a time without a lap is null."""
+    return {name: None if np.isnan(v) else v for name, v in result._asdict().items()}
+
+
+def describe_race(result: Score, num_episodes: int) -> str:
+    """Return a race in one line."""
+    return (
+        f"{result.success:.1%} of {num_episodes} noisy starts finish {NUM_LAPS} laps on the black "
+        f"box; first lap {result.first_lap_s:.2f} s, flying lap {result.flying_lap_s:.2f} s"
     )
-    print(f"written: {out}/ in {summary['seconds']} s")

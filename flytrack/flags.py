@@ -184,6 +184,22 @@ class Diagnose:
 
 
 @dataclass(frozen=True)
+class Adapt:
+    """Flags of ``flytrack adapt``."""
+
+    log: Positional[Path]
+    """Log of the policy's flights on the plant; about ten seconds are enough."""
+    out: Path
+    """The new policy, .safetensors; the old one where that is better, or nothing differs."""
+    checkpoint: Annotated[Path, arg(metavar="PATH|champion|robust")] = Path("champion")
+    """The policy: a checkpoint, or a shipped policy's name."""
+    seed: int = 0
+    """Seed of the drawn plants and of the starts."""
+    accept: bool = False
+    """Adapt to a log although it contradicts itself or the policy's model."""
+
+
+@dataclass(frozen=True)
 class Plan:
     """Flags of ``flytrack plan``."""
 

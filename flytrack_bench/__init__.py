@@ -8,7 +8,7 @@ check_installed(
 
 from flytrack_bench.policies import Policy, PolicyError, load_policy
 from flytrack_bench.results import Data, DataError, differences, run
-from flytrack_bench.retrain import diagnose_and_retrain
+from flytrack_bench.retrain import adapt_to_flight, diagnose_and_retrain
 from flytrack_bench.suite import Suite, SuiteError, Task, load_suite
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "Suite",
     "SuiteError",
     "Task",
+    "adapt_to_flight",
     "diagnose_and_retrain",
     "differences",
     "load_policy",

@@ -36,7 +36,7 @@ class Flags:
     """Ids of the tasks to fly; default: all, or with --adapt all hidden plants."""
     adapt: Annotated[str | None, arg(metavar="MODULE:NAME", help_behavior_hint=OPTIONAL)] = None
     """A function that makes a policy for each plant, given `flytrack_bench.Data` and --policy:
-    `flytrack_bench:diagnose_and_retrain`, or your own."""
+    `flytrack_bench:adapt_to_flight`, `flytrack_bench:diagnose_and_retrain`, or your own."""
     data_seconds: float = 30.0
     """Seconds of flight that --adapt may log of each plant."""
     verify: OptionalPath = None

@@ -70,7 +70,7 @@ def policy_of(checkpoint: Checkpoint, name: str, sha256: str = "") -> Policy:
 
 
 def load_policy(where: str) -> Policy:
-    """Return the policy that a checkpoint's path or ``module:name`` names.
+    """Return the policy that a checkpoint's path or name, or ``module:name``, names.
 
     The name is that of a function of the observation, or of an object as in ``Policy.network``.
 
@@ -78,8 +78,9 @@ def load_policy(where: str) -> Policy:
             CheckpointError: a file that is no checkpoint.
     """
     if ":" not in where or Path(where).exists():
-        checkpoint, content = load_checkpoint(Path(where)), Path(where).read_bytes()
-        return policy_of(checkpoint, Path(where).name, hashlib.sha256(content).hexdigest())
+        checkpoint = load_checkpoint(where)
+        digest = hashlib.sha256(checkpoint.path.read_bytes()).hexdigest()
+        return policy_of(checkpoint, Path(where).name, digest)
     found = import_object(where, "policy", PolicyError)
     network = found if hasattr(found, "act") else Function(found)
     space = flytrack_env.FlyTrack().observation_space(flytrack_env.FlyTrack().default_params)

@@ -1,7 +1,6 @@
 """The flight that a pilot flies against: a lap from standstill, then flying laps, at any time."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Literal, NamedTuple
 
 import jax
@@ -17,7 +16,6 @@ from flytrack_env.resets import ResetParams
 from flytrack_env.state import POSITION, VELOCITY
 
 Kind = Literal["reference", "champion", "none"]
-CHAMPION = "champion/flytrack.safetensors"  # in baselines.purejaxrl_ppo
 CHAMPION_NEEDS = "expected 2 or more: fly on its own track, flytrack, without --model"
 MAX_STEPS, NUM_LAPS = 6000, 3  # of the champion's flight
 STILL_START = ResetParams(0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # no noise, full, never on the course
@@ -121,7 +119,7 @@ def fly_champion(
     import baselines.purejaxrl_ppo as baseline  # needs the extra
     from baselines.purejaxrl_ppo.flights import fly_episode
 
-    champion = baseline.load_checkpoint(Path(baseline.__file__).parent / CHAMPION)
+    champion = baseline.load_checkpoint("champion")
     model = model or model_from_json(champion.meta["model"], "checkpoint: model")
     env = make(champion.env_id, track=track, model=model)
     params = still_start(env.default_params, MAX_STEPS)

@@ -37,6 +37,11 @@ MAX_HEADER_BYTES = 2**23  # the description of a track of ten thousand gates
 MAX_DIFFERENCES = 12  # in one message
 
 FINAL = f"final{SUFFIX}"
+# Names of the shipped policies, which docs/results/champion.md describes.
+SHIPPED = {
+    name: Path(__file__).parent / "champion" / f"{stem}{SUFFIX}"
+    for name, stem in (("champion", "flytrack"), ("robust", "robust"))
+}
 STEP_FILE = re.compile(rf"step_(\d+)\{SUFFIX}")
 REWARD = "reward."  # prefix of the reward's weights among the environment's parameters
 # What a run that continues must have in common with its checkpoint, beside its configuration.
@@ -255,13 +260,17 @@ def save_run(path: Path, runner: Runner, config: Config, description: dict[str, 
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
-    """Return the checkpoint in a file.
+    """Return the checkpoint in a file, or a shipped one by its name: ``champion``, ``robust``.
+
+    A file of such a name comes first.
 
     Raises:
         CheckpointError: missing or damaged file, another format, or parameters that do not belong
             to the network that the file describes.
     """
     path = Path(path)
+    if not path.is_file():
+        path = SHIPPED.get(str(path), path)
     if path.is_dir():
         files = ", ".join(sorted(file.name for file in path.glob(f"*{SUFFIX}"))) or "there is none"
         raise CheckpointError(f"{path}: found a folder, expected a checkpoint file in it: {files}")

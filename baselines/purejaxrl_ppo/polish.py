@@ -28,6 +28,10 @@ from flytrack_env.tracks import cross_gate
 QUADRATIC_OFFSET = 0.1
 
 
+class LostError(ValueError):
+    """A policy that does not race; the message says in which flights, and what was expected."""
+
+
 class Settings(NamedTuple):
     """How a policy is polished.
 
@@ -133,7 +137,7 @@ def polish(
     policy: Policy,
     seed: int,
     settings: Settings = Settings(),  # noqa: B008, a tuple of constants
-    draw_model: Callable[[jax.Array], ModelParameters] | None = None,
+    draw_model: Callable[[jax.Array, jax.Array], ModelParameters] | None = None,
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> Any:
     """Return the parameters of a policy that races faster.
@@ -143,19 +147,22 @@ def polish(
         policy: that races already.
         seed: of the flights.
         settings: see ``Settings``.
-        draw_model: from a key, the model of one flight; that of the environment if None.
+        draw_model: from a key and the share of the updates that is done, the model of one flight;
+            that of the environment if None.
         report: called with the number of updates done and of all.
 
     Raises:
-        ValueError: no flight of an update passes all gates.
+        LostError: no flight of an update passes all gates.
     """
     params = start_pose_params(env.default_params, 10**6)
     last_gate = settings.laps * params.course.num_gates
     optimizer = optax.adam(optax.cosine_decay_schedule(settings.learning_rate, settings.updates))
 
-    def compute_cost(policy_params: Any, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def compute_cost(
+        policy_params: Any, key: jax.Array, done: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         key_model, key_start = jax.random.split(key)
-        own = params if draw_model is None else params.replace(model=draw_model(key_model))
+        own = params if draw_model is None else params.replace(model=draw_model(key_model, done))
         flown = fly(env, Policy(policy.network, policy_params), key_start, own, settings)
         is_complete = flown.gates >= last_gate
         return jnp.where(
@@ -164,11 +171,11 @@ def polish(
 
     @partial(jax.jit, donate_argnums=(0, 1))
     def update(
-        policy_params: Any, optimizer_state: Any, key: jax.Array
+        policy_params: Any, optimizer_state: Any, key: jax.Array, done: jax.Array
     ) -> tuple[Any, Any, jax.Array]:
         keys = jax.random.split(key, settings.flights)
-        gradients, is_complete = jax.vmap(jax.grad(compute_cost, has_aux=True), (None, 0))(
-            policy_params, keys
+        gradients, is_complete = jax.vmap(jax.grad(compute_cost, has_aux=True), (None, 0, None))(
+            policy_params, keys, done
         )
         num_complete = is_complete.sum()
         gradient = jax.tree.map(
@@ -184,9 +191,12 @@ def polish(
     optimizer_state = optimizer.init(policy_params)
     keys = jax.random.split(jax.random.key(seed), settings.updates)
     for done, key in enumerate(keys, start=1):
-        policy_params, optimizer_state, num_complete = update(policy_params, optimizer_state, key)
+        share = jnp.float32((done - 1) / settings.updates)
+        policy_params, optimizer_state, num_complete = update(
+            policy_params, optimizer_state, key, share
+        )
         if int(num_complete) == 0:
-            raise ValueError(
+            raise LostError(
                 f"policy: found none of {settings.flights} flights that passed {last_gate} gates "
                 f"within {settings.laps * settings.slowest_lap_s:g} s, expected one that already "
                 "races"

@@ -20,6 +20,7 @@ import tyro
 
 import flytrack_env
 from baselines.purejaxrl_ppo.checkpoint import (
+    SHIPPED,
     Checkpoint,
     load_checkpoint,
     observation_layout,
@@ -33,7 +34,6 @@ from baselines.purejaxrl_ppo.ppo import Metrics, Runner, make_ppo
 from flytrack_env.model_file import model_from_json
 from flytrack_env.multi_drone import MultiDroneRace, Opponent, Versus, VersusParams
 
-CHAMPION = Path(__file__).parent / "champion" / "flytrack.safetensors"
 FIRST_LAYER = "layers_0"
 # Small steps, and nearly deterministic actions: the first policy races already, and noise would
 # undo it.
@@ -45,7 +45,7 @@ NUM_LAPS, NUM_RACE_STEPS = 3, 1500  # 15 s: the champions need 12
 class Settings:
     """Settings of self-play, which are the flags of the command."""
 
-    opponent: Path = CHAMPION
+    opponent: Path = SHIPPED["champion"]
     """Checkpoint of the policy that stays in the pool; the learner begins as a copy of it."""
     out: Path = Path("runs/self_play")
     """Folder of final.safetensors."""

@@ -342,7 +342,7 @@ class HiddenDrone:
         self._onset_s = -math.inf if truth.onset_s is None else truth.onset_s + settle_s
         self.battery_v = self.loaded_v()
         self._air_w = tuple(truth.effects.get("wind", {}).get(name, 0.0) for name in AIR_VELOCITY)
-        self._turning_b: Vector = (0.0, 0.0, 0.0)
+        self.turning_b: Vector = (0.0, 0.0, 0.0)
         self.felt = Felt(self.force_b, self.rates_b, self.rates_b)
         self.tracked = Tracked(self.pos_w, self.vel_w, self.quat)
         asymmetry = truth.effects.get("thrust_lag_asymmetry", {}).get("ratio", 1.0)
@@ -498,11 +498,11 @@ class HiddenDrone:
             add(pos_w, scale(half_s, vel_w)),
             add(vel_w, scale(half_s, self.acc_w)),
         )
-        rates = self._asked(turn(quat, self._turning_b, half_s))
+        rates = self._asked(turn(quat, self.turning_b, half_s))
         if self._loop is not None:
             before = self._loop.rates_b
             rates = scale(0.5, add(before, self._loop.follow(rates, part_s)))
-        self._turning_b = rates = self._add("turn", rates)
+        self.turning_b = rates = self._add("turn", rates)
         self.force_b, self.pos_w, self.vel_w = self._force(), pos_w, vel_w
         self._accelerate(part_s)
         self.quat = turn(quat, rates, part_s)
@@ -550,7 +550,7 @@ class HiddenDrone:
     def _set_slope(self, command: Sticks) -> None:
         """Set how fast the applied thrust stick moves at this instant."""
         away = command[3] - self.applied[3]
-        self.thrust_stick_slope = away / (self._taus[3] if away >= 0.0 else self._taus[4])
+        self.thrust_stick_slope = away / where(away >= 0.0, self._taus[3], self._taus[4])
 
     def _see(self, quat: Quaternion) -> None:
         """Set what depends on an attitude: airspeed and thrust."""

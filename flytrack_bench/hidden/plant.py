@@ -9,7 +9,7 @@ import numpy as np
 from flytrack_bench.hidden import drone as equations
 from flytrack_bench.hidden.drone import HiddenDrone, Start
 from flytrack_bench.hidden.laws import STATELESS_KINDS
-from flytrack_bench.hidden.truth import DT_S, Truth
+from flytrack_bench.hidden.truth import DT_S, MOTIONS, Truth
 from flytrack_bench.hidden.vectors import Number, Quaternion, Vector
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.plants import Plant
@@ -37,6 +37,7 @@ class HiddenState(NamedTuple):
     open_v: Number
     past: tuple[tuple[Number, ...], ...]
     has_flown: Any
+    turning_b: Vector
 
 
 class HiddenPlant(Plant):
@@ -60,7 +61,7 @@ class HiddenPlant(Plant):
                 f"outside: found {truth.outside.kind!r}, expected one of {STATELESS_KINDS}"
             )
         accepted: dict[str, tuple[Any, ...]] = {
-            "motion": ("handout", "semi_implicit"),
+            "motion": MOTIONS,
             "step_s": (DT_S,),
             "gust": (None,),
             "onset_s": (None,),
@@ -77,6 +78,7 @@ class HiddenPlant(Plant):
         hidden = self._hidden()
         for name in ("pos_w", "vel_w", "acc_w", "quat", "rates_b", "applied"):
             setattr(hidden, name, tuple(getattr(drone, name)))
+        hidden.turning_b = tuple(drone.rates_b)
         hidden.open_v = 0.0
         hidden.open_v = drone.battery_v - hidden.loaded_v()
         state = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), _state_of(hidden))

@@ -25,6 +25,7 @@ exp = _either(math.exp, jnp.exp)
 expm1 = _either(math.expm1, jnp.expm1)
 tanh = _either(math.tanh, jnp.tanh)
 sqrt = _either(math.sqrt, jnp.sqrt)
+sin = _either(math.sin, jnp.sin)
 cos = _either(math.cos, jnp.cos)
 acos = _either(math.acos, jnp.arccos)
 atan2 = _either(math.atan2, jnp.arctan2)
@@ -89,8 +90,9 @@ def turn(quat: Quaternion, rates_b: Vector, step_s: float) -> Quaternion:
     """Return the attitude after a time at constant body rates, rad/s, exactly."""
     rate = norm(rates_b)
     half = 0.5 * rate * step_s
-    share = math.sin(half) / rate if rate > 0.0 else 0.0
-    return multiply(quat, (math.cos(half), *scale(share, rates_b)))
+    is_turning = rate > 0.0
+    share = where(is_turning, sin(half) / where(is_turning, rate, 1.0), 0.0)
+    return multiply(quat, (cos(half), *scale(share, rates_b)))
 
 
 def add(first: Vector, second: Vector) -> Vector:

@@ -17,8 +17,8 @@ MIN_CORRELATION = 0.5  # of the force with the command, on either side of 0
 CLEAR, FLOWN = 0.9, (0.02, 0.98)  # correlation, and quantiles of the commands, for the hover
 MIN_SPREAD = 0.5  # m/s^2, rms of the force about its mean: less is drag and noise
 PWM = (900.0, 2200.0)  # us, all that flight controllers use
-# Command of no thrust: -1 in a range of -1 to 1, 0 in one of 0 to 1. Idling motors make it lower.
-NO_THRUST_AT = -0.5
+# Commands span less in races at full thrust, 0.12 in one that passed for 0..1: no curve shows.
+MIN_SPAN = 0.15
 MIN_TORQUE = 0.3  # correlation of the rotation with a motor's torque
 MOTOR_LAG_S = 0.03
 UP = np.array([0.0, 0.0, 1.0])
@@ -80,6 +80,8 @@ def thrust_changes(log: FlightLog) -> list[Change]:
         return []
     if found.correlation < 0.0:
         return [Change("u_thrust", "axes", "-")]
+    if np.ptp(found.commands) < MIN_SPAN:
+        return []
     # Thrust is between linear and quadratic in the command above that of no thrust.
     errors = {}
     for zero in (-1.0, 0.0):

@@ -452,6 +452,7 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
         lift=craft.summarize_lift(linearization, selection.model, refined, flying),
         outliers=outliers,
         learned=learned,
+        joint=summary.estimate_joint(linearization, named.extended, refined),
     )
 
 

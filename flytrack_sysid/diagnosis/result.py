@@ -160,6 +160,20 @@ class Changed:
 
 
 @dataclass(frozen=True)
+class Joint:
+    """Joint uncertainty of those parameters of the extended model that the log was fitted by.
+
+    Attributes:
+        names: of the parameters, as in ``flytrack_sysid.inference.parameters``.
+        covariance: of their values, (names, names), one standard deviation; large where the log
+            determines nothing.
+    """
+
+    names: tuple[str, ...] = ()
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+
+
+@dataclass(frozen=True)
 class Prediction:
     """Held-out RMS errors of free flights from measured states, and where they are evidence.
 
@@ -250,6 +264,7 @@ class Diagnosis:
         lift: by model, if the log shows the thrust.
         outliers: by channel, if any.
         learned: a law for what is unexplained, part of the extended model.
+        joint: how uncertain the extended model's parameters are together.
     """
 
     verdict: str
@@ -274,6 +289,7 @@ class Diagnosis:
     lift: Mapping[str, Lift] = field(default_factory=dict)
     outliers: Mapping[str, Outliers] = field(default_factory=dict)
     learned: Learned | None = None
+    joint: Joint = field(default_factory=Joint)
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of diagnosis.json, with the names of its schema and six digits."""

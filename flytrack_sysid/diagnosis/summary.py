@@ -30,6 +30,7 @@ from flytrack_sysid.diagnosis.result import (
     Changed,
     Errors,
     Estimated,
+    Joint,
     NotIdentifiable,
     Prediction,
     Unexplained,
@@ -552,6 +553,27 @@ def changed_parameters(
         ends, unit = (value - half, value + half), range_of(name).unit
         result.append(Changed(name, float(problem.start[index]), value, ends, unit, bound))
     return tuple(result)
+
+
+def estimate_joint(linearization: Linearization, extended: FittedModel, refined: Refined) -> Joint:
+    """Return the joint uncertainty of the parameters that the log was fitted by.
+
+    Single steps say what the log determines at all. Flights, where they were fitted, add how much
+    parts of the log disagree, which few parts show in few directions only: so both are summed.
+    """
+    problem, fit = refined.problem, refined.fit
+    columns = [linearization.indices.index(index) for index in extended.indices]
+    acting = [linearization.indices[column] for column in linearization.acting(columns)]
+    if not acting:
+        return Joint()
+    names = tuple(problem.names[index] for index in acting)
+    covariance = Marginal(linearization, extended, names).covariance()
+    if fit is not None:
+        rows = [row for row, index in enumerate(acting) if index in fit.indices]
+        own = [fit.indices.index(acting[row]) for row in rows]
+        of_flights = fit.covariance[np.ix_(own, own)] / TWO_SIDED_95**2
+        covariance[np.ix_(rows, rows)] += of_flights
+    return Joint(names, covariance)
 
 
 def refinement_notes(refined: Refined, model: FittedModel) -> list[str]:

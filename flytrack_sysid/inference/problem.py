@@ -604,7 +604,7 @@ def split_seconds(values: np.ndarray) -> np.ndarray:
     rows_per_s = kept.shape[-4] // CHUNK_S
     split = kept.reshape(*kept.shape[:-4], CHUNK_S, rows_per_s, *kept.shape[-3:])
     split = np.moveaxis(split, (-5, -3), (0, 1))
-    return split.reshape(*split.shape[:-3], -1)
+    return split.reshape(*split.shape[:-3], math.prod(split.shape[-3:]))
 
 
 def split_blocks(values: np.ndarray) -> np.ndarray:
@@ -614,4 +614,4 @@ def split_blocks(values: np.ndarray) -> np.ndarray:
 
 def merge_seconds(values: np.ndarray) -> np.ndarray:
     """Reshape (CHUNK_S, chunks, ...) to (blocks, ...)."""
-    return values.reshape(-1, *values.shape[2:])
+    return values.reshape(math.prod(values.shape[:2]), *values.shape[2:])

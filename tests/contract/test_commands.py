@@ -95,6 +95,7 @@ def test_without_its_extra_a_command_helps_and_says_what_to_install(name, tmp_pa
         "collect": "--out o",
         "diagnose": "log --out o",
         "import": "f --format csv --out o",
+        "adapt": "log --out o",
     }
     blocked = "tqdm,matplotlib,rerun,optax,distrax,onnx,safetensors,mlflow,pygame"
     line = [sys.executable, "-c", WITHOUT, blocked, name, *words.get(name, "").split()]

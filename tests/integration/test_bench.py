@@ -13,9 +13,10 @@ from benchmarks import suite as drawn
 from benchmarks.champion import CHAMPION
 from flytrack.cli import main
 from flytrack_bench import Data, DataError, load_policy, load_suite, results, retrain
-from flytrack_bench.policies import Function, Policy
+from flytrack_bench.policies import Function, Policy, PolicyError
 from flytrack_bench.suite import FOLDER, digest_of
 from flytrack_env.tracks import TrackError, load_track
+from flytrack_loop.adapt import Adapted
 from tests.support.refusals import refused
 
 CENTRED = "tests.integration.test_bench:hover"
@@ -93,6 +94,22 @@ def test_no_more_data_is_flown_than_allowed(small):
     assert 55 <= len(log) <= 60 and log.time.max() < 0.6  # some rows are lost, as sensors lose them
     with pytest.raises(DataError, match=r"found 0.6, expected at most the 0.4 s left"):
         data.fly(policy, 0.6)
+
+
+def test_a_checkpoint_is_adapted_to_all_data_and_a_function_is_refused(small, monkeypatch):
+    suite, robust = load_suite(small), load_policy("robust")
+    logs = []
+    monkeypatch.setattr(
+        retrain,
+        "adapt",
+        lambda log, checkpoint: logs.append(log) or Adapted(None, checkpoint, False),
+    )
+    data = Data(suite.tasks[1], suite, seconds=0.8)
+    adapted = retrain.adapt_to_flight(data, robust)
+    assert data.seconds_left == 0.0 and 75 <= len(logs[0]) <= 80
+    assert adapted.checkpoint is robust.checkpoint and adapted.name == "robust, adapted"
+    with pytest.raises(PolicyError, match="found hover, expected a checkpoint"):
+        retrain.adapt_to_flight(data, Policy("hover", Function(hover), None, None, ""))
 
 
 def test_the_interval_covers_the_spread_of_seeds():

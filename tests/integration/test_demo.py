@@ -25,6 +25,7 @@ def test_demo_writes_everything(tmp_path):
     summary = json.loads((out / "summary.json").read_text())
     assert summary["noisy_starts"]["episodes"] == 16
     assert load_model(out / "model.json").tau.shape == (4,)
+    assert summary["adapted"] is None and "not adapted: " in text.getvalue()  # nothing was learned
     assert "noisy starts finish 3 laps" in text.getvalue()
     with pytest.raises(SystemExit):
         main(arguments)  # it does not overwrite a run

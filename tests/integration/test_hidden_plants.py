@@ -246,6 +246,12 @@ def test_the_flight_is_that_in_plain_floats(names):
     check_flight(truth, base if names else None, rng)
 
 
+def test_fine_motion_is_that_in_plain_floats():
+    rng = np.random.default_rng(7)
+    truth = replace(hidden.with_effects(hidden.draw_base(rng), ("rotor_drag",), rng), motion="fine")
+    check_flight(truth, replace(truth, motion="handout"), rng)
+
+
 @pytest.mark.parametrize("kind", slow_but(STATELESS_KINDS[:1], STATELESS_KINDS))
 def test_a_law_outside_the_list_acts_as_in_plain_floats(kind):
     number = STATELESS_KINDS.index(kind)

@@ -11,10 +11,13 @@ from baselines.purejaxrl_ppo.checkpoint_env import plant_env
 from baselines.purejaxrl_ppo.flights import Score, fly_many
 from benchmarks.champion import CHAMPION
 from benchmarks.loop.plants import draw_plant
+from flytrack.cli import main
+from flytrack_bench import load_suite
 from flytrack_bench.hidden import HiddenPlant
 from flytrack_env import nominal_parameters
-from flytrack_loop import Gap, errors_of
+from flytrack_loop import Gap, errors_of, fly_log, race
 from flytrack_loop.stages import log_of_flights, measure_gap
+from flytrack_sysid import save_log
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +72,22 @@ def test_the_gap_is_between_the_plant_and_the_simulator_learnt_in(champion):
     assert set(lost.effects) == {"thrust_scale"} and lost.effects["thrust_scale"]["factor"] < 1.0
     gap = measure_gap(champion, HiddenPlant(lost), seed=1, episodes=8)
     assert gap.simulator.success == 1.0 > gap.plant.success
+
+
+@pytest.mark.slow
+def test_a_policy_that_crashes_on_a_hidden_plant_is_adapted_to_ten_seconds_of_it(tmp_path):
+    """The plant has equations of its own; the log is what common sensors measure."""
+    craft = load_suite("v1").chosen(("plant_1",))[0].craft
+    plant, policy = HiddenPlant(craft), load_checkpoint("robust")
+    log = fly_log(plant, policy, 3, 10.0, 1.0)
+    save_log(tmp_path / "race.npz", log.select(np.arange(len(log)) < 1000))
+    new = tmp_path / "new.safetensors"
+    main(["adapt", str(tmp_path / "race.npz"), "--checkpoint", "robust", "--out", str(new)])
+    old, adapted = (
+        race(one, plant_env(one, plant), 5, 64) for one in (policy, load_checkpoint(new))
+    )
+    assert old.success < 0.1 and adapted.success > 0.9
+    assert adapted.flying_lap_s < 3.6
 
 
 def test_a_policy_without_laps_has_no_gap():

@@ -9,7 +9,6 @@ from numpy.testing import assert_allclose
 import flytrack_env
 from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.self_play import (
-    CHAMPION,
     Settings,
     fly_races,
     main,
@@ -21,7 +20,7 @@ from baselines.purejaxrl_ppo.self_play import (
 from flytrack_env.model_file import model_from_json
 from flytrack_env.multi_drone import MultiDroneRace
 
-START = load_checkpoint(CHAMPION)
+START = load_checkpoint("champion")
 ENV = flytrack_env.make("FlyTrack-v0", model=model_from_json(START.meta["model"], "model"))
 RACE = MultiDroneRace(ENV, 2, "first")
 

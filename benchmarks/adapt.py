@@ -1,0 +1,298 @@
+"""What ``flytrack adapt`` makes of ten seconds of flight: ``python -m benchmarks.adapt [--page]``.
+
+The shipped robust policy flies the hidden plants of suite v1 in three motions, and is adapted to
+each by the log of that flight. Beside it fly the policy as it was, and the same descent on the
+refitted base model, without any name. Between them come plants without effects that the policy
+claims to be made for: nothing is to be adapted to. Appends a line a trial to
+docs/results/adapt.jsonl, and a later run resumes there; ``--page`` writes docs/results/adapt.md.
+"""
+
+import time
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from baselines.purejaxrl_ppo import Checkpoint, load_checkpoint
+from baselines.purejaxrl_ppo.checkpoint_env import plant_env
+from baselines.purejaxrl_ppo.flights import fly_many
+from benchmarks import report
+from benchmarks.diagnosis import model_of
+from benchmarks.loop.plants import draw_base
+from flytrack_bench import load_suite
+from flytrack_bench.hidden import MOTIONS, HiddenPlant
+from flytrack_env import Motion, nominal_parameters
+from flytrack_env.effects import BY_NAME
+from flytrack_env.model_file import model_as_json, model_from_json
+from flytrack_loop import race
+from flytrack_loop.adapt import Adapted, Settings, adapt, improve
+from flytrack_loop.stages import BATCH, MIN_ROWS, rounded
+from flytrack_sysid import Diagnosis, FlightLog, log_of_states
+from flytrack_sysid.diagnosis.plausible import PlausibleModels
+from flytrack_sysid.inference.parameters import to_vector
+from flytrack_sysid.sensors import measure
+
+LINES = report.RESULTS / "adapt.jsonl"
+POLICY, DT_S, NUM_LAPS, NUM_STEPS = "robust", 0.01, 25, 1000
+PLANT, UNCHANGED = "plant", "unchanged"
+NUM_PLANTS, NUM_UNCHANGED = 8, 20
+AS_MODELS = {"handout": "handout", "semi_implicit": "semi_implicit", "fine": "continuous"}
+ENTRIES = ("nothing", "refitted base", "adapted")
+STARTS, START_SEED = 256, 7
+
+
+class Trial(NamedTuple):
+    """A plant, its motion, the seconds in its log, and the seed of flights, draws and starts."""
+
+    kind: str
+    number: int
+    motion: str
+    seconds: float
+    seed: int
+
+
+def list_trials(seconds: float, seed: int) -> list[Trial]:
+    """Return all trials; kinds and motions are even among the first ones."""
+    plants = [
+        Trial(PLANT, 1 + index, MOTIONS[(index + turn) % len(MOTIONS)], seconds, seed)
+        for turn in range(len(MOTIONS))
+        for index in range(NUM_PLANTS)
+    ]
+    unchanged = [
+        Trial(UNCHANGED, index, MOTIONS[index % len(MOTIONS)], seconds, seed)
+        for index in range(NUM_UNCHANGED)
+    ]
+    mixed = []
+    for index, trial in enumerate(plants):
+        mixed += [trial, *unchanged[2 * index : 2 * index + 2]]
+    return mixed
+
+
+def fly(plant: HiddenPlant, policy: Checkpoint, seconds: float, seed: int) -> FlightLog:
+    """Return what common sensors log of a policy's flights, of so many seconds in all.
+
+    An accelerometer feels the force in the axes in which it acts, which depend on the motion.
+    """
+    env = plant_env(policy, plant)
+    flown = fly_many(env, policy.policy, seed, BATCH, NUM_STEPS, NUM_LAPS)
+    flights = []
+    for number, is_flying in enumerate(np.asarray(flown.is_flying)):
+        if is_flying.sum() >= MIN_ROWS:
+            states, actions = (np.asarray(leaf[number]) for leaf in (flown.states, flown.actions))
+            flights.append((states[is_flying], actions[is_flying]))
+    log = log_of_states(flights, DT_S, f"flights of {POLICY}")
+    log = log.select(np.arange(len(log)) < round(seconds / DT_S))
+    gravity = float(nominal_parameters().g)
+    if plant.truth.motion != "handout":
+        log = replace(log, channels={**log.channels, "a": felt_after_step(log, gravity)})
+    return measure(log, 1.0, gravity, np.random.default_rng(seed))
+
+
+def felt_after_step(log: FlightLog, gravity: float) -> np.ndarray:
+    """Return accelerations that ``measure`` reads as the force in the axes after each step."""
+    attitude = Rotation.from_quat(log["q"], scalar_first=True)
+    before = Rotation.from_quat(
+        log["q"][np.arange(len(log)) - np.where(log.is_start(), 0, 1)], scalar_first=True
+    )
+    lifted = log["a"] + [0.0, 0.0, gravity]
+    return (before * attitude.inv()).apply(lifted) - [0.0, 0.0, gravity]
+
+
+def raced(policy: Checkpoint, plant: HiddenPlant) -> dict[str, Any]:
+    """Return the share of starts that finish, and the mean flying lap, s."""
+    found = race(policy, plant_env(policy, plant), START_SEED, STARTS)
+    return {"success": found.success, "flying_lap_s": rounded(found.flying_lap_s)}
+
+
+def lap_of(entry: dict[str, Any]) -> str:
+    """Return who finishes, and the flying lap."""
+    lap_s = entry["flying_lap_s"]
+    return f"{entry['success']:.1%}, " + ("-" if lap_s is None else f"{lap_s:.3f} s")
+
+
+def figures(plants: list[dict[str, Any]], unchanged: list[dict[str, Any]]) -> list[report.Figure]:
+    """Return the figures of the page, of trials that were not refused."""
+    count = len(plants)
+    lines = [
+        report.Figure(
+            f"hidden plants on which 99 % of starts finish: {name}",
+            "all" if name == "adapted" else "",
+            f"{sum(one['entries'][name]['success'] >= 0.99 for one in plants)} of {count}",
+            count,
+        )
+        for name in ENTRIES
+    ]
+    inside = [
+        low <= one["entries"]["adapted"]["flying_lap_s"] <= high
+        for one in plants
+        if one["expected_lap_s"] and one["entries"]["adapted"]["flying_lap_s"]
+        for low, high in [one["expected_lap_s"]]
+    ]
+    cpu_s = [one["cpu_s"] for one in plants]
+    invented = [
+        any(name in BY_NAME and f"{name}(" not in one["hidden"] for name in one["named"])
+        for one in plants
+    ]
+    kept = [one["is_new"] is False and one["verdict"] == "consistent" for one in unchanged]
+    return [
+        *lines,
+        report.Figure(
+            "mean flying lap within what was expected of a flight",
+            "",
+            f"{sum(inside)} of {len(inside)}",
+            len(inside),
+        ),
+        report.Figure(
+            "hidden plants with a named effect that is not in them",
+            "none",
+            f"{sum(invented)} of {count}",
+            count,
+        ),
+        report.Figure(
+            "CPU s from log to policy, median (all)",
+            "60",
+            f"{np.median(cpu_s):.0f} ({report.spread(cpu_s)})",
+            count,
+        ),
+        report.Figure(
+            "plants that are what the policy was made for: nothing to adapt to",
+            "20 of 20",
+            f"{sum(kept)} of {len(kept)}",
+            len(kept),
+        ),
+    ]
+
+
+def plants_table(plants: list[dict[str, Any]]) -> str:
+    """Return a row for each hidden plant."""
+    rows = []
+    for one in sorted(plants, key=lambda line: (line["number"], line["motion"])):
+        entries = one["entries"]
+        cells = [lap_of(entries[name]) if name in entries else "refused" for name in ENTRIES]
+        expected = one.get("expected_lap_s")
+        cells += ["{:.3f} to {:.3f} s".format(*expected) if expected else "-"]
+        named = ", ".join(one.get("named", ())) or one.get("refused", "nothing")
+        head = [str(one["number"]), one["motion"], one.get("motion_found", "-"), one["flights"]]
+        rows.append([*head, one["hidden"], named, *cells])
+    header = ["plant", "motion", "found", "flights", "hidden", "named", *ENTRIES, "expected"]
+    return report.table(header, rows)
+
+
+def write_page(lines: list[dict[str, Any]]) -> None:
+    """Write the page of lines."""
+    plants = [one for one in lines if one["kind"] == PLANT]
+    unchanged = [one for one in lines if one["kind"] == UNCHANGED]
+    whole = [one for one in plants if "is_new" in one]
+    judged = [one for one in unchanged if "is_new" in one]
+    others = [
+        f"{one['motion']} {one['number']}: {', '.join(one['named']) or one['verdict']}"
+        for one in judged
+        if one["verdict"] != "consistent"
+    ]
+    refused = len(unchanged) - len(judged)
+    text = f"{len(judged)} of {NUM_UNCHANGED} were flown"
+    text += f", and {refused} more refused." if refused else "."
+    if others:
+        text += f" Something was found on {'; '.join(others)}."
+    trials = list_trials(lines[0]["seconds"], lines[0]["seed"])
+    planned = sum(trial.kind == PLANT for trial in trials)
+    report.fill_page(
+        report.RESULTS / "adapt.md",
+        "adapt",
+        seconds=lines[0]["seconds"],
+        seed=lines[0]["seed"],
+        starts=STARTS,
+        figures=report.figures_table(figures(whole, judged)),
+        not_run=f"{len(plants)} of {planned} pairs of plant and motion were flown "
+        f"before the run was stopped, {len(plants) - len(whole)} of them refused as a log.",
+        plants=plants_table(plants),
+        unchanged=text,
+        commit=lines[-1]["commit"],
+        machine=lines[-1]["machine"],
+    )
+
+
+def measure_trial(trial: Trial) -> dict[str, Any]:
+    """Return what is made of a trial's plant."""
+    return measure_unchanged(trial) if trial.kind == UNCHANGED else measure_plant(trial)
+
+
+def measure_plant(trial: Trial) -> dict[str, Any]:
+    """Return what each way makes of a hidden plant's log."""
+    craft = load_suite("v1").chosen((f"plant_{trial.number}",))[0].craft
+    assert craft is not None
+    plant, policy = HiddenPlant(replace(craft, motion=trial.motion)), load_checkpoint(POLICY)
+    log = fly(plant, policy, trial.seconds, trial.seed)
+    result: dict[str, Any] = {"hidden": craft.text(), "flights": len(np.unique(log.segment))}
+    entries = result["entries"] = {"nothing": raced(policy, plant)}
+    begun_s = time.process_time()
+    try:
+        found = adapt(log, policy, trial.seed)
+    except ValueError as error:
+        return {**result, "refused": str(error)}
+    result["cpu_s"] = round(time.process_time() - begun_s, 1)
+    result |= about(found)
+    entries["adapted"] = raced(found.checkpoint, plant)
+    refitted = adapt_to_base(policy, found.diagnosis, trial.seed)
+    entries["refitted base"] = raced(refitted.checkpoint, plant)
+    return result
+
+
+def about(found: Adapted) -> dict[str, Any]:
+    """Return what an adaptation found, and the flying lap that it expects, 95 %, s."""
+    diagnosis, new = found.diagnosis, found.new
+    expected = None
+    if new is not None and new.is_complete.any():
+        expected = np.quantile(new.lap_s[new.is_complete], (0.025, 0.975)).round(3).tolist()
+    return {
+        "motion_found": diagnosis.extended.motion.value,
+        "named": [cause.effect for cause in diagnosis.causes],
+        "verdict": diagnosis.verdict,
+        "is_new": found.is_new,
+        "expected_lap_s": expected,
+    }
+
+
+def adapt_to_base(policy: Checkpoint, diagnosis: Diagnosis, seed: int) -> Adapted:
+    """Return a policy adapted to the refitted base model of a diagnosis, without any name."""
+    base = diagnosis.base
+    vector = to_vector(base)
+    exact = PlausibleModels(base, vector, np.zeros((len(vector), 1)), vector, vector)
+    own = model_from_json(policy.meta["model"], "model")
+    return improve(policy, own, exact, diagnosis, seed, Settings(), lambda unit: ignore)
+
+
+def ignore(done: int, total: int) -> None:
+    """Show no progress."""
+
+
+def measure_unchanged(trial: Trial) -> dict[str, Any]:
+    """Return what is made of a plant without effects that the policy claims to be made for."""
+    rng = np.random.default_rng([trial.seed, trial.number, NUM_UNCHANGED])
+    truth = replace(draw_base(rng), motion=trial.motion)
+    model = model_of(truth)._replace(motion=Motion(AS_MODELS[trial.motion]))
+    policy = load_checkpoint(POLICY)
+    policy = policy._replace(meta={**policy.meta, "model": model_as_json(model)})
+    log = fly(HiddenPlant(truth), policy, trial.seconds, trial.seed + trial.number)
+    begun_s = time.process_time()
+    try:
+        found = adapt(log, policy, trial.seed)
+    except ValueError as error:
+        return {"refused": str(error)}
+    return {**about(found), "cpu_s": round(time.process_time() - begun_s, 1)}
+
+
+def main(seconds: float = 10.0, seed: int = 0, page: bool = False) -> None:
+    """Run the trials that are missing, or write the page of those that are there.
+
+    seconds: of flight in a log. seed: of flights, draws and starts. page: write the page only.
+    """
+    if page:
+        write_page(report.lines_of_commit(LINES))
+    else:
+        report.record_trials(LINES, list_trials(seconds, seed), measure_trial, 1)
+
+
+if __name__ == "__main__":
+    report.command(main)

@@ -1,0 +1,237 @@
+"""Adaptation: plausible models, the way to them, what is refused, and what is said."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint
+from baselines.purejaxrl_ppo.checkpoint import SHIPPED
+from flytrack_env import nominal_parameters
+from flytrack_env.dynamics import step
+from flytrack_env.effects import WIND, CommandDelay, LinearDrag, QuadraticDrag
+from flytrack_env.model_file import model_from_json
+from flytrack_loop import adapt as adapting
+from flytrack_loop.adapt import Adapted, Judged, Settings, adapt, describe_adapted, embed
+from flytrack_sysid import LogError
+from flytrack_sysid.check.thrust import thrust_changes
+from flytrack_sysid.diagnosis import Cause, Diagnosis, Unexplained
+from flytrack_sysid.diagnosis.plausible import find_plausible_models
+from flytrack_sysid.diagnosis.result import Joint
+from flytrack_sysid.inference.parameters import THRUST_COEFFS, names_of, to_vector
+from flytrack_sysid.inference.problem import split_blocks
+from tests.support.evaluated import write_checkpoint
+from tests.support.handout_plant import HandoutPlant, excited
+
+NOMINAL = nominal_parameters()
+DRAG = NOMINAL.with_effects(LinearDrag(0.3, 0.2, 0.1))
+CAUSE = Cause("linear_drag", (), "force", {}, 100.0, 30.0, 100.0, 90.0)
+STICKS = np.linspace(-1.0, 1.0, 9)
+FULL_V = 24.0
+
+
+def thrust(coeffs, stick, volt=FULL_V):
+    """The handout's thrust map."""
+    powers = [np.ones_like(stick), stick, stick**2, stick**3, volt + 0.0 * stick, volt * stick]
+    return np.stack(powers, axis=-1) @ np.asarray(coeffs, float)
+
+
+def diagnosis(extended, joint=Joint(), causes=(CAUSE,), unexplained=Unexplained()):  # noqa: B008
+    rest = (NOMINAL, NOMINAL, extended, {}, "log.npz", "0" * 64)
+    return Diagnosis("causes_found", causes, unexplained, (), {}, *rest, joint=joint)
+
+
+def seen_at(sticks, std_n):
+    """Return the covariance of a thrust map that was fitted at some sticks and 24 V."""
+    rows = np.stack([thrust(one, sticks) for one in np.eye(6)], axis=1)
+    return np.linalg.inv(rows.T @ rows / std_n**2 + 1e-6 * np.eye(6))
+
+
+def test_only_thrust_that_was_flown_is_the_logs():
+    flown = np.linspace(0.6, 1.0, 9)
+    truth = np.asarray(NOMINAL.thrust_coeffs, float)
+    # N, of 1, u, u^2, u^3: 0.01 N at the sticks that were flown, and -23 N at the lower end.
+    fitted = truth + 4.0 * np.array([-0.48, 1.88, -2.4, 1.0, 0.0, 0.0])
+    assert np.abs(thrust(fitted, STICKS) - thrust(truth, STICKS)).max() > 5.0
+    extended = DRAG._replace(thrust_coeffs=1.1 * fitted)
+    models = find_plausible_models(diagnosis(extended, Joint(THRUST_COEFFS, seen_at(flown, 0.05))))
+    mean = np.asarray(models.model.thrust_coeffs, float)
+    assert_allclose(thrust(mean, flown), thrust(1.1 * fitted, flown), atol=0.2)
+    assert_allclose(thrust(mean, STICKS), 1.1 * thrust(truth, STICKS), atol=1.5)
+    drawn = jax.vmap(models.draw)(jax.random.split(jax.random.key(0), 400))
+    maps = np.asarray(drawn.thrust_coeffs, float)
+    spread = np.std([thrust(one, STICKS) for one in maps], axis=0)
+    assert spread[-1] < 0.1 < 0.5 < spread[0] < 5.0
+    assert_allclose(drawn.effects[0].d_x, 0.3, rtol=1e-6)  # known exactly here
+
+
+def test_draws_have_the_covariance_of_the_log_and_stay_in_range():
+    names = ("tau_roll", "linear_drag.d_x", "linear_drag.d_y")
+    covariance = np.array([[1e-6, 0.0, 0.0], [0.0, 4e-4, 3e-4], [0.0, 3e-4, 4e-4]])
+    models = find_plausible_models(diagnosis(DRAG, Joint(names, covariance)))
+    drawn = jax.vmap(models.draw_vector)(jax.random.split(jax.random.key(1), 4000))
+    own = np.asarray(drawn, float)[:, [names_of(DRAG).index(name) for name in names]]
+    assert_allclose(own.mean(axis=0), [NOMINAL.tau[0], 0.3, 0.2], atol=2e-3)
+    assert_allclose(np.cov(own.T), covariance, atol=3e-5)
+    late = Joint(("command_delay.delay_s",), np.array([[1e-4]]))
+    wide = find_plausible_models(diagnosis(NOMINAL.with_effects(CommandDelay(0.005)), late))
+    delays_s = jax.vmap(wide.draw)(jax.random.split(jax.random.key(1), 50)).effects[0].delay_s
+    assert delays_s.min() == 0.0 < 0.02 < delays_s.max()
+
+
+@pytest.mark.parametrize("cause, drain", [("battery_drain", 9.0), ("linear_drag", 1.0)])
+def test_a_drain_that_no_cause_names_is_that_of_the_model(cause, drain):
+    joint = Joint(("battery_drain_v_per_min",), np.array([[0.25]]))
+    extended = DRAG._replace(battery_drain_v_per_min=9.0)
+    models = find_plausible_models(
+        diagnosis(extended, joint, (CAUSE, replace(CAUSE, effect=cause)))
+    )
+    assert models.model.battery_drain_v_per_min == drain
+    drawn = jax.vmap(models.draw)(jax.random.split(jax.random.key(2), 50))
+    assert (np.std(drawn.battery_drain_v_per_min) > 0.1) == (cause == "battery_drain")
+
+
+def test_a_model_in_the_structure_of_another_flies_as_it_did():
+    own = NOMINAL.with_effects(QuadraticDrag(0.01, 0.02, 0.03))
+    like = DRAG.with_effects(QuadraticDrag(), WIND.parameters(1.0, 2.0))
+    same = embed(own, like)
+    assert jax.tree.structure(same) == jax.tree.structure(like)
+    state = np.zeros(21, np.float32)
+    state[[2, 3, 4, 9, 20]] = 5.0, 4.0, -3.0, 1.0, 23.5
+    command = jnp.array([0.3, -0.2, 0.1, 0.4])
+    after = [np.asarray(step(state, command, 0.01, model)) for model in (own, same, like)]
+    assert_array_equal(after[0], after[1])
+    assert np.abs(after[0] - after[2]).max() > 1e-4
+
+
+def test_models_move_from_the_policys_own_to_the_plants():
+    models = find_plausible_models(diagnosis(DRAG))
+    start = to_vector(embed(NOMINAL, DRAG))
+    drags = [
+        float(
+            adapting.draw_moving(
+                jax.random.key(0), jnp.float32(done), models, start, Settings(move_share=0.5)
+            )
+            .effects[0]
+            .d_x
+        )
+        for done in (0.0, 0.25, 0.5, 0.9)
+    ]
+    assert_allclose(drags, [0.0, 0.15, 0.3, 0.3], rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def log():
+    log = excited(HandoutPlant())
+    return log.select(log.segment < 6)
+
+
+def with_channel(log, name, values):
+    return replace(log, channels={**log.channels, name: values})
+
+
+BAD_LOGS = {
+    "a hover": (
+        lambda log: with_channel(log, "u", log["u"] * [0.05, 0.05, 1.0, 1.0]),
+        "u_roll, u_pitch: found at most 0.0.* expected 0.1 or more.*hover",
+    ),
+    "crashes": (
+        lambda log: replace(log, segment=np.arange(len(log)) // 45),
+        "found .* flights of 0.45 s at most, 0 s in all .* expected 3 s or more: crashes",
+    ),
+    "another craft": (
+        lambda log: with_channel(log, "v_bat", log["v_bat"] * 0.6),
+        "another craft than the policy's: .*; the battery has 13.* V in this log, the model's 22",
+    ),
+    "degrees": (lambda log: with_channel(log, "w", np.rad2deg(log["w"])), "deg/s"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_LOGS)
+def test_a_log_of_no_race_of_this_craft_is_refused_before_work(kind, log, monkeypatch):
+    monkeypatch.setattr(adapting, "diagnose", pytest.fail)
+    change, message = BAD_LOGS[kind]
+    with pytest.raises(LogError, match=message):
+        adapt(change(log), load_checkpoint("champion"))
+
+
+def test_a_policy_of_another_observation_or_without_its_model_is_refused(
+    log, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(adapting, "diagnose", pytest.fail)
+    other = write_checkpoint(tmp_path / "history.safetensors", "FlyTrackActionHistory-v0")
+    with pytest.raises(CheckpointError, match="a policy of FlyTrackActionHistory-v0, expected one"):
+        adapt(log, load_checkpoint(other))
+    champion = load_checkpoint("champion")
+    meta = {name: value for name, value in champion.meta.items() if name != "model"}
+    with pytest.raises(CheckpointError, match="model: found none"):
+        adapt(log, champion._replace(meta=meta))
+
+
+def test_a_log_that_agrees_leaves_the_policy_as_it_is(log, monkeypatch):
+    nothing = diagnosis(NOMINAL, causes=())
+    monkeypatch.setattr(adapting, "diagnose", lambda *_, **__: nothing)
+    monkeypatch.setattr(adapting, "improve", pytest.fail)
+    champion = load_checkpoint("champion")
+    found = adapt(log, champion, accept=True)
+    assert found.checkpoint is champion and not found.is_new
+    assert "Nothing to adapt to" in describe_adapted(found)
+
+
+def judged(finish, lap_s):
+    is_complete = np.arange(100) < finish
+    return Judged(is_complete, np.where(is_complete, lap_s, np.nan))
+
+
+@pytest.mark.parametrize(
+    "lap_s, finish, is_new", [(3.9, 100, True), (5.0, 100, False), (3.9, 50, False)]
+)
+def test_the_old_policy_is_kept_where_the_new_one_is_worse(lap_s, finish, is_new, monkeypatch):
+    champion = load_checkpoint("champion")
+    model = model_from_json(champion.meta["model"], "model")
+    models = find_plausible_models(diagnosis(model))
+    flights = iter([judged(100, 3.7), judged(90, 4.2), judged(100, 3.7), judged(finish, lap_s)])
+    monkeypatch.setattr(adapting, "polish", lambda env, policy, *_: policy.params)
+    monkeypatch.setattr(adapting, "judge", lambda *_: (next(flights), next(flights)))
+    found = adapting.improve(
+        champion, model, models, diagnosis(model), 0, Settings(), lambda unit: lambda *_: None
+    )
+    text = describe_adapted(found)
+    assert found.is_new == is_new
+    assert "costs the old policy 10% of the flights and +0.500 s a lap" in text
+    assert ("96.3% to 100.0% of flights finish" in text) == is_new
+    assert ("the old one is kept" in text) != is_new
+    assert (found.checkpoint is champion) != is_new
+
+
+def test_what_is_unexplained_is_said():
+    flights = judged(100, 4.0), judged(100, 4.1), judged(100, 3.9)
+    open_case = diagnosis(DRAG, unexplained=Unexplained(True, ("airspeed",)))
+    text = describe_adapted(Adapted(open_case, load_checkpoint("champion"), True, *flights))
+    assert "Less sure" in text
+    lost = Adapted(diagnosis(DRAG), load_checkpoint("champion"), False, *flights[:2])
+    assert "No policy was found" in describe_adapted(lost)
+
+
+def test_shipped_policies_have_names_and_a_file_of_the_name_comes_first(tmp_path, monkeypatch):
+    for name, path in SHIPPED.items():
+        assert load_checkpoint(name).path == path
+    write_checkpoint(tmp_path / "robust")
+    monkeypatch.chdir(tmp_path)
+    assert load_checkpoint("robust").config.hidden_sizes == (8,)
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        load_checkpoint("winner")
+
+
+def test_blocks_of_nothing_are_blocks():
+    assert split_blocks(np.zeros((0, 550, 4, 3, 2))).shape == (20, 0, 546)
+
+
+def test_a_race_at_full_thrust_is_no_other_range_of_the_stick(log):
+    high = np.clip(log["u"][:, 3], 0.9, 1.0)
+    force = np.tile([[0.0, 0.0, 1.0]], (len(log), 1)) * (30.0 * high**2)[:, None]
+    flown = with_channel(log, "u", np.column_stack([log["u"][:, :3], high]))
+    assert thrust_changes(with_channel(flown, "f", force)) == []
