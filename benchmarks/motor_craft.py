@@ -131,9 +131,7 @@ def advance(crafts: Crafts, state: State, commands: np.ndarray, step_s: float = 
     three = _change(crafts, moved(two, 0.5), commands)
     four = _change(crafts, moved(three, 1.0), commands)
     changes = zip(one, two, three, four, strict=True)
-    after = moved(State(*((a + 2.0 * b + 2.0 * c + d) / 6.0 for a, b, c, d in changes)), 1.0)
-    left, _, right = np.linalg.svd(after.turn)
-    return after._replace(turn=left @ right)
+    return moved(State(*((a + 2.0 * b + 2.0 * c + d) / 6.0 for a, b, c, d in changes)), 1.0)
 
 
 class Flight(NamedTuple):
@@ -203,5 +201,7 @@ def fly(
         rows.append((state, commands, specific_force(crafts, state)))
         for _ in range(round(dt / step_s)):
             state = advance(crafts, state, commands, step_s)
+        left, _, right = np.linalg.svd(state.turn)
+        state = state._replace(turn=left @ right)
     states = State(*(np.stack(leaf) for leaf in zip(*(row[0] for row in rows), strict=True)))
     return Flight(states, np.stack([row[1] for row in rows]), np.stack([row[2] for row in rows]))

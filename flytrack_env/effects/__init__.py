@@ -198,6 +198,14 @@ def takes_motors(effects: Effects) -> bool:
     return any(effect_of(parameters).takes_motors for parameters in effects)
 
 
+def acts_on_sticks(effect: Effect) -> bool:
+    """Return whether an effect acts on sticks or on the rates that follow them, not on motors.
+
+    A delay of the commands is that of any commands.
+    """
+    return effect is not COMMAND_DELAY and not {"command", "lag", "rates"}.isdisjoint(effect.hooks)
+
+
 def fold(
     stage: str,
     effects: Effects,
@@ -331,6 +339,7 @@ __all__ = [
     "Wind",
     "YawReaction",
     "acts",
+    "acts_on_sticks",
     "at_row",
     "check_parameters",
     "delay_steps_of",

@@ -280,7 +280,6 @@ PRODUCTS = ("product_xy", "product_xz", "product_yz")
 LAGS = ("up_s", "down_s")
 DAMPING = ("damping_x", "damping_y", "damping_z")
 NOTABLE = {
-    **dict.fromkeys(CENTER, 0.002),
     **dict.fromkeys(DAMPING, 0.5),
     "load": 0.03,
     **dict.fromkeys(NAMES, 0.03),
@@ -311,10 +310,11 @@ MOTORS = Effect(
     takes_motors=True,
     search=Search(
         shapes=tuple(name for name in Motors._fields if name not in NOTABLE),
-        groups=(CENTER, ("load",), DAMPING, *((motor,) for motor in NAMES)),
+        groups=(("load",), DAMPING, *((motor,) for motor in NAMES)),
         is_setting=True,
-        fitted=(*RADII, *LAGS),
+        fitted=(*RADII, *LAGS, *CENTER),
         base_causes={
+            "center_of_mass": CENTER,
             **{f"inertia_{axis}": (f"radius_{axis}",) for axis in "xyz"},
             "motor_lag": LAGS,
         },
