@@ -100,6 +100,31 @@ def nominal_parameters() -> ModelParameters:
     )
 
 
+def nominal_motor_parameters() -> ModelParameters:
+    """Return the same quadcopter from the motors up, with the handout's frame.
+
+    Assumption: radii of gyration of 7, 9 and 11 cm, the drag torque of a propeller 1.5 cm of its
+    thrust, motors that take 25 ms up and 35 ms down.
+    """
+    motors = effects.Motors(
+        front_x=0.15,
+        front_y=0.09,
+        rear_x=0.15,
+        rear_y=0.14,
+        radius_x=0.07,
+        radius_y=0.09,
+        radius_z=0.11,
+        yaw_arm=0.015,
+        rotor_momentum=0.01,
+        up_s=0.025,
+        down_s=0.035,
+        damping_x=0.5,
+        damping_y=0.5,
+        damping_z=0.3,
+    )
+    return nominal_parameters()._replace(motion=Motion.CONTINUOUS).with_effects(motors)
+
+
 def lag(applied: Action, command: Action, dt: Scalar, tau: Any) -> Action:
     """Return the applied action after ``dt`` seconds of first-order lag towards a held command.
 

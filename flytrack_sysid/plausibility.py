@@ -65,7 +65,7 @@ def _motors(log: FlightLog) -> Iterator[str]:
         if span <= STILL < spans.max():
             yield (
                 f"u: motor {name}: found {first + 0.0:g} in every row while the others move, "
-                "expected the outputs of four motors in flight: it is missing, or its column is another's"
+                "expected outputs of four motors: it is missing, or its column is another's"
             )
 
 
