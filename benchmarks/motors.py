@@ -5,17 +5,17 @@
 model, and appends a line per craft; lines that are there are not computed again.
 """
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
+from benchmarks import report
 from benchmarks.motor_craft import Crafts, Flight, Pilot, fly
 from flytrack_env import Motion, nominal_parameters
 from flytrack_env.dynamics import ModelParameters
@@ -149,19 +149,38 @@ FAULTS: dict[str, tuple[Callable[[Crafts], Crafts], set[str]]] = {
 }
 
 
-def examined(fault: str, seed: int) -> dict[str, Any]:
-    """Return what a diagnosis says of a craft with a fault."""
-    rng = np.random.default_rng([seed, list(FAULTS).index(fault)])
-    craft = draw(rng)
-    change, expected = FAULTS[fault]
-    model = nominal_model(craft)
-    flight = fly(change(craft), Pilot(rng, 1, DURATION_S, REACH), DURATION_S)
+class Case(NamedTuple):
+    """A craft of a seed: what is wrong, its model before that, and its log."""
+
+    fault: str
+    model: ModelParameters
+    log: FlightLog
+
+
+def cases(seed: int) -> list[Case]:
+    """Return a craft of each fault; all of them fly at once."""
+    rng = np.random.default_rng(seed)
+    drawn = [draw(rng) for _ in FAULTS]
+    changed = [change(craft) for craft, (change, _) in zip(drawn, FAULTS.values(), strict=True)]
+    fields = Crafts.__dataclass_fields__
+    together = Crafts(
+        **{name: np.concatenate([getattr(craft, name) for craft in changed]) for name in fields}
+    )
+    flight = fly(together, Pilot(rng, len(together), DURATION_S, REACH), DURATION_S)
+    return [
+        Case(fault, nominal_model(craft), log_of_flight(flight, index, rng, 1.0))
+        for index, (fault, craft) in enumerate(zip(FAULTS, drawn, strict=True))
+    ]
+
+
+def examined(case: Case) -> dict[str, Any]:
+    """Return what a diagnosis says of a craft."""
     began = time.process_time()
-    found = diagnose(log_of_flight(flight, 0, rng, 1.0), model)
+    found = diagnose(case.log, case.model)
     named = {cause.effect for cause in found.causes}
+    expected = FAULTS[case.fault][1]
     return {
-        "fault": fault,
-        "seed": seed,
+        "fault": case.fault,
         "named": sorted(named),
         "parameters": {
             cause.effect: {
@@ -177,16 +196,17 @@ def examined(fault: str, seed: int) -> dict[str, Any]:
 
 def main(count: int = 20, out: Path = Path("docs/results/motors.jsonl")) -> None:
     """Diagnose ``count`` crafts of each fault; those that the file has are left out."""
-    lines = out.read_text().splitlines() if out.exists() else []
-    known = {(line["fault"], line["seed"]) for line in map(json.loads, lines)}
+    commit = report.commit_of_checkout()
+    known = {(line["fault"], line["seed"]) for line in report.lines_in(out)}
     for seed in range(count):
-        for fault in FAULTS:
-            if (fault, seed) in known:
+        if all((fault, seed) in known for fault in FAULTS):
+            continue
+        for case in cases(seed):
+            if (case.fault, seed) in known:
                 continue
-            result = examined(fault, seed)
-            with out.open("a") as file:
-                file.write(json.dumps(result) + "\n")
-            print(seed, fault, result["named"], f"{result['cpu_s']:.0f} CPU s", flush=True)
+            result = {"seed": seed, "commit": commit, **examined(case)}
+            report.append_line(out, result)
+            print(seed, case.fault, result["named"], f"{result['cpu_s']:.0f} CPU s", flush=True)
 
 
 if __name__ == "__main__":
