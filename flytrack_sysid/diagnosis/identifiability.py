@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import BY_NAME, MAX_DELAY_STEPS
+from flytrack_env.effects import BY_NAME, MAX_DELAY_STEPS, takes_motors
 from flytrack_env.plants import Simulator
 from flytrack_sysid.collect import states_flown
 from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG, NotIdentifiable
@@ -304,7 +304,7 @@ def advise(
 ) -> dict[str, str]:
     """Return for each wanted effect the manoeuvre that would show it best, of ``MANOEUVRES``.
 
-    The best is returned even if it does not suffice (``Question.shares`` below 1). Call it inside
+    None is known for a craft whose motors are commanded. The best is returned even if it does not suffice (``Question.shares`` below 1). Call it inside
     ``jax.enable_x64(True)``.
 
     Args:
@@ -313,6 +313,8 @@ def advise(
         linearization: of the model, along everything (``SearchState.linearized``).
         wanted: effect -> effects that look alike in this log, maybe none.
     """
+    if takes_motors(problem.like.effects):  # manoeuvres are flown by sticks
+        return dict.fromkeys(wanted, "")
     if not wanted:
         return {}
     questions = [Question(linearization, model, effect, alike) for effect, alike in wanted.items()]
