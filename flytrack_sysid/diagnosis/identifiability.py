@@ -304,8 +304,8 @@ def advise(
 ) -> dict[str, str]:
     """Return for each wanted effect the manoeuvre that would show it best, of ``MANOEUVRES``.
 
-    None is known for a craft whose motors are commanded. The best is returned even if it does not suffice (``Question.shares`` below 1). Call it inside
-    ``jax.enable_x64(True)``.
+    None is known for a craft whose motors are commanded. The best is returned even if it does not
+    suffice (``Question.shares`` below 1). Call it inside ``jax.enable_x64(True)``.
 
     Args:
         problem: the log's, with its noise.
