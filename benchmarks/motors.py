@@ -133,10 +133,11 @@ def _draggy(craft: Crafts) -> Crafts:
 
 WEAK = np.array([1.0, 1.0, 0.9, 1.0])
 INERTIA = np.diag([1.1, 1.0, 1.0])
-# What is wrong: the change of the craft, and the causes that it may be named.
+# What is wrong: the change of the craft, and the names that a diagnosis may give it. Of the causes
+# of the effect motors the name is the parameter.
 FAULTS: dict[str, tuple[Callable[[Crafts], Crafts], set[str]]] = {
     "clean": (lambda craft: craft, set()),
-    "weak motor": (_scaled("thrust", WEAK), {"motors"}),
+    "weak motor": (_scaled("thrust", WEAK), {"rear_left"}),
     "center of mass": (_moved, {"center_of_mass"}),
     "inertia": (_scaled("inertia", INERTIA), {"inertia_x"}),
     "drag": (_draggy, {"linear_drag"}),
@@ -145,7 +146,7 @@ FAULTS: dict[str, tuple[Callable[[Crafts], Crafts], set[str]]] = {
         lambda craft: replace(craft, linear=craft.linear + 0.3),
         {"thrust_curve", "thrust_scale"},
     ),
-    "mass": (_scaled("mass", 1.1), {"motors", "thrust_scale", "thrust_curve"}),
+    "mass": (_scaled("mass", 1.1), {"load"}),
 }
 
 
@@ -177,7 +178,9 @@ def examined(case: Case) -> dict[str, Any]:
     """Return what a diagnosis says of a craft."""
     began = time.process_time()
     found = diagnose(case.log, case.model)
-    named = {cause.effect for cause in found.causes}
+    named: set[str] = set()
+    for cause in found.causes:
+        named |= set(cause.parameters) if cause.effect == "motors" else {cause.effect}
     expected = FAULTS[case.fault][1]
     return {
         "fault": case.fault,

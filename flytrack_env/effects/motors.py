@@ -310,6 +310,9 @@ MOTORS = Effect(
     takes_motors=True,
     search=Search(
         shapes=tuple(name for name in Motors._fields if name not in NOTABLE),
+        probes={
+            "load": (0.1,)
+        },  # far from neutral, where outliers weigh less than their slope says
         groups=(("load",), DAMPING, *((motor,) for motor in NAMES)),
         is_setting=True,
         fitted=(*RADII, *LAGS, *CENTER),
