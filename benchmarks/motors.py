@@ -1,8 +1,8 @@
 """Diagnoses from motors, of rigid bodies that share no code with the model: see docs/motors.md.
 
-``python -m benchmarks.motors --count 20 --out docs/results/motors.jsonl`` flies crafts of
-``benchmarks.motor_craft`` with one thing wrong each, or nothing, diagnoses each from its nominal
-model, and appends a line per craft; lines that are there are not computed again.
+``python -m benchmarks.motors --count 20`` flies crafts of ``benchmarks.motor_craft`` with one thing
+wrong each, or nothing, diagnoses each from its nominal model, and appends a line per craft to
+docs/results/motors.jsonl; lines that are there are not computed again. It ends with a table of all.
 """
 
 import time
@@ -197,6 +197,17 @@ def examined(case: Case) -> dict[str, Any]:
     }
 
 
+def table_of(lines: list[dict[str, Any]]) -> str:
+    """Return how many crafts of each fault were named exactly."""
+    rows = []
+    for fault in FAULTS:
+        found = [line for line in lines if line["fault"] == fault]
+        exact = sum(line["is_exact"] for line in found)
+        others = sorted({", ".join(line["named"]) for line in found if not line["is_exact"]})
+        rows.append([fault, f"{exact} of {len(found)}", "; ".join(others)])
+    return report.table("fault | exact | named otherwise", rows)
+
+
 def main(count: int = 20, out: Path = Path("docs/results/motors.jsonl")) -> None:
     """Diagnose ``count`` crafts of each fault; those that the file has are left out."""
     commit = report.commit_of_checkout()
@@ -210,6 +221,7 @@ def main(count: int = 20, out: Path = Path("docs/results/motors.jsonl")) -> None
             result = {"seed": seed, "commit": commit, **examined(case)}
             report.append_line(out, result)
             print(seed, case.fault, result["named"], f"{result['cpu_s']:.0f} CPU s", flush=True)
+    print(table_of(report.lines_in(out)))
 
 
 if __name__ == "__main__":
