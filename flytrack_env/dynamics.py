@@ -100,6 +100,31 @@ def nominal_parameters() -> ModelParameters:
     )
 
 
+def nominal_motor_parameters() -> ModelParameters:
+    """Return the same quadcopter from the motors up, with the handout's frame.
+
+    Assumption: radii of gyration of 7, 9 and 11 cm, the drag torque of a propeller 1.5 cm of its
+    thrust, motors that take 25 ms up and 35 ms down.
+    """
+    motors = effects.Motors(
+        front_x=0.15,
+        front_y=0.09,
+        rear_x=0.15,
+        rear_y=0.14,
+        radius_x=0.07,
+        radius_y=0.09,
+        radius_z=0.11,
+        yaw_arm=0.015,
+        rotor_momentum=0.01,
+        up_s=0.025,
+        down_s=0.035,
+        damping_x=0.5,
+        damping_y=0.5,
+        damping_z=0.3,
+    )
+    return nominal_parameters()._replace(motion=Motion.CONTINUOUS).with_effects(motors)
+
+
 def lag(applied: Action, command: Action, dt: Scalar, tau: Any) -> Action:
     """Return the applied action after ``dt`` seconds of first-order lag towards a held command.
 
@@ -187,7 +212,9 @@ def _force_context(
     airspeed_w = drone.vel_w - air_w
     airspeed_b = Vec3(*(axis.dot(airspeed_w) for axis in body_axes_w))
     thrust = collective_thrust(applied.thrust, drone.battery_v, params.thrust_coeffs)
-    context = ForceContext(drone, applied, body_axes_w, airspeed_b, thrust / params.m)
+    context = ForceContext(
+        drone, applied, body_axes_w, airspeed_b, thrust / params.m, params.thrust_coeffs
+    )
     thrust = effects.fold("thrust", params.effects, memories, thrust, context)
     return context._replace(thrust_acc=compute_once(thrust / params.m))
 
@@ -270,6 +297,7 @@ def _respond(
         motion=params.motion,
         full_stick_b=body_rates(FULL_STICKS, params.max_rate),
         thrust_coeffs=params.thrust_coeffs,
+        mass=params.m,
     )
     acting = effects.fold("command", params.effects, memories, command, context)
     context = context._replace(command=acting)
@@ -356,11 +384,13 @@ class _Instant(NamedTuple):
 
     Attributes:
         rates: body rates before each effect, and after all of them.
+        memories: of the effects, where those that replace the lag are at the moment.
     """
 
     applied: Action
     battery_v: Scalar
     rates: Rates
+    memories: Memories
 
 
 def _lag_within_step(
@@ -376,23 +406,24 @@ def _lag_within_step(
         applied: Action,
         elapsed_s: Scalar,
         response: _Response,
+        moment: Memories,
         first_rates: Rates = (),
     ) -> _Instant:
         now = zip(response.acting, applied, response.tau, strict=True)
         slope = Action(*((target - current) / tau for target, current, tau in now))
         volts = _voltage(drone, memories, applied, elapsed_s, params)
         rates = _rates(drone, memories, applied, slope, elapsed_s, params, first_rates)
-        return _Instant(applied, volts, rates)
+        return _Instant(applied, volts, rates, moment)
 
     half = 0.5 * dt
     first = _respond(drone, memories, command, dt, (0.0, 0.5), params)
     middle = drone._replace(applied=first.applied)
     second = _respond(middle, first.memories, command, dt, (0.5, 1.0), params)
-    beginning = instant(drone.applied, 0.0, first)
+    beginning = instant(drone.applied, 0.0, first, memories)
     instants = (
         beginning,
-        instant(first.applied, half, second, beginning.rates),
-        instant(second.applied, dt, second, beginning.rates),
+        instant(first.applied, half, second, first.memories, beginning.rates),
+        instant(second.applied, dt, second, second.memories, beginning.rates),
     )
     return instants, second
 
@@ -430,8 +461,8 @@ def _move_continuously(
             instant.battery_v,
         )
         axes = compute_once(quat.axes())
-        context = _force_context(there, memories, instant.applied, axes, params)
-        return compute_once(_forces(context, memories, params))
+        context = _force_context(there, instant.memories, instant.applied, axes, params)
+        return compute_once(_forces(context, instant.memories, params))
 
     half, vel_w = 0.5 * dt, drone.vel_w
     acc_0, _ = force_at(instants[0], drone.quat, vel_w, 0.0)

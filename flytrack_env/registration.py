@@ -8,6 +8,8 @@ from typing import Any, Literal, NamedTuple
 import gymnax
 from gymnax.registration import registered_envs
 
+from flytrack_env.dynamics import nominal_motor_parameters
+from flytrack_env.effects import takes_motors
 from flytrack_env.env import FlyTrack
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.messages import check_keywords
@@ -78,6 +80,10 @@ ENVIRONMENTS: dict[str, Variant] = {
     "FlyTrackMask-v0": Variant(
         "The race seen as a binary image of the gates' frames.", wrappers=(GateMask,)
     ),
+    "FlyTrackMotors-v0": Variant(
+        "The race with the outputs of four motors as commands; motors and rates at 600 Hz.",
+        arguments={"model": nominal_motor_parameters()},
+    ),
 }
 
 
@@ -89,7 +95,7 @@ def make(env_id: str, **overrides: Any) -> EpisodicEnvironment:
     plant.
 
     Raises:
-        ValueError: unknown id.
+        ValueError: unknown id, or a model without motors in an id whose commands are those.
         TypeError: unknown argument.
     """
     if env_id not in ENVIRONMENTS:
@@ -97,6 +103,11 @@ def make(env_id: str, **overrides: Any) -> EpisodicEnvironment:
     check_keywords(overrides, ARGUMENTS)
     variant = ENVIRONMENTS[env_id]
     env: EpisodicEnvironment = FlyTrack(**{**variant.arguments, **overrides})
+    is_of_motors = takes_motors(env.default_params.model.effects)
+    if "model" in variant.arguments and env.plant.dt is None and not is_of_motors:
+        raise ValueError(
+            f"model: found one that sticks command, expected one with the effect motors in {env_id}"
+        )
     for wrapper in variant.wrappers:
         if wrapper is DomainRandomization and env.plant.dt is not None:
             continue

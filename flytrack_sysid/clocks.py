@@ -320,7 +320,7 @@ def with_causal_commands(
         notes: one if the commands were moved.
     """
     all_rows = np.ones(len(log), bool)
-    if "w" not in log:
+    if "w" not in log or log.has_motors:
         return log, all_rows, []
     turns = np.cumsum(log["w"] * usual_step(log)[:, None], axis=0)
     commanded = log["u"][:, :3] * np.deg2rad(np.asarray(model.max_rate))

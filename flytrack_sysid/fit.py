@@ -29,7 +29,7 @@ from flytrack_sysid.inference.parameters import (
     with_values,
 )
 from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
-from flytrack_sysid.log_motion import motion_notes, required_motion
+from flytrack_sysid.log_motion import check_commands, motion_notes, required_motion
 from flytrack_sysid.log_voltage import (
     fitted_battery,
     flown_voltages,
@@ -222,7 +222,7 @@ def _warnings(
             )
     if uncertainty is not None and uncertainty.share > UNCERTAIN_THRUST:
         half_width_n, share, action, battery_v = uncertainty
-        thrust = log["u"][:, 3]
+        thrust = log.throttle
         volts = (
             f" at {log['v_bat'].min():.4g} to {log['v_bat'].max():.4g} V" if "v_bat" in log else ""
         )
@@ -262,6 +262,7 @@ def what_is_fitted(
         raise FitError(
             f"effects: {name}: known from settings and not fitted; start from a model that has it"
         )
+    check_commands(log, model)
     free = _free_names(model, log, fixed)
     model = with_values(model, fixed)
     model = model._replace(motion=required_motion(log, motion) or model.motion)
@@ -359,7 +360,7 @@ def _check_response(log: FlightLog, start: ModelParameters) -> None:
 
     Possible reasons: motors that are off, a drone on the ground, rates of another log.
     """
-    if "w" not in log:
+    if "w" not in log or log.has_motors:
         return
     correlations = []
     for axis, decay in enumerate(np.exp(-usual_step(log)[0] / np.asarray(start.tau, float)[:3])):

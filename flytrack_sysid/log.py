@@ -11,8 +11,9 @@ state, ``a`` and ``f`` of row k are those of the step that led to t_k, with the 
 whole ones.
 
 Columns of ``STATED`` hold the same number in every row: ``measured``, 1 where a real drone flew and
-0 where a simulator did; ``v_bat_low`` and ``v_bat_high``, V, the range that is stated for a pack
-that was not logged.
+0 where a simulator did; ``motors``, 1 where ``u`` holds the outputs of the motors rear right, front
+right, rear left and front left instead of sticks, -1 off and 1 full; ``v_bat_low`` and
+``v_bat_high``, V, the range that is stated for a pack that was not logged.
 """
 
 import hashlib
@@ -43,8 +44,8 @@ CHANNELS: dict[str, tuple[str, ...]] = {
     "v_bat": ("v_bat",),
 }
 REQUIRED = ("t", *CHANNELS["u"])
-MEASURED, STATED_VOLTAGES = "measured", ("v_bat_low", "v_bat_high")
-STATED = (MEASURED, *STATED_VOLTAGES)
+MEASURED, OF_MOTORS, STATED_VOLTAGES = "measured", "motors", ("v_bat_low", "v_bat_high")
+STATED = (MEASURED, OF_MOTORS, *STATED_VOLTAGES)
 COLUMNS = (
     "t",
     "segment",
@@ -85,6 +86,7 @@ class FlightLog:
         origin: whether a real drone or a simulator flew; None if it is unknown.
         stated_voltage_v: lowest and highest voltage of the pack in flight, V, if they are stated
             but ``v_bat`` was not logged.
+        has_motors: whether the commands are the outputs of four motors instead of sticks.
     """
 
     time: np.ndarray
@@ -93,6 +95,7 @@ class FlightLog:
     source: str = "flight log"
     origin: Origin | None = None
     stated_voltage_v: tuple[float, float] | None = None
+    has_motors: bool = False
 
     def __len__(self) -> int:
         return len(self.time)
@@ -118,6 +121,11 @@ class FlightLog:
         ):
             digest.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
         return digest.hexdigest()
+
+    @property
+    def throttle(self) -> np.ndarray:
+        """The thrust command, (num_rows,); of motors their mean."""
+        return self["u"].mean(axis=1) if self.has_motors else self["u"][:, 3]
 
     def select(self, rows: np.ndarray) -> "FlightLog":
         """Return some of the rows, by mask or slice."""

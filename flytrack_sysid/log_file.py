@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from flytrack_env import motors
 from flytrack_env.files import open_file, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.npz_file import NpzError, load_npz, npz_of
@@ -119,9 +120,10 @@ def describe(log: FlightLog) -> str:
 
 def _ranges(log: FlightLog) -> list[str]:
     """Return lines on the ranges of commands and of measured speed, tilt, height and voltage."""
+    names = motors.NAMES if log.has_motors else CHANNELS["u"]
     commands = [
         f"{column} {values.min():.3g} to {values.max():.3g}"
-        for column, values in zip(CHANNELS["u"], log["u"].T, strict=True)
+        for column, values in zip(names, log["u"].T, strict=True)
     ]
     ranges = []
     if "v" in log:

@@ -7,6 +7,7 @@ measured.
 """
 
 from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import takes_motors
 from flytrack_env.motion import Motion
 from flytrack_sysid.log import MEASURED, FlightLog, LogError
 
@@ -52,6 +53,25 @@ def motion_notes(
             f"flew; {HOW_TO_MARK}; measured logs are replayed as continuous"
         )
     return notes
+
+
+def check_commands(log: FlightLog, model: ModelParameters) -> None:
+    """Raise LogError for a model that takes other commands than the log has, sticks or motors.
+
+    The rates of a model that takes motors follow from torques, so that they have to be measured.
+    """
+    expects_motors = takes_motors(model.effects)
+    if log.has_motors != expects_motors:
+        found, expected = ("motors", "sticks") if log.has_motors else ("sticks", "motors")
+        has = "without" if log.has_motors else "with"
+        raise LogError(
+            f"{log.source}: u: found commands of {found}, and a model that takes {expected} ({has} "
+            "the effect motors); expected both of one kind"
+        )
+    if expects_motors and "w" not in log:
+        raise LogError(
+            f"{log.source}: w: missing, expected the gyro: motors turn a craft by torque"
+        )
 
 
 def check_same_origin(*logs: FlightLog) -> None:

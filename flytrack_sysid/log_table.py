@@ -11,6 +11,7 @@ from flytrack_sysid.log import (
     CHANNELS,
     COLUMNS,
     MEASURED,
+    OF_MOTORS,
     ORIGINS,
     REQUIRED,
     STATED,
@@ -119,6 +120,8 @@ def stated_columns(log: FlightLog) -> dict[str, np.ndarray]:
         stated[MEASURED] = next(
             number for number, origin in ORIGINS.items() if origin == log.origin
         )
+    if log.has_motors:
+        stated[OF_MOTORS] = 1.0
     return {name: np.full(len(log), stated[name]) for name in STATED if name in stated}
 
 
@@ -149,6 +152,7 @@ def log_of_table(table: Table) -> FlightLog:
         is_command = np.abs(table.columns[column]) <= 1.0 + COMMAND_MARGIN
         table.check(is_command, column, "a command in [-1, 1]")
     origin, stated_voltage_v = _origin(table), _stated_voltages(table)
+    has_motors = _has_motors(table)
     channels = {}
     for name, columns in CHANNELS.items():
         if columns[0] in table.columns:
@@ -161,7 +165,9 @@ def log_of_table(table: Table) -> FlightLog:
         expected = f"a quaternion of norm 1 within {MAX_NORM_ERROR:g}"
         table.check(error <= MAX_NORM_ERROR, ", ".join(CHANNELS["q"]), expected, norm)
         channels["q"] *= np.where(error > MIN_NORM_ERROR, 1.0 / norm, 1.0)[:, None]
-    return FlightLog(table.columns["t"], channels, segment, table.source, origin, stated_voltage_v)
+    return FlightLog(
+        table.columns["t"], channels, segment, table.source, origin, stated_voltage_v, has_motors
+    )
 
 
 def _stated(table: Table, name: str) -> float | None:
@@ -183,6 +189,15 @@ def _origin(table: Table) -> Origin | None:
             0, MEASURED, f"found {value}, expected 1 (a real drone) or 0 (a simulator)"
         )
     return None if value is None else ORIGINS[value]
+
+
+def _has_motors(table: Table) -> bool:
+    """Return whether the commands are those of motors, as the column ``motors`` states."""
+    value = _stated(table, OF_MOTORS)
+    if value not in (None, 0.0, 1.0):
+        expected = "expected 1 (commands of four motors) or 0 (of sticks)"
+        raise table.error(0, OF_MOTORS, f"found {value}, {expected}")
+    return value == 1.0
 
 
 def _stated_voltages(table: Table) -> tuple[float, float] | None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from flytrack_env import motors
 from flytrack_sysid.check import check_log, problems_of
 from flytrack_sysid.kinematics import GRAVITY, cut_windows
 from flytrack_sysid.log import CHANNELS, FlightLog, LogError
@@ -55,6 +56,19 @@ def _commands(log: FlightLog) -> Iterator[str]:
         )
 
 
+def _motors(log: FlightLog) -> Iterator[str]:
+    """Find a motor that stands still while others move."""
+    if not log.has_motors:
+        return
+    spans = np.ptp(log["u"], axis=0)
+    for name, span, first in zip(motors.NAMES, spans, log["u"][0], strict=True):
+        if span <= STILL < spans.max():
+            yield (
+                f"u: motor {name}: found {first + 0.0:g} in every row while the others move, "
+                "expected outputs of four motors: it is missing, or its column is another's"
+            )
+
+
 def _motion(log: FlightLog) -> Iterator[str]:
     measured = [name for name in ("p", "v", "a", "f", "q", "w") if name in log]
     moving = {name for name in ("u", *measured) if np.ptp(log[name], axis=0).max() > STILL}
@@ -99,7 +113,7 @@ def _conventions(log: FlightLog) -> Iterator[str]:
         yield from problems_of(found)
 
 
-CHECKS = (_length, _commands, _motion, _attitude, _acceleration)
+CHECKS = (_length, _commands, _motors, _motion, _attitude, _acceleration)
 
 
 def find_problems(log: FlightLog, accept: bool = False) -> list[str]:

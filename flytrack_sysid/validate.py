@@ -9,7 +9,7 @@ from flytrack_sysid import prediction_errors
 from flytrack_sysid.inference.one_step import Prediction, predict
 from flytrack_sysid.inference.record import fill_gaps
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.log_motion import motion_notes, required_motion
+from flytrack_sysid.log_motion import check_commands, motion_notes, required_motion
 from flytrack_sysid.log_voltage import voltage_notes
 from flytrack_sysid.steps import (
     HELD_AFTER_S,
@@ -121,6 +121,7 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
             rows are used only for the applied action and the memories of effects.
 
     Raises:
+        LogError: the model takes other commands than the log has.
         ValueError: ``rows`` has another shape or type.
     """
     rows = np.ones(len(log), bool) if rows is None else np.asarray(rows)
@@ -128,6 +129,7 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
         raise ValueError(
             f"rows: found {rows.dtype} of shape {rows.shape}, expected bool of ({len(log)},)"
         )
+    check_commands(log, model)
     num_rows, num_judged = len(log), int(rows.sum())
     contradictions = motion_notes(
         log, model, None, f"replayed as the model says ({model.motion.value})"
@@ -151,8 +153,8 @@ def validate(model: ModelParameters, log: FlightLog, rows: np.ndarray | None = N
     elif "v_bat" not in log:
         notes.append("thrust by voltage: v_bat is not in the log")
         thrust = None
-    steps = step_responses(prediction, rows)
-    if not steps:
+    steps = () if log.has_motors else step_responses(prediction, rows)
+    if not steps and not log.has_motors:
         notes.append(
             f"step responses: no judged command of roll, pitch or yaw jumps by {MIN_JUMP:g} "
             f"between {HELD_BEFORE_S:g} s and {HELD_AFTER_S:g} s of constant command, with body "

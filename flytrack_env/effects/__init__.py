@@ -41,6 +41,7 @@ from flytrack_env.effects.learned_law import LEARNED_LAW, LearnedLaw
 from flytrack_env.effects.linear_drag import LINEAR_DRAG, LinearDrag
 from flytrack_env.effects.mocap_latency import MOCAP_LATENCY, MocapLatency
 from flytrack_env.effects.motor_imbalance import MOTOR_IMBALANCE, MotorImbalance
+from flytrack_env.effects.motors import MOTORS, Motors
 from flytrack_env.effects.quadratic_drag import QUADRATIC_DRAG, QuadraticDrag
 from flytrack_env.effects.quick_rates import QUICK_RATES, QuickRates
 from flytrack_env.effects.rate_cross_coupling import RATE_CROSS_COUPLING, RateCrossCoupling
@@ -74,6 +75,7 @@ EFFECTS: tuple[Effect, ...] = (
     RATE_SLEW_LIMIT,
     THRUST_LAG_ASYMMETRY,
     BETAFLIGHT_LOOP,
+    MOTORS,
     RATE_SCALE,
     YAW_REACTION,
     MOTOR_IMBALANCE,
@@ -191,6 +193,19 @@ def acts(effects: Effects, stage: str) -> bool:
     return any(stage in effect_of(parameters).hooks for parameters in effects)
 
 
+def takes_motors(effects: Effects) -> bool:
+    """Return whether the commands of a model are those of four motors (static)."""
+    return any(effect_of(parameters).takes_motors for parameters in effects)
+
+
+def acts_on_sticks(effect: Effect) -> bool:
+    """Return whether an effect acts on sticks or on the rates that follow them, not on motors.
+
+    A delay of the commands is that of any commands.
+    """
+    return effect is not COMMAND_DELAY and not {"command", "lag", "rates"}.isdisjoint(effect.hooks)
+
+
 def fold(
     stage: str,
     effects: Effects,
@@ -304,6 +319,7 @@ __all__ = [
     "LinearDrag",
     "MocapLatency",
     "MotorImbalance",
+    "Motors",
     "Pose",
     "QuadraticDrag",
     "QuickRates",
@@ -323,6 +339,7 @@ __all__ = [
     "Wind",
     "YawReaction",
     "acts",
+    "acts_on_sticks",
     "at_row",
     "check_parameters",
     "delay_steps_of",
@@ -334,4 +351,5 @@ __all__ = [
     "remember",
     "respond",
     "start_memories",
+    "takes_motors",
 ]

@@ -95,6 +95,7 @@ class CommandContext(NamedTuple):
         motion: of the model.
         full_stick_b: body rates of full sticks, rad/s.
         thrust_coeffs: of the model's thrust map.
+        mass: of the model, kg.
     """
 
     drone: Drone
@@ -104,6 +105,7 @@ class CommandContext(NamedTuple):
     motion: Motion
     full_stick_b: Vec3
     thrust_coeffs: jax.Array | np.ndarray
+    mass: Scalar
 
 
 class ForceContext(NamedTuple):
@@ -115,6 +117,7 @@ class ForceContext(NamedTuple):
         body_axes_w: the body's x, y, z axes.
         airspeed_b: velocity through the air, body frame, m/s.
         thrust_acc: collective thrust over mass, m/s^2; at the stage thrust, before its effects.
+        thrust_coeffs: of the model's thrust map.
     """
 
     drone: Drone
@@ -122,6 +125,7 @@ class ForceContext(NamedTuple):
     body_axes_w: tuple[Vec3, Vec3, Vec3]
     airspeed_b: Vec3
     thrust_acc: Scalar
+    thrust_coeffs: jax.Array | np.ndarray
 
 
 class RatesContext(NamedTuple):
@@ -263,6 +267,8 @@ class Search:
         is_setting: comes with the settings of a craft, so that a model has it from the start or not
             at all; fits free only the parameters in ``fitted``.
         fitted: parameters that a fit of the craft frees.
+        base_causes: of those, which a diagnosis names when they differ from the given model's, by
+            the name of the cause.
     """
 
     needs: tuple[str, ...] = ()
@@ -272,6 +278,7 @@ class Search:
     follows_sticks: bool = False
     is_setting: bool = False
     fitted: tuple[str, ...] = ()
+    base_causes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -290,6 +297,8 @@ class Effect:
         memory: None if the effect has none.
         search: how identification looks for it.
         max_steps: of parameters that are delays, the number of time steps that each may last.
+        takes_motors: a model with it is commanded by the outputs of four motors, not by sticks, and
+            its rates follow from torques.
         static: the last field, if it is a structure and no number. Such an effect is learnt, not
             looked for.
         written: static field -> its JSON values.
@@ -306,6 +315,7 @@ class Effect:
     memory: Memory | None = None
     search: Search = Search()
     max_steps: Mapping[str, int] = field(default_factory=dict)
+    takes_motors: bool = False
     static: str = ""
     written: Callable[[Any], Any] | None = None
     read: Callable[[Any], Any] | None = None

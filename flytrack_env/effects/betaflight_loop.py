@@ -9,15 +9,13 @@ import numpy as np
 
 from flytrack_env.effects.base import CommandContext, Effect, Memory, Range, Search
 from flytrack_env.fusion import one_kernel
+from flytrack_env.motors import QUARTER, SIGNS, moment, reached
 from flytrack_env.quaternion import Scalar, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_env.thrust import collective_thrust
 
 Array = Any  # of the axes, (3,), or the motors, (4,)
 NUM_SUBSTEPS = 10  # of a step: 1 ms at 100 Hz
-# What a stronger motor turns, in the firmware's order of motors: left rotors roll to the right,
-# rear rotors pitch down. An axis a row.
-SIGNS = np.array([[-1.0, -1.0, 1.0, 1.0], [1.0, -1.0, 1.0, -1.0], [1.0, -1.0, -1.0, 1.0]])
 IS_YAW = np.array([False, False, True])
 PER_DEGREE = np.pi / 180.0
 # Units of the firmware's settings, over the thousand that one unit of the mixer has (pid.h); deg/s.
@@ -423,11 +421,10 @@ def _turned(state: Turn, inputs: SubstepInputs, motors: Array) -> Array:
         collective_thrust(_action_of(speeds, loop), inputs.battery_v, inputs.thrust_coeffs)
         for speeds in both
     )
-    thrusts = 0.125 * loop.health * thrusts  # of a motor, the mean of the substep
-    # Sum by sum: XLA makes a product of matrices of a reduction, which no kernel has.
+    thrusts = 0.5 * QUARTER * loop.health * thrusts  # of a motor, the mean of the substep
     levers = jnp.stack([-loop.center_y, loop.center_x, jnp.zeros_like(loop.center_x)])
-    torques = sum(thrusts[motor] * (signs[:, motor] + levers) for motor in range(4))
-    spun = loop.yaw_spin * sum((both[0] - both[1])[motor] * signs[2, motor] for motor in range(4))
+    torques = moment(thrusts, [signs[:, motor] + levers for motor in range(4)])
+    spun = loop.yaw_spin * moment(both[0] - both[1], signs[2])
     x, y, z = state.rates
     # The midpoint rule turns roll and pitch by an angle; Euler's would feed a fast yaw until it
     # overflows.
@@ -445,8 +442,8 @@ def _substep(state: Turn, inputs: SubstepInputs) -> Turn:
     loop, dt = inputs.loop, inputs.dt
     throttle, level, boost = _throttled(loop, state.throttle, inputs.throttle, dt)
     axes, demand = _controlled(state, inputs, level, boost)
-    follow = 1.0 - jnp.exp(-dt / loop.motor_s)
-    motors = state.motors + follow * (_mixed(loop, demand, throttle, level) - state.motors)
+    commands = _mixed(loop, demand, throttle, level)
+    motors = state.motors + reached(loop.motor_s, dt) * (commands - state.motors)
     return Turn(_turned(state, inputs, motors), axes, throttle, motors)
 
 

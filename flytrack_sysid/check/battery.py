@@ -39,7 +39,7 @@ def compare_battery(log: FlightLog) -> tuple[Pair, ...]:
     durations[log.is_start()] = 0.0
     elapsed_s = np.cumsum(durations)
     block = (elapsed_s / BLOCK_S).astype(int)
-    values = np.column_stack([log.time, log["u"][:, 3], log["v_bat"][:, 0]])
+    values = np.column_stack([log.time, log.throttle, log["v_bat"][:, 0]])
     for rows in segments_of(log):
         values[rows] -= values[rows].mean(axis=0)
     products = np.stack(

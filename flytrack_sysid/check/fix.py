@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from flytrack_env.motors import NAMES
 from flytrack_env.toml_file import parse_toml
 from flytrack_sysid.check.explain import Change
 from flytrack_sysid.check.frames import FRAMES, name_of
@@ -84,6 +85,10 @@ def _corrections(tables: Fields, change: Change) -> dict[str, Fields]:
     if channel == "u_thrust" and "command" in tables:
         fields = _thrust(tables["command"], kind, value)
         return {"command": fields} if fields else {}
+    if channel == "motors" and len(tables.get("motors", {}).get("columns", ())) == len(NAMES):
+        held = [int(number) - 1 for number in str(value).split()]
+        columns = tables["motors"]["columns"]
+        return {"motors": {"columns": [columns[held.index(motor)] for motor in range(len(NAMES))]}}
     table = TABLES.get(channel, "")
     if table not in tables:
         return {}

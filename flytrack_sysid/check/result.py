@@ -134,8 +134,12 @@ def check_log(
     Args:
         log: a flight.
         model: whose lags are expected between commands and rates; None if they are unknown.
-        motors: outputs of four motors in Betaflight's order, (num_rows, 4).
+        motors: outputs of four motors in Betaflight's order, (num_rows, 4); by default the
+            commands of a log that has those of motors.
     """
+    if log.has_motors:
+        motors = 0.5 * (log["u"] + 1.0) if motors is None else motors
+        log = with_throttle_alone(log)
     samples = sample_changes(log)
     held = {change.channel for change in samples if change.kind == "held"}
     # Rates about the world's axes also look like an inverted attitude: the simpler one counts.
@@ -173,6 +177,12 @@ def check_log(
     pairs = with_wrong_sizes(pairs, explanations[0])
     after = compare_pairs(right).pairs
     return Check(log.source, pairs, tuple(dict.fromkeys(explanations)), right, after, remarks)
+
+
+def with_throttle_alone(log: FlightLog) -> FlightLog:
+    """Return a log of motors as one of sticks that stay centred and a throttle, their mean."""
+    command = np.pad(log.throttle[:, None], ((0, 0), (3, 0)))
+    return replace(log, channels={**log.channels, "u": command}, has_motors=False)
 
 
 def with_wrong_sizes(pairs: tuple[Pair, ...], changes: tuple[Change, ...]) -> tuple[Pair, ...]:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flytrack_env.motors import SIGNS
 from flytrack_sysid.check.commands import GRID_S, follow
 from flytrack_sysid.check.explain import Change
 from flytrack_sysid.check.motion import MARGIN, MAX_CORRELATION, useful_windows, weight_of
@@ -22,9 +23,9 @@ MIN_SPAN = 0.15
 MIN_TORQUE = 0.3  # correlation of the rotation with a motor's torque
 MOTOR_LAG_S = 0.03
 UP = np.array([0.0, 0.0, 1.0])
-# Signs of the moments about body x, y, z by motors 1 to 4 of Betaflight's "Quad X": rear right,
-# front right, rear left, front left. Yaw is not compared: propellers turn in or out.
-MOMENTS = np.array([[-1.0, -1.0, 1.0, 1.0], [1.0, -1.0, 1.0, -1.0]])
+# Signs of the moments of motors 1 to 4 of Betaflight's "Quad X". Yaw is not compared: propellers
+# turn in or out.
+MOMENTS = SIGNS[:2]
 
 
 def force_along_z(log: FlightLog, windows: Windows) -> np.ndarray | None:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from flytrack_env.motors import NAMES as MOTORS
 from flytrack_sysid.check.explain import Change
 from flytrack_sysid.check.motion import MARGIN
 from flytrack_sysid.check.pairs import CONTRADICTS, STILL, Pair
@@ -36,6 +37,8 @@ def describe(change: Change) -> str:
 
 
 def _says(channel: str, kind: str, value: str | float | bool) -> str:
+    if channel == "motors":
+        return f"their columns hold motors {value}, read as 1 2 3 4 ({', '.join(MOTORS)})"
     if kind == "axes" and value == "-":
         return {
             "u_thrust": "upside down: more command is less thrust",
@@ -66,7 +69,7 @@ def _says(channel: str, kind: str, value: str | float | bool) -> str:
         "range": f"in the range {'1000 to 2000 us' if value == 'pwm' else value}, read as -1 to 1",
         "held": f"each sample is held for {value} rows",
         "wrapped": "the heading was interpolated across 180 degrees",
-    }.get(kind, f"motors are {value}, read as 1 2 3 4")
+    }[kind]
 
 
 def list_explanations(explanations: Sequence[Sequence[Change]]) -> list[str]:

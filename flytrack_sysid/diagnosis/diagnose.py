@@ -61,7 +61,12 @@ from flytrack_sysid.inference.search import (
     with_refitted_noise,
 )
 from flytrack_sysid.log import STATED_VOLTAGES, FlightLog, LogError
-from flytrack_sysid.log_motion import check_same_origin, motion_notes, required_motion
+from flytrack_sysid.log_motion import (
+    check_commands,
+    check_same_origin,
+    motion_notes,
+    required_motion,
+)
 from flytrack_sysid.log_voltage import battery_of_craft, voltage_notes, with_voltage
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
@@ -197,6 +202,7 @@ def split(
     warnings += motion_notes(log, model, motion, "chosen by likelihood")
     motion = required_motion(log, motion)
     model = nominal_parameters() if model is None else model
+    check_commands(log, model)
     warnings += voltage_notes(log, model.battery)
     log = with_voltage(log, model)
     model = model._replace(battery=battery_of_craft(log, model.battery))
@@ -446,9 +452,9 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
         ),
         prediction=prediction,
         changed=summary.changed_parameters(linearization, extended, vetted.refined),
-        half_response_s=craft.summarize_half_responses(
-            linearization, selection.model, refined, flying
-        ),
+        half_response_s={}
+        if parts.log.has_motors
+        else craft.summarize_half_responses(linearization, selection.model, refined, flying),
         lift=craft.summarize_lift(linearization, selection.model, refined, flying),
         outliers=outliers,
         learned=learned,
@@ -496,6 +502,11 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
     if len(logs) == 1:
         return logs[0]
     check_same_origin(*logs)
+    if len({one.has_motors for one in logs}) > 1:
+        shown = ", ".join(
+            f"{Path(one.source).name}: {'motors' if one.has_motors else 'sticks'}" for one in logs
+        )
+        raise LogError(f"u: found commands of {shown}; expected one kind in one command")
     voltages = [flight_log.stated_voltage_v for flight_log in logs]
     if len(set(voltages)) > 1:
         shown = ", ".join(
@@ -516,6 +527,7 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
         segment=np.concatenate(segments),
         source=" + ".join(Path(log.source).name for log in logs),
         origin=logs[0].origin,
+        has_motors=logs[0].has_motors,
         stated_voltage_v=logs[0].stated_voltage_v,
     )
 

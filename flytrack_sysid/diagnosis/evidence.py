@@ -14,7 +14,7 @@ from flytrack_env.toml_file import parse_toml, read_text
 from flytrack_sysid.diagnosis.result import DRIFT, TWO_SIDED_95
 from flytrack_sysid.diagnosis.traces import REGRESSORS, UNITS, Traces
 from flytrack_sysid.inference.parameters import names_of, to_vector, with_values
-from flytrack_sysid.inference.score_test import BASE_CAUSES
+from flytrack_sysid.inference.score_test import ALL_BASE_CAUSES
 from flytrack_sysid.plots import BLUE, GREY, ORANGE, say
 
 WIDTH_IN, ROW_IN, LEGEND_IN = 8.0, 2.5, 0.9
@@ -84,10 +84,10 @@ def without(extended: ModelParameters, nominal: ModelParameters, cause: str) -> 
         type(effect) is not ThrustScale for effect in extended.effects
     ):
         cause = "thrust_curve"  # the scale is one factor between two curves, not an effect
-    if cause not in BASE_CAUSES:
+    if cause not in ALL_BASE_CAUSES:
         return extended.with_effects(nominal.effect(cause))
     before = dict(zip(names_of(nominal), to_vector(nominal).tolist(), strict=True))
-    return with_values(extended, {name: before[name] for name in BASE_CAUSES[cause]})
+    return with_values(extended, {name: before[name] for name in ALL_BASE_CAUSES[cause]})
 
 
 def words_of(cause: str) -> str:

@@ -15,16 +15,21 @@ import jax
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import BY_NAME, MAX_DELAY_STEPS
+from flytrack_env.effects import BY_NAME, MAX_DELAY_STEPS, takes_motors
 from flytrack_env.plants import Simulator
 from flytrack_sysid.collect import states_flown
 from flytrack_sysid.diagnosis.result import SCHEMA, TO_LOG, NotIdentifiable
 from flytrack_sysid.excitation import ANY_VOLTAGE, DT_S, FLIGHT_STEPS, SCRIPT_HEIGHTS, is_inside
 from flytrack_sysid.inference.chunks import CHUNK_S, Chunks, make_chunks, measured_voltage_range
 from flytrack_sysid.inference.parameters import TAUS, THRUST_COEFFS, from_vector
-from flytrack_sysid.inference.problem import SEARCHED, Problem
+from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.record import UPRIGHT
-from flytrack_sysid.inference.score_test import Candidate, Linearization, list_candidates
+from flytrack_sysid.inference.score_test import (
+    Candidate,
+    Linearization,
+    list_candidates,
+    searched_in,
+)
 from flytrack_sysid.inference.search import FittedModel, SearchState
 from flytrack_sysid.inference.trace_cache import fast_jit
 from flytrack_sysid.log import FlightLog, log_of_states
@@ -145,7 +150,7 @@ def unseen_effects(
     Sizes are infinite where no size would show.
     """
     result: dict[str, NotIdentifiable] = {}
-    for effect in (searched.name for searched in SEARCHED):
+    for effect in searched_in(state.problem):
         if effect in model.effects or effect in BASE_ONLY:
             continue
         if effect in state.unobservable:
@@ -169,14 +174,12 @@ def _look_alikes(state: SearchState, model: FittedModel, question: Question) -> 
     """Return effects beside which this one hardly shows."""
     sizes = question.noncentralities()
     result = []
-    for other in SEARCHED:
-        if other.name in (question.effect, *BASE_ONLY, *state.unobservable):
+    for other in searched_in(state.problem):
+        if other in (question.effect, *BASE_ONLY, *state.unobservable):
             continue
-        beside = question.noncentralities(
-            Question(question.linearization, model, other.name).columns
-        )
+        beside = question.noncentralities(Question(question.linearization, model, other).columns)
         if np.any((beside < SEPARATE) & (beside < LOOKS_ALIKE * sizes)):
-            result.append(other.name)
+            result.append(other)
     return tuple(result)
 
 
@@ -301,8 +304,8 @@ def advise(
 ) -> dict[str, str]:
     """Return for each wanted effect the manoeuvre that would show it best, of ``MANOEUVRES``.
 
-    The best is returned even if it does not suffice (``Question.shares`` below 1). Call it inside
-    ``jax.enable_x64(True)``.
+    None is known for a craft whose motors are commanded. The best is returned even if it does not
+    suffice (``Question.shares`` below 1). Call it inside ``jax.enable_x64(True)``.
 
     Args:
         problem: the log's, with its noise.
@@ -310,6 +313,8 @@ def advise(
         linearization: of the model, along everything (``SearchState.linearized``).
         wanted: effect -> effects that look alike in this log, maybe none.
     """
+    if takes_motors(problem.like.effects):  # manoeuvres are flown by sticks
+        return dict.fromkeys(wanted, "")
     if not wanted:
         return {}
     questions = [Question(linearization, model, effect, alike) for effect, alike in wanted.items()]

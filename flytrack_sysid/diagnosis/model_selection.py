@@ -8,10 +8,11 @@ import numpy as np
 from scipy import stats
 
 from flytrack_env.dynamics import collective_thrust
+from flytrack_env.effects import takes_motors
 from flytrack_sysid.inference.parameters import TAUS, THRUST_COEFFS
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import (
-    BASE_CAUSES,
+    ALL_BASE_CAUSES,
     Candidate,
     Linearization,
     candidates_for,
@@ -374,10 +375,18 @@ class BaseChange(NamedTuple):
     gain: float
 
 
+def commanded_thrust(problem: Problem, coefficients: np.ndarray) -> np.ndarray:
+    """Return the steady thrust of the commands by a thrust map, (rows, chunks) N."""
+    record = problem.chunks.record
+    num_sticks = 0 if takes_motors(problem.like.effects) else 3
+    actions, volts = record.command[..., num_sticks:], record.battery_v[..., None]
+    return np.asarray(collective_thrust(actions, volts, coefficients)).mean(axis=-1)
+
+
 def thrust_over_weight(problem: Problem, coefficients: np.ndarray) -> float:
     """Return the rms over scored rows of a thrust map, as a share of the weight."""
-    record, is_scored = problem.chunks.record, problem.counts.any(axis=(2, 3))
-    thrust = np.asarray(collective_thrust(record.command[..., 3], record.battery_v, coefficients))
+    is_scored = problem.counts.any(axis=(2, 3))
+    thrust = commanded_thrust(problem, coefficients)
     weight = float(problem.like.m) * float(problem.like.g)
     return float(np.sqrt(np.mean(thrust[is_scored] ** 2))) / weight
 
@@ -421,7 +430,8 @@ def base_changes(
     """Return the changes of the base that the log shows, by name of the cause."""
     changes = {
         name: base_change(state, linearization, model, fields)
-        for name, fields in BASE_CAUSES.items()
+        for name, fields in ALL_BASE_CAUSES.items()
+        if set(fields) <= set(state.problem.names)
     }
     return {name: change for name, change in changes.items() if change is not None}
 

@@ -14,12 +14,14 @@ from flytrack_env.effects import BY_NAME
 from flytrack_env.state import BATTERY_FULL_V
 from flytrack_sysid.diagnosis.model_selection import thrust_over_weight
 from flytrack_sysid.diagnosis.result import Cause
-from flytrack_sysid.inference.parameters import DRAIN, TAUS, THRUST_COEFFS
+from flytrack_sysid.inference.parameters import DRAIN, THRUST_COEFFS, range_of
 from flytrack_sysid.inference.problem import Problem
-from flytrack_sysid.inference.score_test import BASE_CAUSES
+from flytrack_sysid.inference.score_test import ALL_BASE_CAUSES
 
 MIN_ERROR_FRACTION = 0.02  # of the error of free flight, held out
 NOTABLE_LAG_S = 0.005  # as of the effects that delay
+CENTER, NOTABLE_CENTER_M = ALL_BASE_CAUSES["center_of_mass"], 0.002
+NOTABLE_RADIUS = 0.02  # of a radius of gyration: 4 % of the inertia
 NOTABLE_THRUST = 0.02  # of the weight, as of a scale of thrust
 NOTABLE_DRAIN_PER_MIN = 0.1  # of the battery, from full to empty: 0.2 V/min of the handout's
 
@@ -80,8 +82,8 @@ def is_notable(name: str, problem: Problem, vector: np.ndarray) -> bool:
         if abs(change) >= BY_NAME[name].notable["factor"]:
             return True
         name = "thrust_curve"  # found as one factor between two curves
-    if name in BASE_CAUSES:
-        return _is_base_notable(BASE_CAUSES[name], problem, vector)
+    if name in ALL_BASE_CAUSES:
+        return _is_base_notable(ALL_BASE_CAUSES[name], problem, vector)
     effect = BY_NAME[name]
     # Notable voltages are of the handout's battery: the same share of a smaller one matters as
     # much.
@@ -104,6 +106,14 @@ def _is_base_notable(fields: Sequence[str], problem: Problem, vector: np.ndarray
         return thrust_over_weight(problem, _change(problem, vector, fields)) >= NOTABLE_THRUST
     battery = problem.like.battery
     notable_drain = NOTABLE_DRAIN_PER_MIN * float(battery.full_v - battery.empty_v)
-    sizes = {**dict.fromkeys(TAUS, NOTABLE_LAG_S), DRAIN: notable_drain}
+    radii_m = np.abs(problem.start[problem.parameter_indices(fields)])
+    sizes = {
+        **{
+            field: NOTABLE_LAG_S if range_of(field).unit == "s" else NOTABLE_RADIUS * radius_m
+            for field, radius_m in zip(fields, radii_m, strict=True)
+        },
+        **dict.fromkeys(CENTER, NOTABLE_CENTER_M),
+        DRAIN: notable_drain,
+    }
     changes = _change(problem, vector, fields)
     return bool(np.any(np.abs(changes) >= [sizes[field] for field in fields]))

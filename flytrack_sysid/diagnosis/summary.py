@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flytrack_env.dynamics import ModelParameters, collective_thrust
+from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, effect_of
 from flytrack_sysid.diagnosis import vetoes
 from flytrack_sysid.diagnosis.identifiability import advise, unit_of, unseen_effects
@@ -13,6 +13,7 @@ from flytrack_sysid.diagnosis.model_selection import (
     BaseChange,
     Marginal,
     base_changes,
+    commanded_thrust,
     equivalents,
     separation,
 )
@@ -48,7 +49,7 @@ from flytrack_sysid.inference.parameters import (
 )
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import (
-    BASE_CAUSES,
+    ALL_BASE_CAUSES,
     Linearization,
     base_fields,
     solve,
@@ -87,14 +88,10 @@ def estimates(
 
 def mean_thrust(problem: Problem) -> np.ndarray:
     """Return the mean thrust of scored rows (N) per unit of each thrust coefficient, (6,)."""
-    record, is_scored = problem.chunks.record, problem.counts.any(axis=(2, 3))
+    is_scored = problem.counts.any(axis=(2, 3))
     return np.array(
         [
-            np.mean(
-                np.asarray(collective_thrust(record.command[..., 3], record.battery_v, coeffs))[
-                    is_scored
-                ]
-            )
+            np.mean(commanded_thrust(problem, coeffs)[is_scored])
             for coeffs in np.eye(len(THRUST_COEFFS))
         ]
     )
@@ -640,7 +637,7 @@ def stand_in_notes(selection: vetoes.Selection, vector: np.ndarray) -> list[str]
         vector: parameters of the extended model, (num_parameters,).
     """
     problem, notes = selection.state.problem, []
-    for name in (cause for cause in selection.stand_ins if cause in BASE_CAUSES):
+    for name in (cause for cause in selection.stand_ins if cause in ALL_BASE_CAUSES):
         size = ""
         if name == "thrust_curve":
             for factor in mean_factor(problem, vector, 0.0).values():

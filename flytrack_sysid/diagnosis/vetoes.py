@@ -18,7 +18,7 @@ from flytrack_sysid.diagnosis.result import Unexplained
 from flytrack_sysid.inference.chunks import AXES
 from flytrack_sysid.inference.problem import Problem, split_blocks
 from flytrack_sysid.inference.record import Record
-from flytrack_sysid.inference.score_test import BASE_CAUSES, threshold
+from flytrack_sysid.inference.score_test import ALL_BASE_CAUSES, threshold
 from flytrack_sysid.inference.search import FittedModel, SearchState
 
 # Held-out rows contradict a cause if two conditions hold. Its gain is HELD_OUT_SIGMAS standard
@@ -195,7 +195,7 @@ def find_stand_ins(
         is_gone = after < min_gain or (
             after < KEPT_SHARE * before and suspect.robust < OUTWEIGHS * rest_gain
         )
-        needed = min_gain * (DISTURBED_BASE if suspect.name in BASE_CAUSES else DISTURBED)
+        needed = min_gain * (DISTURBED_BASE if suspect.name in ALL_BASE_CAUSES else DISTURBED)
         if is_gone or (own_side in disturbed and suspect.robust < needed):
             result.append(suspect.name)
     return tuple(result)

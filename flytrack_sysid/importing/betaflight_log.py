@@ -6,6 +6,7 @@ Logs have the attitude since Betaflight 2025.12, and no velocity.
 """
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 from flytrack_env.effects import effect_of
 from flytrack_env.messages import quote_name, quote_value
 from flytrack_sysid.importing.betaflight_settings import RATES_TYPES, full_stick_rate, stick_curve
+from flytrack_sysid.importing.commands import commands_of_motors
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import (
     ImportedFlight,
@@ -48,6 +50,8 @@ PERCENT = 100.0
 # Past full stick: smoothing by a Butterworth filter overshoots a step by 4.3 %.
 MAX_OVERSHOOT = 0.05
 NUM_MOTORS = 4
+FEATURE_3D = 1 << 12  # of the header's features (Betaflight's config/feature.h)
+DSHOT, PWM = (48.0, 2047.0), (1000.0, 2000.0)  # outputs of a motor that is off, and full
 # Settings that change how thrust follows from throttle and voltage: name, neutral values, effect.
 THRUST_SETTINGS = (
     ("vbat_sag_compensation", (0,), "motors get more at a low voltage"),
@@ -119,12 +123,16 @@ def _read_log(
     remarks += clock.describe("the frames")
     times = put_on_one_line(source, {"frames": clock}, "frames")["frames"]
     table = Table(source, columns).select(clock.is_used)
-    craft = mapping.craft
+    craft, of_motors = mapping.craft, mapping.rules.motors_as_command
     if craft.max_rate_deg_s is None:
         craft = craft._replace(max_rate_deg_s=headers.full_stick_deg_s())
     full = np.array([*(craft.max_rate_deg_s or ()), FULL_THROTTLE])
     channels = _channels(table, headers)
-    channels["u"], clipped = _commands(table, headers, full)
+    clipped: list[str] = []
+    if of_motors:
+        channels["u"] = _motors_as_commands(source, table, headers)
+    else:
+        channels["u"], clipped = _commands(table, headers, full)
     if mapping.rules.motors_as_thrust:
         channels["u"][:, 3] = _thrust_of_motors(table, headers)
         clipped.append("thrust command: the mean of the motors")
@@ -133,8 +141,8 @@ def _read_log(
     remarks += [*clipped, *_motors(table, headers)]
     if "f" not in channels:
         remarks.append("no accelerometer in the log: nothing is asked of the specific force")
-    remarks += [*headers.stick_curve(), *headers.thrust_settings()]
-    log = log_of_table(table._replace(columns=columns))
+    remarks += [*([] if of_motors else headers.stick_curve()), *headers.thrust_settings()]
+    log = replace(log_of_table(table._replace(columns=columns)), has_motors=of_motors)
     return ImportedFlight(log, craft, tuple(f"{source}: {text}" for text in remarks))
 
 
@@ -280,6 +288,21 @@ def _motors(table: Table, headers: _Headers) -> list[str]:
         highest = headers.numbers("motorOutput", 2)[1]
         notes.append(saturation(np.max(table.matrix(names), axis=1) >= highest))
     return notes
+
+
+def _motors_as_commands(source: str, table: Table, headers: _Headers) -> np.ndarray:
+    """Return the outputs of the motors as commands, (num_rows, 4); -1 is off, not idle."""
+    if int(headers.numbers("features", 1, [0.0])[0]) & FEATURE_3D:
+        raise headers.error(
+            "features",
+            "found motors in 3D mode, which turn both ways, expected motors of one direction with "
+            "motors.as_command",
+        )
+    names = [name for name in table.columns if name.startswith("motor[")]
+    _, high = headers.numbers("motorOutput", 2)
+    low, high = DSHOT if high > PWM[1] or high == DSHOT[1] else PWM
+    shares = np.clip((table.matrix(names) - low) / (high - low), 0.0, 1.0) if names else None
+    return commands_of_motors(source, shares)
 
 
 def _thrust_of_motors(table: Table, headers: _Headers) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from flytrack_env.motors import NAMES
 from flytrack_sysid.importing.flight import saturation
 from flytrack_sysid.importing.units import PER_DEGREE
 from flytrack_sysid.log import LogError
@@ -35,6 +36,7 @@ class CommandRules(NamedTuple):
         attitude_gain: of roll, pitch, yaw (rad/s per rad); 0 to identify one.
         rate_gain: of roll, pitch, yaw (N m per rad/s); None to identify it.
         motors_as_thrust: the mean of the motors replaces the thrust command.
+        motors_as_command: the outputs of four motors are the commands.
         motor_torque: about x, y, z by each motor at its upper end, (3, num_motors) N m; None where
             torques are logged or unknown.
     """
@@ -42,6 +44,7 @@ class CommandRules(NamedTuple):
     attitude_gain: tuple[float, ...] = (0.0, 0.0, 0.0)
     rate_gain: tuple[float, ...] | None = None
     motors_as_thrust: bool = False
+    motors_as_command: bool = False
     motor_torque: tuple[tuple[float, ...], ...] | None = None
 
 
@@ -70,6 +73,8 @@ def read_commands(
     notes: tuple[str, ...] = ()
     if "motors" in channels:
         notes += (f"{source}: {saturation(channels['motors'].max(axis=1) >= 1.0)}",)
+    if rules.motors_as_command:
+        return commands_of_motors(source, channels.get("motors")), notes
     thrust, new_notes = _thrust(source, channels, rules)
     notes += new_notes
     if "u" in channels:
@@ -91,6 +96,28 @@ def read_commands(
             f"{source}: commands clipped to [-1, 1] in {is_past.sum()} of {len(is_past)} rows",
         )
     return np.clip(commands, -1.0, 1.0), notes
+
+
+def commands_of_motors(source: str, motors: np.ndarray | None) -> np.ndarray:
+    """Return the outputs of four motors, 0 to 1, as commands, (num_rows, 4) in [-1, 1].
+
+    Raises:
+        LogError: another number of motors, or a motor that stands still while others move.
+    """
+    where = f"{source}: motors.as_command"
+    if motors is None:
+        raise LogError(f"{where}: found no motor outputs in the log or mapping")
+    if motors.shape[1] != len(NAMES):
+        found = f"found {motors.shape[1]} motors"
+        raise LogError(f"{where}: {found}, expected the 4 of a quadcopter: {', '.join(NAMES)}")
+    spans = np.ptp(motors, axis=0)
+    for name, span, first in zip(NAMES, spans, motors[0], strict=True):
+        if span == 0.0 < spans.max():
+            raise LogError(
+                f"{where}: motor {name}: found {first:.4g} of its range in every row while others "
+                "move, expected the output of a motor in flight"
+            )
+    return 2.0 * motors - 1.0
 
 
 def _thrust(

@@ -109,6 +109,11 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
         craft = craft._replace(
             max_rate_deg_s=_full_stick_deg_s(path, parameters, chosen["RATE"], remarks)
         )
+    if mapping.rules.motors_as_command:
+        raise LogError(
+            f"{mapping.source}: motors.as_command: not read of ArduPilot logs, whose motors have "
+            "another order; expected false"
+        )
     channels = _channels(chosen, parameters, np.array(craft.max_rate_deg_s), remarks)
     topics = [
         Table(str(path), {TIMESTAMP: fields[TIME] * UNITS["time"]["us"], **_named(name, fields)})

@@ -7,6 +7,7 @@ import numpy as np
 
 from flytrack_env.battery import Battery
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
+from flytrack_env.effects import Motors
 from flytrack_env.files import open_file
 from flytrack_env.messages import error_text
 from flytrack_env.motion import Motion
@@ -23,15 +24,17 @@ class Craft(NamedTuple):
         max_rate_deg_s: body rates of roll, pitch and yaw at a command of 1.
         mass_kg: mass.
         voltage_v: lowest and highest voltage in flight.
+        motors: the frame, where the commands are those of motors.
     """
 
     max_rate_deg_s: tuple[float, float, float] | None = None
     mass_kg: float | None = None
     voltage_v: tuple[float, float] | None = None
+    motors: Motors | None = None
 
     def describe(self) -> str:
         """Return one line on the craft."""
-        rates = "full stick unknown"
+        rates = "full stick unknown" if self.motors is None else "commands of motors"
         if self.max_rate_deg_s:
             rates = f"full stick {', '.join(f'{rate:.4g}' for rate in self.max_rate_deg_s)} deg/s"
         mass = f"mass {self.mass_kg:g} kg" if self.mass_kg else "mass unknown"
@@ -39,6 +42,12 @@ class Craft(NamedTuple):
         if self.voltage_v:
             volts = f"voltage {self.voltage_v[0]:.4g} to {self.voltage_v[1]:.4g} V"
         return f"craft: {rates}; {mass}; {volts}"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what is known as JSON values; without the frame of motors where there is none."""
+        values = self._asdict()
+        motors = values.pop("motors")
+        return values if motors is None else {**values, "motors": motors._asdict()}
 
     def nominal_model(self, source: str) -> ModelParameters:
         """Return the generic racing quadcopter scaled to this craft, as a start for fits.
@@ -53,25 +62,29 @@ class Craft(NamedTuple):
         Raises:
             LogError: full-stick rates, mass or voltage are unknown.
         """
-        if self.max_rate_deg_s is None or self.mass_kg is None or self.voltage_v is None:
-            name = next(name for name, value in self._asdict().items() if value is None)
-            raise LogError(f"{source}: craft.{name}: missing in log and mapping; a model needs it")
         nominal = nominal_parameters()
+        max_rate = self.max_rate_deg_s
+        if max_rate is None and self.motors is not None:  # a unit of its observations only
+            max_rate = tuple(nominal.max_rate.tolist())
+        if max_rate is None or self.mass_kg is None or self.voltage_v is None:
+            name = next(name for name in Craft._fields if getattr(self, name) is None)
+            raise LogError(f"{source}: craft.{name}: missing in log and mapping; a model needs it")
         empty_v, full_v = self.voltage_v
         per_volt = float(nominal.battery.full_v) / full_v
         coeffs = np.asarray(nominal.thrust_coeffs, float) * self.mass_kg / float(nominal.m)
         coeffs[VOLTAGE_TERMS:] *= per_volt
         leaves: dict[str, Any] = {  # NumPy arrays
             "thrust_coeffs": coeffs.astype(np.float32),
-            "max_rate": np.asarray(self.max_rate_deg_s, np.float32),
+            "max_rate": np.asarray(max_rate, np.float32),
         }
-        return nominal._replace(
+        model = nominal._replace(
             **leaves,
             m=self.mass_kg,
             motion=Motion.CONTINUOUS,  # as drones move
             battery_drain_v_per_min=float(nominal.battery_drain_v_per_min) / per_volt,
             battery=Battery(full_v, empty_v, fitted_low_v=empty_v, fitted_high_v=full_v),
         )
+        return model if self.motors is None else model.with_effects(self.motors)
 
 
 class ImportedFlight(NamedTuple):

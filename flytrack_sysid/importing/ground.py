@@ -121,7 +121,7 @@ def _blocks_of(log: FlightLog) -> _Blocks | None:
             acc_w = np.gradient(mean(velocity), mean(log.time[:, None])[:, 0], axis=0)
         size = np.linalg.norm(acc_w / GRAVITY + np.array([0.0, 0.0, 1.0]), axis=1)
     is_at_rest = is_motionless & (np.abs(size - 1.0) <= MAX_FORCE_ERROR)
-    throttle = 0.5 * (mean(log["u"][:, 3:])[:, 0] + 1.0)
+    throttle = 0.5 * (mean(log.throttle[:, None])[:, 0] + 1.0)
     is_level = ~is_at_rest & (np.abs(size - 1.0) <= LEVEL_FORCE_ERROR)
     return _Blocks(of_row, throttle, is_at_rest, is_level, is_start[starts])
 

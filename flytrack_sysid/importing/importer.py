@@ -96,7 +96,7 @@ class Imported:
         document = {
             "sha256": self.log.sha256,
             "sources": self.sources,
-            "craft": self.craft._asdict(),
+            "craft": self.craft.as_json(),
             "clocks": [offset.as_json() for offset in self.offsets],
             "notes": self.notes,
             "problems": self.problems,
@@ -195,7 +195,7 @@ def _flights_in_the_air(
         elif num_ground == num_used:
             reasons.append(f"{source}: nothing flies: on the ground in all {num_used} rows")
             continue
-        elif log["u"][is_used, 3].max() < MIN_THRUST:
+        elif log.throttle[is_used].max() < MIN_THRUST:
             reasons.append(
                 f"{source}: nothing flies: the thrust command never exceeds 5 % of its range"
             )

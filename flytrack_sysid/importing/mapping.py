@@ -14,7 +14,9 @@ import numpy as np
 from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
+from flytrack_env.effects import BY_NAME, Motors
 from flytrack_env.messages import error_text, quote_name, quote_value
+from flytrack_env.motors import NAMES
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
 from flytrack_env.validation import (
     Fields,
@@ -33,6 +35,7 @@ from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import MAX_NORM_ERROR, Table
 
 SHIPPED = Path(__file__).parent.parent / "mappings"
+FRAMES = Path(__file__).parent.parent / "frames.toml"
 NUM_AXES = 3
 UNSIGNED = (1.0, 1.0, 1.0)
 Count = Annotated[int, Meta(ge=1, le=10**9)]
@@ -405,18 +408,24 @@ class TorqueCommand(RateGainFields):
         return result + ([_scaled(table, "reference_rates", rates, 1.0)] if rates else [])
 
 
-class Motors(RateGainFields):
+class MotorFields(RateGainFields):
     """The motors' outputs, and what follows from them; ``CommandRules`` describes the fields."""
 
     columns: tuple[Text, ...] = ()
     low: Finite | None = None
     high: Finite | None = None
     as_thrust: bool = False
+    as_command: bool = False
     torque_n_m: tuple[tuple[Finite, ...], tuple[Finite, ...], tuple[Finite, ...]] | None = None
 
     def channels(self, table: str) -> list[Channel]:
         """Return the channel of outputs, 0 to 1, if there are columns."""
         low, high = self.low, self.high
+        if self.as_command and self.columns and len(self.columns) != len(NAMES):
+            raise ValueError(
+                f"columns: found {len(self.columns)} motors, expected the 4 of a quadcopter with "
+                f"as_command, in the order {', '.join(NAMES)}"
+            )
         if self.torque_n_m is not None and {len(row) for row in self.torque_n_m} != {
             len(self.columns)
         }:
@@ -437,6 +446,78 @@ class Motors(RateGainFields):
         return [Channel(table, "motors", self.columns, scale)]
 
 
+class Frame(Fields):
+    """The frame of a craft whose commands are those of motors, and what turns it.
+
+    Attributes:
+        craft: name of a known craft, whose numbers the other fields replace.
+        mass_kg: of the craft.
+        front_m: how far the front motors are ahead and aside of the middle.
+        rear_m: how far the rear motors are behind and aside of it.
+        inertia_kg_m2: about the body's axes.
+        yaw_arm_m: torque of a propeller over its thrust.
+        propellers: "in", as Betaflight's default, or "out".
+        lag_s: of a motor that speeds up, and of one that slows down.
+        rotor_momentum: of a rotor at full command, kg m^2/s.
+    """
+
+    craft: Text | None = None
+    mass_kg: Positive | None = None
+    front_m: tuple[Positive, Positive] | None = None
+    rear_m: tuple[Positive, Positive] | None = None
+    inertia_kg_m2: ThreePositive | None = None
+    yaw_arm_m: Positive | None = None
+    propellers: Literal["in", "out"] = "in"
+    lag_s: tuple[Positive, Positive] = (0.03, 0.03)
+    rotor_momentum: Annotated[float, Meta(ge=0.0)] = 0.0
+
+    def known(self) -> "Frame":
+        """Return the frame with the numbers of its known craft; raises ValueError."""
+        if self.craft is None:
+            return self
+        crafts = _load(FRAMES)
+        values = crafts[choose("craft", self.craft, crafts)]
+        default = Frame()
+        given = {
+            name: getattr(self, name)
+            for name in Frame.__struct_fields__
+            if getattr(self, name) != getattr(default, name)
+        }
+        return msgspec.convert({**values, **given}, Frame)
+
+    def motors(self, mass_kg: float | None) -> Motors:
+        """Return the parameters of the effect; raises ValueError.
+
+        Args:
+            mass_kg: of the craft.
+        """
+        for name in ("front_m", "rear_m", "inertia_kg_m2", "yaw_arm_m"):
+            if getattr(self, name) is None:
+                raise ValueError(f"{name}: missing; a craft of [frame] has it")
+        if mass_kg is None:
+            raise ValueError("mass_kg: missing in [frame] and [craft]; its inertia is over it")
+        assert self.front_m and self.rear_m and self.inertia_kg_m2 and self.yaw_arm_m
+        radii = np.sqrt(np.array(self.inertia_kg_m2) / mass_kg).tolist()
+        turn = 1.0 if self.propellers == "in" else -1.0
+        motors = Motors(
+            *self.front_m,
+            *self.rear_m,
+            radius_x=radii[0],
+            radius_y=radii[1],
+            radius_z=radii[2],
+            yaw_arm=turn * self.yaw_arm_m,
+            rotor_momentum=turn * self.rotor_momentum / mass_kg,
+            up_s=self.lag_s[0],
+            down_s=self.lag_s[1],
+        )
+        for name, bounds in BY_NAME["motors"].ranges.items():
+            value = getattr(motors, name)
+            if not bounds.low <= value <= bounds.high:
+                expected = f"{bounds.low:g} to {bounds.high:g} {bounds.unit}"
+                raise ValueError(f"{name}: found {value:.4g}, expected {expected}")
+        return motors
+
+
 class MappingFile(Fields):
     """A mapping file; the tables from ``time`` to ``motors`` describe columns."""
 
@@ -452,20 +533,22 @@ class MappingFile(Fields):
     thrust_command: ThrustCommand | None = None
     attitude_command: AttitudeCommand | None = None
     torque_command: TorqueCommand | None = None
-    motors: Motors | None = None
+    motors: MotorFields | None = None
     rows: UsedRows = msgspec.field(default_factory=UsedRows)
     craft: CraftFields = msgspec.field(default_factory=CraftFields)
+    frame: Frame | None = None
     files: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
     delimiter: Annotated[str, Meta(min_length=1, max_length=1)] = ","
 
     def rules(self) -> CommandRules:
         """Return how commands follow from setpoints and motors."""
-        motors, torque = self.motors or Motors(), self.torque_command
+        motors, torque = self.motors or MotorFields(), self.torque_command
         rate_gain = torque.stated_gain if torque else None
         return CommandRules(
             attitude_gain=self.attitude_command.gain if self.attitude_command else (0.0, 0.0, 0.0),
             rate_gain=rate_gain or motors.stated_gain,
             motors_as_thrust=motors.as_thrust,
+            motors_as_command=motors.as_command,
             motor_torque=motors.torque_n_m,
         )
 
@@ -529,7 +612,7 @@ def load_mapping(where: str | Path) -> Mapping:
     return Mapping(
         source=source,
         rows=file.rows,
-        craft=Craft(file.craft.max_rate_deg_s, file.craft.mass_kg, file.craft.voltage_v),
+        craft=_craft(source, file),
         channels=tuple(channels),
         rules=file.rules(),
         files={
@@ -538,6 +621,19 @@ def load_mapping(where: str | Path) -> Mapping:
         },
         delimiter=file.delimiter,
     )
+
+
+def _craft(source: str, file: MappingFile) -> Craft:
+    """Return what a mapping states of the craft."""
+    craft = Craft(file.craft.max_rate_deg_s, file.craft.mass_kg, file.craft.voltage_v)
+    if file.frame is None:
+        return craft
+    try:
+        frame = file.frame.known()
+        mass_kg = craft.mass_kg or frame.mass_kg
+        return craft._replace(mass_kg=mass_kg, motors=frame.motors(mass_kg))
+    except ValueError as error:
+        raise LogError(f"{source}: {join_text('frame', str(error))}") from error
 
 
 def _load(path: Path) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -219,4 +220,6 @@ def _flight(
     )
     columns = columns_of(time, {**values, "u": commands})
     columns["segment"] = number_segments(time, max_gap_s)
-    return ImportedFlight(log_of_table(table._replace(columns=columns)), mapping.craft, notes)
+    log = log_of_table(table._replace(columns=columns))
+    log = replace(log, has_motors=mapping.rules.motors_as_command)
+    return ImportedFlight(log, mapping.craft, notes)

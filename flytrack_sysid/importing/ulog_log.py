@@ -105,10 +105,11 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
     Raises:
         LogError: the file is no ULog, or at no time has rates, attitude and rate setpoints.
     """
-    if mapping.rules.motors_as_thrust:
+    for name in ("as_thrust", "as_command"):
+        if not getattr(mapping.rules, f"motors_{name}"):
+            continue
         raise LogError(
-            f"{mapping.source}: motors.as_thrust: not read of PX4 logs: actuator outputs are too "
-            "slow"
+            f"{mapping.source}: motors.{name}: not read of PX4 logs: actuator outputs are too slow"
         )
     samples, clocks, parameters, remarks = _decode(path)
     craft = mapping.craft

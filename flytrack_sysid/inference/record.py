@@ -118,6 +118,18 @@ def _velocity(log: FlightLog) -> np.ndarray:
     return velocity
 
 
+def _applied(log: FlightLog) -> np.ndarray:
+    """Return the applied action, or what stands for it where none is logged, (num_rows, 4).
+
+    That is the command; of motors a craft that does not turn, at their mean.
+    """
+    if "uprev" in log:
+        return log["uprev"]
+    if not log.has_motors:
+        return log["u"]
+    return np.pad(log.throttle[:, None], ((0, 0), (3, 0)))
+
+
 class Filled(NamedTuple):
     """A log with rows interpolated in its gaps.
 
@@ -173,7 +185,7 @@ def build_record(filled: Filled) -> Record:
         command_doubt=filled.command_doubt,
         begins=begins,
         is_applied_known=(begins | after_gap) & ("uprev" in log),
-        applied=log["uprev"] if "uprev" in log else log["u"],
+        applied=_applied(log),
         pos_w=log.channels.get("p", zeros),
         vel_w=_velocity(log),
         quat=log["q"] if "q" in log else np.tile(UPRIGHT, (len(log), 1)),

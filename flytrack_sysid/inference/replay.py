@@ -14,12 +14,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from flytrack_env.dynamics import ModelParameters, Moved, body_rates, move
-from flytrack_env.effects import MAX_DELAY_STEPS, at_row, start_memories
+from flytrack_env.dynamics import (
+    ModelParameters,
+    Moved,
+    body_rates,
+    move,
+    observe_rates,
+    read_gyro,
+)
+from flytrack_env.effects import MAX_DELAY_STEPS, at_row, start_memories, takes_motors
 from flytrack_env.fusion import one_kernel
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_sysid.inference.record import Record
+
+# Time over which rates that follow from torques are moved to the gyro's: long against its noise,
+# short against what a torque of some tenths of rad/s^2, which a model lacks, adds up to.
+OBSERVED_S = 0.1
 
 
 class Step(NamedTuple):
@@ -63,6 +74,24 @@ def measured_drone(row: Record, applied: Action, rates_b: Vec3) -> Drone:
     )
 
 
+def _observed(
+    model: ModelParameters,
+    before: Drone,
+    memories: tuple[Any, ...],
+    row: Record,
+    gyro_b: jax.Array,
+    share: jax.Array,
+) -> tuple[Drone, tuple[Any, ...]]:
+    """Return drone and memories with body rates moved to the gyro's by a share of the way.
+
+    From sticks rates follow within a time, from torques the errors of a model add up without end.
+    """
+    offset_b = Vec3(*gyro_b) - read_gyro(before, memories, row.step_s, model)
+    offset_b = where_true(jnp.isnan(gyro_b[0]), Vec3(*jnp.zeros_like(gyro_b)), offset_b)
+    rates_b = before.rates_b + offset_b.scale(share)
+    return observe_rates(before, memories, rates_b, row.step_s, model)
+
+
 class ReplayState(NamedTuple):
     """The state of a replay between rows; ``memories`` are those of the effects."""
 
@@ -90,6 +119,8 @@ def replay_row(
     steady_b = body_rates(applied, model.max_rate)
     first_b = where_true(jnp.isnan(gyro_b[0]), steady_b, Vec3(*gyro_b))
     rates_b = first_b if is_gyro_fed else where_true(row.begins, first_b, state.rates_b)
+    of_motors = takes_motors(model.effects)
+    rates_b = steady_b if of_motors else rates_b  # the applied action has them
     before = measured_drone(row, applied, rates_b)
     # The logged action, which is the applied one where a flight begins: so past commands depend on
     # no model of a batch.
@@ -98,6 +129,10 @@ def replay_row(
         row.begins, start_memories(model.effects, begun, MAX_DELAY_STEPS), state.memories
     )
     memories = at_row(memories, row.time_s)
+    if of_motors:
+        share = 1.0 - jnp.exp(-row.step_s / OBSERVED_S)
+        share = jnp.where(row.begins | is_gyro_fed, 1.0, share)
+        before, memories = _observed(model, before, memories, row, gyro_b, share)
     moved = move(before, memories, Action(*row.command), row.step_s, model)
     after = ReplayState(moved.after.applied, moved.after.rates_b, moved.memories)
     return after, Step(row, before, memories, moved, model)

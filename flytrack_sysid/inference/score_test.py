@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg, stats
 
-from flytrack_env.effects import BY_NAME, Effect
+from flytrack_env.effects import BY_NAME, EFFECTS, Effect, acts_on_sticks, takes_motors
 from flytrack_sysid.inference.parameters import DRAIN, TAUS, THRUST_COEFFS, neutral_value, range_of
 from flytrack_sysid.inference.problem import (
     SEARCHED,
@@ -38,13 +38,23 @@ BASE_CAUSES = {
     "battery_drain": (DRAIN,),
 }
 
+# The same with those of the effects of a craft, which a model has or has not.
+ALL_BASE_CAUSES = {
+    **BASE_CAUSES,
+    **{
+        name: tuple(f"{effect.name}.{field}" for field in fields)
+        for effect in EFFECTS
+        for name, fields in effect.search.base_causes.items()
+    },
+}
+
 
 def base_fields(cause: str) -> tuple[str, ...]:
     """Return the base parameters of a cause; none if it is an effect of its own.
 
     Those of a scale of thrust, which is one factor between two curves, are the curve's.
     """
-    return BASE_CAUSES.get("thrust_curve" if cause == "thrust_scale" else cause, ())
+    return ALL_BASE_CAUSES.get("thrust_curve" if cause == "thrust_scale" else cause, ())
 
 
 class Probe(NamedTuple):
@@ -153,11 +163,22 @@ def find_families(effect: Effect) -> list[set[str]]:
 CANDIDATES = [candidate for effect in SEARCHED for candidate in list_candidates(effect)]
 
 
+def searched_in(problem: Problem) -> list[str]:
+    """Return the names of the effects that are looked for, in the order of the list.
+
+    What acts on sticks and on the rates that follow them is not part of a craft whose motors are
+    commanded.
+    """
+    has_sticks = not takes_motors(problem.like.effects)
+    return [effect.name for effect in SEARCHED if has_sticks or not acts_on_sticks(effect)]
+
+
 def candidates_for(problem: Problem) -> list[Candidate]:
     """Return the candidates: effects of the list, and settings of the craft that may change."""
+    searched = searched_in(problem)
     given = [BY_NAME[name] for name in problem.given_effects if BY_NAME[name].search.is_setting]
     return [
-        *CANDIDATES,
+        *(candidate for candidate in CANDIDATES if candidate.effect in searched),
         *(
             candidate
             for effect in given

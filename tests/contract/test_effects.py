@@ -18,6 +18,7 @@ from flytrack_env.effects import (
     CommandDelay,
     ImuLatency,
     LinearDrag,
+    Motors,
     ThrustScale,
     Wind,
     check_parameters,
@@ -47,12 +48,18 @@ RACER = BetaflightLoop(
     20.0, 21.0, 2.0, 2.0, 0.02, 0.5, **SHOWING, thrust_linear=20.0, throttle_boost=10.0
 )
 
+FRAME = Motors(
+    *(0.1, 0.11, 0.09, 0.12, 0.004, 0.003, 0.08, 0.09, 0.1, 0.1, 0.08, 0.05, 0.015, 0.01),
+    *(0.03, 0.04, 0.5, 0.6, 0.7, 0.1, 0.9, 1.1, 1.05, 0.95),
+)
+CRAFTS = {"betaflight_loop": RACER, "motors": FRAME}  # nothing acts without one
+
 
 def inside_ranges(effect, fraction):
     """Return parameters that lie that far from neutral towards the upper end of their ranges."""
     neutral = effect.parameters()
-    if "respond" in effect.hooks and fraction > 0.0:
-        return RACER
+    if effect.name in CRAFTS and fraction > 0.0:
+        return CRAFTS[effect.name]
     values = (
         n + fraction * (r.high - n) for n, r in zip(neutral, effect.ranges.values(), strict=True)
     )
@@ -109,7 +116,7 @@ def test_probes_show_the_effect(effect):
     plain = flown((), full_stick, drone)
     for name, values in effect.search.probes.items():
         for value in values:
-            start = effect.parameters() if "respond" not in effect.hooks else RACER
+            start = CRAFTS.get(effect.name, effect.parameters())
             assert not np.array_equal(
                 flown(start._replace(**{name: value}), full_stick, drone), plain
             )
@@ -179,7 +186,11 @@ def test_gradients_are_finite_and_right(effect, fraction):
         if fraction == 0.0 and name in effect.search.shapes:
             assert not slope.any()
             continue
-        size = bounds.high - bounds.low if "respond" not in effect.hooks else getattr(RACER, name)
+        size = (
+            getattr(CRAFTS[effect.name], name, 0.0)
+            if effect.name in CRAFTS
+            else (bounds.high - bounds.low)
+        )
         change = np.float32(2e-3 * size)
         shift = jax.tree.map(partial(np.multiply, change), tangent)
         moved = jax.tree.map(np.add, parameters, shift)

@@ -29,7 +29,7 @@ from flytrack_sysid.diagnosis.result import (
 )
 from flytrack_sysid.diagnosis.traces import REGRESSORS, traces
 from flytrack_sysid.inference.parameters import names_of, to_vector, with_values
-from flytrack_sysid.inference.score_test import BASE_CAUSES
+from flytrack_sysid.inference.score_test import ALL_BASE_CAUSES, BASE_CAUSES
 from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, Verdict, page
 from tests.contract.test_effects import inside_ranges
 from tests.support.hidden_flights import scripted
@@ -142,7 +142,8 @@ def test_every_cause_has_a_plot_in_which_it_shows(flown, are_settings):
     causes = [effect.name for effect in effects]
     if not are_settings:
         causes += BASE_CAUSES
-        assert set(EVIDENCE) == {*causes, *(effect.name for effect in SETTINGS)}
+        names = {*causes, *ALL_BASE_CAUSES, *(effect.name for effect in SETTINGS)}
+        assert set(EVIDENCE) == names
     models = {"without": base, **{cause: shown(base, cause) for cause in causes}}
     found = traces(log, models, like="without")
     sizes = {"rates": 0.01, "attitude": 0.01, "force": 0.05, "velocity": 0.05, "battery": 0.02}

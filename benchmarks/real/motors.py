@@ -1,0 +1,144 @@
+"""Measured flights from their motors: ``python -m benchmarks.real.motors``.
+
+The first half of each flight is learnt from, the second is predicted, beside a linear ARX of the
+same motors and rates. Then the parameters of two flights of one craft, and the rotor drag of a
+simulated flight of others (PX4 in Gazebo), whose truth is known. Flights come from
+``benchmarks.real.crazyflie.DATA``.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import tyro
+
+from benchmarks import report
+from benchmarks.real.black_boxes import (
+    base_steps,
+    fit_linear_boxes,
+    fly_windows,
+    rows_of,
+    with_pose,
+)
+from benchmarks.real.crazyflie import DATA, MAX_WINDOWS
+from flytrack_sysid import FitError, fit, import_log
+from flytrack_sysid.fit import Fit
+from flytrack_sysid.importing.importer import Imported
+from flytrack_sysid.inference.chunks import at_usual_rate
+from flytrack_sysid.inference.free_flight import (
+    HORIZONS_S,
+    QUANTITIES,
+    evaluate_windows,
+    make_windows,
+)
+
+MAPPINGS = Path(__file__).parent / "mappings"
+HORIZON = HORIZONS_S.index(0.25)
+RATES = QUANTITIES.index("rates")
+SPACING_S = 0.1
+ROTOR_DRAG = 0.0378  # s/m, of the Gazebo flight: its data's README
+LAGS = {"motors.up_s": 0.02, "motors.down_s": 0.03}
+
+
+class Craft(NamedTuple):
+    """A craft's files, format and mapping, and the values that are not fitted."""
+
+    files: tuple[str, ...]
+    format: str
+    mapping: str
+    fixed: Mapping[str, float] = {}
+
+
+CRAFTS = {
+    "Betaflight 6S": Craft(("betaflight_acro_log/shortLog.BFL",), "betaflight", "acro_motors"),
+    "Gecko": Craft(("bf_gecko/btfl_002.bbl",), "betaflight", "gecko_motors", LAGS),
+    "Crazyflie, log15": Craft(("cf_arpl_motors/log15",), "usd", "arpl_motors"),
+}
+
+
+def read(craft: Craft) -> Imported:
+    """Return the flight of a craft."""
+    files = [DATA / file for file in craft.files]
+    return import_log(files, craft.format, MAPPINGS / f"{craft.mapping}.toml")
+
+
+def predicted(craft: Craft) -> dict[str, float]:
+    """Return the errors of the rates after 0.25 s in the second half, rms in rad/s, and sizes."""
+    flight = read(craft)
+    log = at_usual_rate(flight.log)[0]
+    step_s = float(np.median(np.diff(log.time)))  # even: an ARX has as many rows in any part
+    log = replace(log, time=step_s * np.arange(len(log)), segment=np.zeros(len(log), int))
+    is_test = np.arange(len(log)) >= len(log) // 2
+    train = log.select(~is_test)
+    found = fit(train, flight.nominal_model(), craft.fixed, every=0, accept=True)
+    windows = make_windows(log, is_test, SPACING_S, MAX_WINDOWS)
+    boxes = fit_linear_boxes(rows_of(with_pose(train), found.model))
+    base = base_steps(found.model, with_pose(log))
+    errors = {
+        "motors": evaluate_windows(found.model, windows),
+        "arx": fly_windows(boxes["arx"], windows, base).errors[0],
+    }
+    counts = windows.counts[HORIZON, :, RATES]
+    result = {
+        name: float(np.sqrt(np.mean(np.sum(values[HORIZON, counts, RATES] ** 2, axis=-1))))
+        for name, values in errors.items()
+    }
+    return {**result, "ratio": result["motors"] / result["arx"], "windows": int(counts.sum())}
+
+
+def overlap(fits: Sequence[Fit]) -> tuple[list[bool], list[str]]:
+    """Return whether the intervals of two flights overlap, by parameter, and the parameters."""
+    first, second = (one.intervals for one in fits)
+    names = [name for name in first if name in second and name.startswith("motors.")]
+    flags = [
+        first[name].low <= second[name].high and second[name].low <= first[name].high
+        for name in names
+    ]
+    return flags, names
+
+
+def two_flights() -> list[Fit]:
+    """Return the fits of two flights of one Crazyflie."""
+    fits = []
+    for name in ("log15", "log16"):
+        craft = Craft((f"cf_arpl_motors/{name}",), "usd", f"arpl_motors_{name}")
+        flight = read(craft)
+        fits.append(fit(flight.log, flight.nominal_model(), accept=True))
+    return fits
+
+
+def rotor_drag() -> Fit:
+    """Return the fit of the flight in Gazebo, with linear and rotor drag."""
+    flight = read(Craft(("eth_quadrotor_model/quadrotor_model.csv",), "csv", "eth_motors"))
+    return fit(
+        flight.log, flight.nominal_model(), effects=("rotor_drag", "linear_drag"), accept=True
+    )
+
+
+def main(out: Path | None = None) -> None:
+    """Measure and print; out: a file of JSON values."""
+    results: dict[str, Any] = {"commit": report.commit_of_checkout()}
+    for name, craft in CRAFTS.items():
+        try:
+            results[name] = predicted(craft)
+        except FitError as error:
+            results[name] = str(error)
+        print(name, results[name], flush=True)
+    fits = two_flights()
+    flags, names = overlap(fits)
+    results["two flights"] = {
+        name: [list(one.intervals[name]) for one in fits] + [flag]
+        for name, flag in zip(names, flags, strict=True)
+    }
+    print(f"overlapping: {sum(flags)} of {len(flags)}", results["two flights"], flush=True)
+    drag = rotor_drag().intervals["rotor_drag.h"]
+    results["rotor drag"] = list(drag)
+    print("rotor drag", drag, drag.low <= ROTOR_DRAG <= drag.high)
+    if out is not None:
+        report.write_json(out, results)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,115 @@
+"""Logs whose commands are the outputs of motors: imports, checks, fits and what they refuse."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flytrack_env import nominal_parameters
+from flytrack_env.motors import NAMES
+from flytrack_env.toml_file import parse_toml
+from flytrack_sysid.check import check_log, text_of
+from flytrack_sysid.check.fix import fix_mapping
+from flytrack_sysid.fit import fit
+from flytrack_sysid.importing import import_log
+from flytrack_sysid.log import LogError
+from flytrack_sysid.log_file import load_log, save_log
+from flytrack_sysid.plausibility import find_problems
+from flytrack_sysid.validate import validate
+from tests.support.motor_flights import COLUMNS, flown, write_csv
+from tests.support.motor_models import crafts, model_of
+
+
+@pytest.fixture(scope="module")
+def log():
+    return flown()
+
+
+def test_motors_of_a_table_become_commands_of_a_craft(log, tmp_path):
+    path, mapping = write_csv(tmp_path, log)
+    found = import_log(path, "csv", mapping)
+    assert found.log.has_motors and not found.problems
+    np.testing.assert_allclose(found.log["u"], log["u"], atol=1e-9)
+    save_log(tmp_path / "log.npz", found.log)
+    again = load_log(tmp_path / "log.npz")
+    assert again.has_motors and again.sha256 == found.log.sha256
+    model = found.nominal_model()
+    truth = model_of(crafts()).effect("motors")
+    motors = model.effect("motors")
+    for name in ("front_y", "rear_y", "radius_x", "radius_y", "radius_z", "yaw_arm", "down_s"):
+        assert getattr(motors, name) == pytest.approx(getattr(truth, name), rel=1e-6)
+
+
+def test_a_known_craft_has_a_frame_that_a_mapping_may_change(log, tmp_path):
+    path, mapping = write_csv(tmp_path, log, frame='craft = "iris"\npropellers = "out"')
+    motors = import_log(path, "csv", mapping).nominal_model().effect("motors")
+    assert motors.front_y == 0.09 and motors.yaw_arm == -0.013
+
+
+@pytest.mark.parametrize(
+    ("columns", "frame", "expected"),
+    [
+        (COLUMNS[:3], "", r"motors\.columns: found 3 motors, expected the 4 of a quadcopter"),
+        ([*COLUMNS, "w0", "w1"], "", r"found 6 motors, expected the 4 of a quadcopter"),
+        (COLUMNS, 'craft = "boat"', r"frame\.craft: found 'boat', expected one of crazyflie_2"),
+        (COLUMNS, "rotor_momentum = 5.0", r"frame\.rotor_momentum: found 6.25, expected -0.5 to"),
+    ],
+)
+def test_what_no_quadcopter_has_is_refused(log, tmp_path, columns, frame, expected):
+    path, mapping = write_csv(tmp_path, log, columns, frame)
+    with pytest.raises(LogError, match=expected):
+        import_log(path, "csv", mapping)
+
+
+def test_a_motor_that_stands_still_is_named(log, tmp_path):
+    still = replace(log, channels={**log.channels, "u": log["u"] * [1.0, 1.0, 0.0, 1.0]})
+    path, mapping = write_csv(tmp_path, still)
+    with pytest.raises(LogError, match=r"motor rear_left: found 0\.5 of its range in every row"):
+        import_log(path, "csv", mapping)
+    assert "motor rear_left: found 0 in every row" in find_problems(still)[0]
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (1, 0, 2, 3), (3, 1, 2, 0), (2, 3, 0, 1)])
+def test_the_order_of_motors_is_found_and_corrected(log, tmp_path, order):
+    columns = [COLUMNS[motor] for motor in order]
+    swapped = replace(log, channels={**log.channels, "u": log["u"][:, list(order)]})
+    found = check_log(swapped)
+    if order == (0, 1, 2, 3):
+        assert not found.contradicts
+        return
+    held = " ".join(str(motor + 1) for motor in order)
+    assert f"hold motors {held}, read as 1 2 3 4" in text_of(found)
+    assert any("hold motors" in problem for problem in find_problems(swapped))
+    _, mapping = write_csv(tmp_path, log, columns)
+    fixed = fix_mapping(mapping.read_text(), found.explanations[0])
+    assert not fixed.left and parse_toml(fixed.text)["motors"]["columns"] == COLUMNS
+
+
+def test_commands_of_another_kind_than_the_models_are_refused(log):
+    sticks = replace(log, has_motors=False)
+    model = model_of(crafts())
+    with pytest.raises(LogError, match="found commands of sticks, and a model that takes motors"):
+        validate(model, sticks)
+    with pytest.raises(LogError, match="found commands of motors, and a model that takes sticks"):
+        fit(log, nominal_parameters(), accept=True)
+    with pytest.raises(LogError, match="w: missing, expected the gyro"):
+        validate(model, log.without("w"))
+
+
+@pytest.mark.slow
+def test_a_fit_finds_the_craft():
+    truth = crafts(inertia=np.diag([0.0048, 0.0043, 0.009]), up_s=0.035, down_s=0.05)
+    log = flown(truth, 40.0)
+    start = model_of(crafts())
+    found = fit(log, start, accept=True)
+    expected = model_of(truth).effect("motors")
+    for name in ("radius_x", "radius_y", "radius_z", "up_s", "down_s"):
+        value, low, high = found.intervals[f"motors.{name}"]
+        assert low < getattr(expected, name) < high, name
+        assert value == pytest.approx(getattr(expected, name), rel=0.05)
+    assert NAMES[0] not in found.intervals
+    errors = {
+        name: validate(model, log).rollouts[1].errors["rates"].median
+        for name, model in (("start", start), ("fit", found.model))
+    }
+    assert errors["fit"] < 0.5 * errors["start"]

@@ -1,0 +1,193 @@
+"""The body driven by motors, against rigid bodies in NumPy that share no code with it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.motor_craft import Pilot, State, advance, fly, hovering, speed_for
+from flytrack_env import effects
+from flytrack_env.dynamics import move
+from flytrack_env.effects.motors import Spinning
+from flytrack_env.motors import NAMES
+from flytrack_env.quaternion import Quaternion, Vec3
+from flytrack_env.state import Action, Drone, pack, unpack_action
+from tests.support.compiling import quick_jit
+from tests.support.motor_models import crafts, model_of
+
+DT = 0.01
+TILTED = np.array([[4.0, -0.2, 0.3], [-0.2, 5.0, 0.1], [0.3, 0.1, 8.0]]) * 1e-3
+WHOLE = crafts(
+    inertia=TILTED, thrust=[6.0, 5.8, 5.4, 6.0], drag=[0.1, 0.12, 0.2], damping=[0.01, 0.012, 0.005]
+)
+
+
+@pytest.fixture(autouse=True)
+def _float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def _flight(model, start, commands, dt):
+    def one(state, command):
+        moved = move(*state, unpack_action(command), dt, model)
+        reading = jnp.stack(moved.context.force_b)
+        return moved[:2], jnp.concatenate([pack(moved.after), reading])
+
+    return jax.lax.scan(one, start, commands)[1]
+
+
+_program = quick_jit(_flight)
+LONGEST = 200
+
+
+def _flown(model, start, commands, dt=DT):
+    """Return a flight, all of one length, so that one program is compiled."""
+    padded = np.pad(commands, ((0, LONGEST - len(commands)), (0, 0)), mode="edge")
+    return np.asarray(_program(model, start, padded, dt))[: len(commands)]
+
+
+def begun(model, state):
+    """Return the drone and the memories of a NumPy craft's state."""
+    first = State(*(leaf[0] for leaf in state))
+    full = np.deg2rad(np.asarray(model.max_rate, float))
+    drone = Drone(
+        Vec3(*first.pos),
+        Vec3(*first.vel),
+        Vec3(0.0, 0.0, 0.0),
+        Quaternion(*Rotation.from_matrix(first.turn).as_quat(scalar_first=True)),
+        Vec3(*first.rates),
+        Action(*first.rates / full, 2.0 * first.speeds.mean() - 1.0),
+        24.0,
+    )
+    drone = jax.tree.map(jnp.asarray, drone)
+    memories = tuple(
+        Spinning(tuple(map(jnp.asarray, first.speeds))) if memory is not None else None
+        for memory in effects.start_memories(model.effects, drone)
+    )
+    return drone, memories
+
+
+def both(craft, state, commands, dt=DT):
+    """Return the states after each command of the NumPy craft, (n, 15 + 3), and of the model."""
+    model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model_of(craft))
+    flown = _flown(model, begun(model, state), 2.0 * commands - 1.0, dt)
+    step_s, rows = (1e-4 if len(commands) < 10 else 1e-3), []
+    for command in commands:
+        for _ in range(round(dt / step_s)):
+            state = advance(craft, state, command[None], step_s)
+        quat = Rotation.from_matrix(state.turn[0]).as_quat(scalar_first=True)
+        rows.append(np.concatenate([state.pos[0], state.vel[0], quat, state.rates[0]]))
+    shown = flown[:, [*range(6), *range(9, 16)]]
+    truth = np.array(rows)
+    sign = np.sign(np.sum(shown[:, 6:10] * truth[:, 6:10], axis=1, keepdims=True))
+    truth[:, 6:10] *= sign
+    return truth, shown
+
+
+def held(*motors, steps=5):
+    return np.tile(np.array(motors, float), (steps, 1))
+
+
+BALANCED = crafts(places=[[-0.1, -0.1, 0], [0.1, -0.1, 0], [-0.1, 0.1, 0], [0.1, 0.1, 0]])
+HOVER = float(speed_for(crafts(), 0.8 * 9.80665 / (4 * 6.0) * np.ones(1))[0])
+
+
+def test_a_drone_falls_freely_and_hovers():
+    falling = hovering(crafts())._replace(speeds=np.zeros((1, 4)))
+    _, flown = both(crafts(), falling, held(0, 0, 0, 0))
+    np.testing.assert_allclose(flown[-1, 3:6], [0.0, 0.0, -9.80665 * 0.05], atol=1e-12)
+    _, flown = both(BALANCED, hovering(BALANCED), held(*[HOVER] * 4, steps=50))
+    np.testing.assert_allclose(flown[-1, 3:6], 0.0, atol=1e-9)
+    np.testing.assert_allclose(flown[-1, 10:], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("motor", range(4), ids=NAMES)
+def test_each_motor_turns_the_craft_as_it_should(motor):
+    commands = held(*[HOVER] * 4)
+    commands[:, motor] += 0.2
+    truth, flown = both(BALANCED, hovering(BALANCED), commands)
+    np.testing.assert_array_equal(
+        np.sign(flown[-1, 10:]),
+        [(-1, -1, 1, 1)[motor], (1, -1, 1, -1)[motor], (1, -1, -1, 1)[motor]],
+    )
+    np.testing.assert_allclose(flown, truth, atol=4e-4)
+
+
+def test_rotors_push_yaw_before_their_torque_and_precess():
+    spun = crafts(momentum=0.05, yaw_arm=0.0)
+    commands = held(HOVER + 0.2, HOVER - 0.2, HOVER - 0.2, HOVER + 0.2)
+    truth, flown = both(spun, hovering(spun), commands)
+    assert flown[-1, 12] > 0.1  # reaction of rotors that spin up, with no torque of the air at all
+    np.testing.assert_allclose(flown, truth, atol=2e-4)
+    rolling = hovering(spun)._replace(
+        rates=np.array([[5.0, 0.0, 0.0]]), speeds=np.array([[HOVER, 0.0, 0.0, HOVER]])
+    )
+    truth, flown = both(spun, rolling, held(HOVER, 0.0, 0.0, HOVER))
+    np.testing.assert_allclose(flown, truth, atol=2e-4)
+    without = both(crafts(momentum=0.0, yaw_arm=0.0), rolling, held(HOVER, 0.0, 0.0, HOVER))[1]
+    assert np.abs(flown - without)[-1, 11] > 0.1  # net momentum turns roll into pitch
+
+
+def test_a_body_without_torque_keeps_momentum_and_energy():
+    free = crafts(inertia=TILTED, thrust=[1e-9] * 4, momentum=0.0)
+    start = hovering(free)._replace(rates=np.array([[4.0, 3.0, 2.0]]), speeds=np.zeros((1, 4)))
+    truth, flown = both(free, start, held(0, 0, 0, 0, steps=200))
+    rates = np.concatenate([[[4.0, 3.0, 2.0]], flown[:, 10:]])
+    energy = np.einsum("ni,ij,nj->n", rates, TILTED, rates)
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-5)
+    turn = Rotation.from_quat(flown[:, 6:10], scalar_first=True)
+    momentum = turn.apply(flown[:, 10:] @ TILTED)
+    np.testing.assert_allclose(momentum, np.tile(TILTED @ [4.0, 3.0, 2.0], (200, 1)), atol=2e-4)
+    np.testing.assert_allclose(flown[-1, 10:], truth[-1, 10:], atol=2e-3)
+
+
+def test_motors_are_slower_down_than_up():
+    model = model_of(crafts(up_s=0.02, down_s=0.08))
+    start = begun(model, hovering(crafts()))
+    up, down = (
+        _flown(model, start, 2.0 * held(*[end] * 4) - 1.0)[-1, 19]
+        for end in (HOVER + 0.2, HOVER - 0.2)
+    )
+    base = 2.0 * HOVER - 1.0
+    np.testing.assert_allclose(up - base, 0.4 * (1.0 - np.exp(-0.05 / 0.02)), rtol=1e-6)
+    np.testing.assert_allclose(down - base, -0.4 * (1.0 - np.exp(-0.05 / 0.08)), rtol=1e-6)
+
+
+def test_a_flown_minute_part_is_that_of_the_independent_craft_to_second_order():
+    flight = fly(WHOLE, Pilot(np.random.default_rng(3), 1, 4.0, 6.0), 4.0)
+    state = State(*(leaf[200] for leaf in flight.states))
+    commands = flight.commands[200:260, 0]
+    truth, flown = both(WHOLE, state, commands)
+    coarse = np.abs(flown - truth).max()
+    assert coarse < 3e-4  # of metres, m/s and rad/s, after 0.6 s
+    finer = np.repeat(commands, 2, axis=0)
+    fine = np.abs(both(WHOLE, state, finer, DT / 2)[1][1::2] - truth).max()
+    assert 3.0 < coarse / fine < 5.0
+
+
+@pytest.mark.slow
+def test_gradients_and_batches():
+    model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model_of(WHOLE))
+    start = begun(model, hovering(WHOLE))
+    commands = np.tile(held(HOVER + 0.1, HOVER, HOVER - 0.05, HOVER, steps=1) * 2.0 - 1.0, (5, 1))
+    motors = jax.tree.map(jnp.asarray, model.effect("motors"))
+
+    def last(motors):
+        return _flight(model.with_effects(motors), start, commands, DT)[-1, 13:16].sum()
+
+    value_and_slopes = quick_jit(jax.vmap(jax.value_and_grad(last)))
+    names = ("radius_x", "yaw_arm", "up_s", "rear_left", "center_x", "damping_y", "product_xy")
+    moved = [motors]
+    sizes = [1e-6 * max(abs(float(getattr(motors, name))), 1e-3) for name in names]
+    for name, size in zip(names, sizes, strict=True):
+        moved += [
+            motors._replace(**{name: getattr(motors, name) + sign * size}) for sign in (1.0, -1.0)
+        ]
+    values, slopes = value_and_slopes(jax.tree.map(lambda *each: jnp.stack(each), *moved))
+    for index, (name, size) in enumerate(zip(names, sizes, strict=True)):
+        measured = (values[1 + 2 * index] - values[2 + 2 * index]) / (2.0 * size)
+        np.testing.assert_allclose(getattr(slopes, name)[0], measured, rtol=1e-4)
+    alone = _flown(model, start, commands)[-1, 13:16].sum()
+    np.testing.assert_allclose(values[0], alone, rtol=1e-9)

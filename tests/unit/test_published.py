@@ -1,0 +1,127 @@
+"""Layouts of public data sets, dry runs on synthetic files of which the truth is known."""
+
+import gzip
+
+import numpy as np
+import pytest
+
+from benchmarks.motor_craft import Pilot, fly
+from benchmarks.motors import log_of_flight
+from benchmarks.published import (
+    HORIZON,
+    drifting,
+    errors_of,
+    held,
+    predicted,
+    read_flights,
+    start_rows,
+)
+from tests.support.motor_models import crafts
+
+NANO = crafts(
+    mass=0.045,
+    inertia=np.diag([2.8e-5, 3.1e-5, 4.6e-5]),
+    places=[[-0.035, -0.035, 0.0], [0.035, -0.035, 0.0], [-0.035, 0.035, 0.0], [0.035, 0.035, 0.0]],
+    thrust=np.full(4, 0.25),
+    linear=0.0,
+    yaw_arm=0.00596,
+    momentum=0.0,
+    up_s=0.03,
+    down_s=0.045,
+    drag=0.045 * np.array([0.3, 0.3, 0.2]),
+)
+BEM = crafts(
+    mass=0.772,
+    inertia=np.diag([0.0028, 0.0024, 0.005]),
+    places=[[-0.075, -0.1, 0.0], [0.075, -0.1, 0.0], [-0.075, 0.1, 0.0], [0.075, 0.1, 0.0]],
+    thrust=np.full(4, 8.0),
+    linear=0.0,
+    yaw_arm=0.022,
+    momentum=0.0,
+    up_s=0.012,
+    down_s=0.012,
+    drag=0.772 * np.array([0.3, 0.4, 0.2]),
+)
+BATTERY = 16.0
+
+
+def idsia_columns(log, t):
+    names = ["x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "wx", "wy", "wz"]
+    values = np.column_stack([log["p"], log["v"], log["q"], log["w"]])
+    speeds = 1750.0 * (log["u"] + 1.0)  # rear right, front right, rear left, front left
+    motors = dict(zip(["m2_rads", "m1_rads", "m3_rads", "m4_rads"], speeds.T, strict=True))
+    return {"t": t, **dict(zip(names, values.T, strict=True)), **motors}
+
+
+def neurobem_columns(log, t):
+    vectors = {"pos": log["p"], "vel": log["v"], "ang vel": log["w"], "acc": log["f"]}
+    columns = {
+        f"{name} {axis}": values[:, index]
+        for name, values in vectors.items()
+        for index, axis in enumerate("xyz")
+    }
+    columns |= {f"quat {axis}": log["q"][:, index] for index, axis in enumerate("wxyz")}
+    speeds = 1500.0 * (log["u"] + 1.0)
+    columns |= {f"mot {motor + 1}": speeds[:, motor] for motor in range(4)}
+    return {"t": t, **columns, "vbat": np.full(len(t), BATTERY)}
+
+
+LAYOUTS = {
+    "idsia_nanodrone": (NANO, idsia_columns, 0.01),
+    "neurobem": (BEM, neurobem_columns, 0.0025),
+}
+
+
+def write(folder, layout, seed, duration_s, noise):
+    craft, columns_of, dt = LAYOUTS[layout]
+    rng = np.random.default_rng(seed)
+    flight = fly(craft, Pilot(rng, 1, duration_s, 5.0), duration_s, dt, dt / round(dt / 1.25e-3))
+    log = log_of_flight(flight, 0, rng, noise)
+    columns = columns_of(log, 100.0 + dt * np.arange(len(log)))
+    path = folder / f"{layout}_{seed}.csv.gz"
+    lines = [",".join(columns), *(",".join(f"{x:.9g}" for x in row) for row in
+             np.column_stack(list(columns.values())))]  # fmt: skip
+    path.write_bytes(gzip.compress("\n".join(lines).encode()))
+    return path, log
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_layout_is_read_as_it_is_documented(layout, tmp_path):
+    path, log = write(tmp_path, layout, 0, 3.0, 0.0)
+    found = read_flights([path], layout)
+    assert found.log.has_motors and not found.problems
+    rows = np.searchsorted(LAYOUTS[layout][2] * np.arange(len(log)), found.log.time + 1e-9) - 1
+    for name in found.log.channels:
+        if name in log:
+            size = max(np.ptp(log[name]), 1.0)
+            np.testing.assert_allclose(
+                np.abs(found.log[name]), np.abs(log[name][rows]), atol=2e-3 * size, err_msg=name
+            )
+    starts = start_rows(found.log)
+    naive, kinematic = (
+        errors_of(found.log, starts, of(found.log, starts)) for of in (held, drifting)
+    )
+    assert kinematic.position < naive.position and kinematic.rates == naive.rates
+    steps = np.linalg.norm(found.log["p"][starts + HORIZON] - found.log["p"][starts], axis=1)
+    assert 0.3 * HORIZON * steps.mean() < naive.position < HORIZON * steps.mean()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_truth_of_a_dry_run_is_found(layout, tmp_path):
+    seconds = 40.0 if layout == "idsia_nanodrone" else 20.0
+    train, test = (
+        read_flights([write(tmp_path, layout, seed, length, 0.3)[0]], layout)
+        for seed, length in ((1, seconds), (2, 10.0))
+    )
+    result = predicted(train, test)
+    craft = LAYOUTS[layout][0]
+    radii = np.sqrt(np.diag(craft.inertia[0]) / craft.mass[0])
+    expected = dict(zip(("radius_x", "radius_y", "radius_z"), radii, strict=True))
+    expected |= {"up_s": craft.up_s[0], "down_s": craft.down_s[0]}
+    for name, value in expected.items():
+        found = result.intervals[f"motors.{name}"]
+        assert found.low < value < found.high, name
+    drag = result.intervals["linear_drag.d_x"]
+    assert drag.value == pytest.approx(craft.drag[0, 0] / craft.mass[0], rel=0.02)
+    assert np.all(np.array(result.errors["motors"]) < 0.35 * np.array(result.errors["drifting"]))
