@@ -11,6 +11,11 @@ from flytrack_env.effects import takes_motors
 from flytrack_env.motion import Motion
 from flytrack_sysid.log import MEASURED, FlightLog, LogError
 
+# Two flights of one craft agreed in 2 of 7 values (docs/results/motors.md).
+DOUBTFUL_MOTORS = (
+    "commands are the outputs of motors: where a measured flight hardly turns, inertia and lags may "
+    "come out several times wrong, with intervals that are too narrow; trust what more flights show"
+)
 HOW_TO_MARK = f"a column {MEASURED!r} says it: 1 for a real drone, 0 for a simulator"
 
 
@@ -27,7 +32,7 @@ def required_motion(log: FlightLog, requested: Motion | None = None) -> Motion |
 def motion_notes(
     log: FlightLog, model: ModelParameters | None, requested: Motion | None, otherwise: str
 ) -> list[str]:
-    """Return where log, model and request contradict each other on the motion, a sentence each.
+    """Return what to doubt: where log, model and request contradict each other, a sentence each.
 
     Args:
         log: the replayed log.
@@ -37,6 +42,8 @@ def motion_notes(
             that is not marked.
     """
     required, notes = required_motion(log, requested), []
+    if log.origin == "measured" and log.has_motors:
+        notes.append(DOUBTFUL_MOTORS)
     if log.origin == "measured" and required not in (None, Motion.CONTINUOUS):
         notes.append(
             f"motion: {required.value} was requested, but {log.source} is measured: drones move "

@@ -669,7 +669,7 @@ def unsettled(
         rejected: the veto of each rejected effect. Those that held-out rows contradict are settled.
         unflown: what single steps show, and free flights do not.
     """
-    stand_ins = (name for name in selection.stand_ins if name in BASE_CAUSES)
+    stand_ins = (name for name in selection.stand_ins if name in ALL_BASE_CAUSES)
     doubted = (name for name, veto in rejected.items() if veto.__name__ in vetoes.REASONS)
     return tuple(dict.fromkeys((*stand_ins, *doubted, *unflown)))
 

@@ -14,6 +14,7 @@ from flytrack_sysid.fit import fit
 from flytrack_sysid.importing import import_log
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_file import load_log, save_log
+from flytrack_sysid.log_motion import DOUBTFUL_MOTORS, motion_notes
 from flytrack_sysid.plausibility import find_problems
 from flytrack_sysid.validate import validate
 from tests.support.motor_flights import COLUMNS, flown, write_csv
@@ -94,6 +95,14 @@ def test_commands_of_another_kind_than_the_models_are_refused(log):
         fit(log, nominal_parameters(), accept=True)
     with pytest.raises(LogError, match="w: missing, expected the gyro"):
         validate(model, log.without("w"))
+
+
+@pytest.mark.parametrize("origin", ["measured", "simulated"])
+def test_motors_of_measured_flights_are_doubted(log, origin):
+    notes = motion_notes(replace(log, origin=origin), None, None, "chosen")
+    assert (DOUBTFUL_MOTORS in notes) is (origin == "measured")
+    of_sticks = replace(log, origin=origin, has_motors=False)
+    assert DOUBTFUL_MOTORS not in motion_notes(of_sticks, None, None, "chosen")
 
 
 @pytest.mark.slow
