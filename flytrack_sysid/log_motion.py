@@ -13,8 +13,8 @@ from flytrack_sysid.log import MEASURED, FlightLog, LogError
 
 # Two flights of one craft agreed in 2 of 7 values (docs/results/motors.md).
 DOUBTFUL_MOTORS = (
-    "commands are the outputs of motors: where a measured flight hardly turns, inertia and lags may "
-    "come out several times wrong, with intervals that are too narrow; trust what more flights show"
+    "commands are the outputs of motors: where a measured flight hardly turns, inertia and lags "
+    "may come out several times wrong, with too narrow intervals; trust what more flights show"
 )
 HOW_TO_MARK = f"a column {MEASURED!r} says it: 1 for a real drone, 0 for a simulator"
 
