@@ -7,6 +7,7 @@ appended to docs/results/repeatability.jsonl, and a later run of the same commit
 ``--page`` writes docs/results/repeatability.md from them.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -169,18 +170,26 @@ def overlaps(one: list[float], other: list[float]) -> bool:
     return one[1] <= other[2] and other[1] <= one[2]
 
 
-def compare(lines: Sequence[Line]) -> list[Any]:
-    """Return a row of the page: how alike the flights of a craft are."""
-    pairs = [
-        (one, other) for one, other in combinations(lines, 2) if one["craft"] == other["craft"]
-    ]
-    values = [
-        overlaps(one[name][key], other[name][key])
+def pairs_of(lines: Sequence[Line]) -> list[tuple[Line, Line]]:
+    """Return pairs of flights of one craft."""
+    return [(one, other) for one, other in combinations(lines, 2) if one["craft"] == other["craft"]]
+
+
+def compare_values(pairs: Iterable[tuple[Line, Line]]) -> list[tuple[str, bool]]:
+    """Return the name of each value that both flights of a pair have, and whether they overlap."""
+    return [
+        (key, overlaps(one[name][key], other[name][key]))
         for one, other in pairs
         for name in ("values", "lift", "half_responses_s")
         for key in one[name].keys() & other[name].keys()
         if not is_coefficient(key)
     ]
+
+
+def compare(lines: Sequence[Line]) -> list[Any]:
+    """Return a row of the page: how alike the flights of a craft are."""
+    pairs = pairs_of(lines)
+    values = [is_alike for _, is_alike in compare_values(pairs)]
     halves = [
         1e3 * float(np.median([0.5 * (one[2] - one[1]) for one in of_stick])) if of_stick else None
         for of_stick in (
@@ -216,6 +225,12 @@ def write_page() -> None:
     """Write docs/results/repeatability.md from the lines of the last commit."""
     lines = [line for line in lines_of_commit(LINES) if "error" not in line]
     by_craft = {craft: [line for line in lines if line["craft"] == craft] for craft in CRAFT}
+    apart = Counter(
+        name
+        for craft in CRAFT
+        for name, is_alike in compare_values(pairs_of(by_craft[craft]))
+        if not is_alike
+    )
     plants = [line for line in lines if line["craft"].startswith(PLANT)]
     by_craft["Simulated, each plant twice"] = plants
     shown = [line for line in plants if line["effect"]]
@@ -239,6 +254,7 @@ def write_page() -> None:
         separable=f"{SEPARABLE:g}",
         found=sum(map(is_in_class, shown)),
         shown=len(shown),
+        apart=", ".join(f"`{name}` {count}" for name, count in apart.most_common(5)),
         seconds=f"{np.median([line['cpu_s'] for line in lines]):.0f}",
         commit=lines[-1]["commit"],
     )
