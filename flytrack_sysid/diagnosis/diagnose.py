@@ -37,10 +37,10 @@ from flytrack_sysid.diagnosis.refinement import Refined, reduced, refine
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis
 from flytrack_sysid.diagnosis.size import split_by_size
 from flytrack_sysid.diagnosis.vetoes import (
+    CONTRADICTED,
+    EXPLAINED_BY_CHANGE,
     Selection,
-    Veto,
     apply_vetoes,
-    contradicted_on_held_out,
     reject,
     select,
 )
@@ -244,18 +244,18 @@ class VettedModel(NamedTuple):
 
     Attributes:
         selection: without the rejected and the refused effects.
-        rejected: the veto of each rejected effect.
+        rejected: the veto's name of each rejected effect.
         refused: effects removed because they fit best at the end of the search range.
         refined: the refinement by free flight.
     """
 
     selection: Selection
-    rejected: Mapping[str, Veto]
+    rejected: Mapping[str, str]
     refused: tuple[Cause, ...]
     refined: Refined
 
 
-def vetoed_in_time(selection: Selection, parts: Split) -> tuple[Selection, dict[str, Veto]]:
+def vetoed_in_time(selection: Selection, parts: Split) -> tuple[Selection, dict[str, str]]:
     """Return a selection with its changes within the log, after its vetoes, and these by effect.
 
     A change may hide behind an effect that held-out rows contradict. So changes are searched for
@@ -263,21 +263,24 @@ def vetoed_in_time(selection: Selection, parts: Split) -> tuple[Selection, dict[
     """
     selection = with_changes(selection, parts.test, parts.log)
     selection, rejected = apply_vetoes(selection, held_out_under(selection, parts.test))
-    contradicted = {name for name, veto in rejected.items() if veto is contradicted_on_held_out}
+    contradicted = {name for name, veto in rejected.items() if veto == CONTRADICTED}
     if contradicted:
         later = with_changes(selection, parts.test, parts.log)
         if later is not selection:
             selection, further = apply_vetoes(later, held_out_under(later, parts.test))
             rejected |= further
             if active_windows(selection):
+                rejected |= dict.fromkeys(contradicted, EXPLAINED_BY_CHANGE)
                 rejected = {
-                    name: veto for name, veto in rejected.items() if name not in contradicted
+                    name: veto
+                    for name, veto in rejected.items()
+                    if name not in selection.model.effects
                 }
     return selection, rejected
 
 
 def refined_within_range(
-    selection: Selection, rejected: Mapping[str, Veto], test: Problem, parts: Split
+    selection: Selection, rejected: Mapping[str, str], test: Problem, parts: Split
 ) -> VettedModel:
     """Return a selection and its refinement, without effects that end at a search bound.
 
@@ -348,9 +351,7 @@ def name_causes(vetted: VettedModel, parts: Split) -> NamedModel:
     selection = selection._replace(state=replace(state, linearization=linearization))
     effects = summary.effect_causes(selection, test, linearization)
     in_base, lost_in_base = summary.base_causes(selection, test, linearization, effects)
-    contradicted = [
-        name for name, veto in vetted.rejected.items() if veto is contradicted_on_held_out
-    ]
+    contradicted = [name for name, veto in vetted.rejected.items() if veto == CONTRADICTED]
     fit = refined.fit
     extended = model if fit is None else model._replace(vector=fit.vector)
     before = [*effects, *in_base]

@@ -660,17 +660,18 @@ def given_law_notes(problem: Problem, unexplained: Unexplained) -> list[str]:
 
 
 def unsettled(
-    selection: vetoes.Selection, rejected: Mapping[str, vetoes.Veto], unflown: Sequence[str]
+    selection: vetoes.Selection, rejected: Mapping[str, str], unflown: Sequence[str]
 ) -> tuple[str, ...]:
     """Return names that the log suggests and does not settle, each once.
 
     Args:
         selection: of the extended model.
-        rejected: the veto of each rejected effect. Those that held-out rows contradict are settled.
+        rejected: the veto's name of each rejected effect. Those that held-out rows contradict are
+            settled.
         unflown: what single steps show, and free flights do not.
     """
     stand_ins = (name for name in selection.stand_ins if name in ALL_BASE_CAUSES)
-    doubted = (name for name, veto in rejected.items() if veto.__name__ in vetoes.REASONS)
+    doubted = (name for name, veto in rejected.items() if veto in vetoes.REASONS)
     return tuple(dict.fromkeys((*stand_ins, *doubted, *unflown)))
 
 
@@ -684,11 +685,11 @@ def neutral_notes(names: Sequence[str]) -> list[str]:
     ]
 
 
-def veto_notes(rejected: Mapping[str, vetoes.Veto]) -> list[str]:
+def veto_notes(rejected: Mapping[str, str]) -> list[str]:
     """Return a note for each reason on the effects that were rejected for it."""
     names: dict[str, list[str]] = {}
     for effect, veto in rejected.items():
-        reason = vetoes.REASONS.get(veto.__name__)
+        reason = vetoes.REASONS.get(veto)
         if reason is not None:
             names.setdefault(reason, []).append(effect)
     return [f"{', '.join(effects)}: not named, since {reason}" for reason, effects in names.items()]

@@ -90,18 +90,18 @@ def reject(selection: Selection, effects: Sequence[str]) -> Selection:
     return Selection(state, selection.base, model, ablations)
 
 
-def apply_vetoes(selection: Selection, test: Problem) -> tuple[Selection, dict[str, Veto]]:
-    """Return the selection without effects that a veto rejects, and the veto of each.
+def apply_vetoes(selection: Selection, test: Problem) -> tuple[Selection, dict[str, str]]:
+    """Return the selection without effects that a veto rejects, and the veto's name for each.
 
     Args:
         selection: to examine.
         test: held-out rows, with the noise of the selection's problem.
     """
-    vetoed: dict[str, Veto] = {}
+    vetoed: dict[str, str] = {}
     selection = examined(selection)
     while True:
         for rule in VETOES:
-            rejected = dict.fromkeys(rule(selection, test), rule)
+            rejected = dict.fromkeys(rule(selection, test), rule.__name__)
             if rejected:
                 vetoed |= rejected
                 selection = examined(reject(selection, tuple(rejected)))
@@ -330,9 +330,12 @@ VETOES: tuple[Veto, ...] = (
     not_seen_at_rest,
     seen_once,
 )
+CONTRADICTED, EXPLAINED_BY_CHANGE = contradicted_on_held_out.__name__, "explained_by_change"
 # Reasons that a warning gives for a rejection, by rule. Effects that held-out rows contradict have
-# a warning of their own (``summary.collect_warnings``).
+# a warning of their own (``summary.collect_warnings``), unless a change within the log is found
+# without them.
 REASONS = {
+    EXPLAINED_BY_CHANGE: "held-out rows contradict it, and a change within the log explains more",
     "stands_in_for_unknown": "what remains unexplained could pass for it",
     "not_seen_at_rest": (
         "dynamics of the rate loop that no list has would look the same while sticks move; fly "
