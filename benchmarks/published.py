@@ -12,7 +12,7 @@ idsia_nanodrone    t s; x y z m; vx vy vz m/s; qx qy qz qw; wx wy wz rad/s, body
 neurobem           t s; ang vel x y z rad/s; quat x y z w; acc x y z m/s^2, specific force; vel x y
                    z m/s; pos x y z m; mot 1 to 4 rad/s (rear right, front right, rear left, front
                    left); vbat V; FLU
-nanobench          as its authors' CSV files: t, p*, q*, v*, imu_*, motor_motor_m*, pwr_pm_vbat
+nanobench_motors   as its authors' CSV files: t, p*, q*, v*, imu_*, motor_motor_m*, pwr_pm_vbat
 =================  ===============================================================================
 
 Measures: the sum over horizons of 1 to 50 rows of the mean absolute error of position (m), velocity
