@@ -144,16 +144,17 @@ def adapt(
     """
     model = check_inputs(log, checkpoint, accept)
     diagnosis = diagnose(log, model, report=report("stages"))
-    if not is_different(diagnosis):
+    if not is_different(diagnosis, model):
         return Adapted(diagnosis, checkpoint, False)
     models = find_plausible_models(diagnosis)
     return improve(checkpoint, model, models, diagnosis, seed, settings, report)
 
 
-def is_different(diagnosis: Diagnosis) -> bool:
-    """Return whether a diagnosis found anything to adapt to."""
+def is_different(diagnosis: Diagnosis, model: ModelParameters) -> bool:
+    """Return whether a diagnosis of a model found anything to adapt to: also another motion."""
     return bool(
-        diagnosis.causes
+        diagnosis.extended.motion is not model.motion
+        or diagnosis.causes
         or diagnosis.beyond
         or diagnosis.learned is not None
         or diagnosis.unexplained.flagged
@@ -304,7 +305,7 @@ def describe_adapted(found: Adapted) -> str:
     if found.known is None or found.old is None:
         nothing = "Nothing to adapt to: the log agrees with the model that the policy was made for."
         return "\n".join([*lines, f"{nothing} The policy is unchanged."])
-    flights = {"old policy, its own model": found.known, "old policy, this plant": found.old}
+    flights = {"old policy, its own craft": found.known, "old policy, this plant": found.old}
     if found.new is not None:
         flights["new policy, this plant"] = found.new
     lines.append(

@@ -366,8 +366,8 @@ def _reasons(path: Path, content: Any) -> dict[str, tuple[str, ...]]:
         place = f"{path}: not_identifiable[{number}]"
         if not isinstance(effect, str):
             raise ScriptError(f"{place}: effect: found {effect!r}, expected a name")
-        if isinstance(fly, str) and fly.startswith(TO_LOG):
-            continue  # a sensor settles it, no flight
+        if isinstance(fly, str) and (not fly or fly.startswith(TO_LOG)):
+            continue  # no manoeuvre is known, or a sensor settles it
         if not isinstance(fly, str) or fly not in MANOEUVRES:
             raise ScriptError(
                 f"{place}: fly: found {fly!r}, expected one of {', '.join(MANOEUVRES)}"

@@ -169,10 +169,10 @@ def find_changes(
     if not len(seconds[1]):
         return []
     best: dict[str, Hypothesis] = {}
-    for candidate in candidates_for(linearization.problem):
+    others = candidates_for(linearization.problem)
+    others = [candidate for candidate in others if candidate.effect not in model.effects]
+    for candidate in (*model.candidates, *others):
         if candidate.effect in lacking:
-            continue
-        if candidate.effect in model.effects and candidate != model.candidate(candidate.effect):
             continue
         change = _change_of(linearization, model, candidate, seconds)
         if change is not None and change.margin > best.get(candidate.effect, change).margin - 1e-12:

@@ -217,9 +217,9 @@ class Fit(NamedTuple):
     Attributes:
         vector: all parameters, (num_parameters,).
         indices: the free parameters.
-        covariance: covariance of the free parameters, (indices, indices), scaled so that the square
-            roots of its diagonal are the half-widths of 95 % intervals. Parameters at the end of
-            their range are held there, and have none.
+        covariance: covariance of the free parameters, (indices, indices), times the square of
+            ``quantile``: roots of its diagonal are half-widths of 95 % intervals. Parameters at the
+            end of their range are held there, and have none.
         half_widths: half of the 95 % interval of each free index; of those at the end of their
             range as if it went on.
         losses: cost of each block of windows without a fit to this block, (blocks,), to first
@@ -232,6 +232,11 @@ class Fit(NamedTuple):
     covariance: np.ndarray
     half_widths: np.ndarray
     losses: np.ndarray
+
+    @property
+    def quantile(self) -> float:
+        """Standard deviations in half of a 95 % interval, Student's t for the number of blocks."""
+        return float(stats.t.ppf(0.975, max(len(self.losses), 2) - 1))
 
 
 def huber_loss(residuals: np.ndarray) -> np.ndarray:
@@ -693,12 +698,13 @@ class _Refinement(NamedTuple):
         end at a bound, since nothing in the flights depends on them. They are held at nominal.
         """
         kept = list(kept)
-        for number, candidate in enumerate(kept):
+        for number in range(len(kept)):
             while (field := superfluous(target.problem, fit, kept[number])) is not None:
-                fields = tuple(name for name in kept[number].fields if name != field)
-                probes = tuple(probe for probe in candidate.probes if probe.field != field)
-                others = [*kept]
-                others[number] = candidate._replace(fields=fields, probes=probes)
+                candidate, others = kept[number], [*kept]
+                others[number] = candidate._replace(
+                    fields=tuple(name for name in candidate.fields if name != field),
+                    probes=tuple(probe for probe in candidate.probes if probe.field != field),
+                )
                 vector = target.problem.at_start(fit.vector, [field])
                 held = target.fitted(vector, self.indices(target.problem, others), MAX_ROUNDS)
                 if sureness(self._losses(target, held) - self._losses(target, fit)) >= SURE:
@@ -795,8 +801,17 @@ def reduced(selection: Selection, refined: Refined) -> Selection:
     if refined.fit is not None:
         if refined.kept == model.candidates:
             return selection
+        nominal = [
+            name
+            for candidate in refined.kept
+            for name in model.candidate(candidate.effect).fields
+            if name not in candidate.fields
+        ]
+        vector = refined.problem.at_start(model.vector, nominal)
         return selection._replace(
-            model=model._replace(candidates=refined.kept, indices=refined.fit.indices)
+            model=model._replace(
+                candidates=refined.kept, vector=vector, indices=refined.fit.indices
+            )
         )
     if refined.kept:
         kept = selection if refined.kept == model.candidates else _narrowed(selection, refined.kept)

@@ -593,6 +593,9 @@ def _limits_text(diagnosis: Diagnosis) -> list[str]:
     ]
     if len(limits) > MAX_LIMITS:
         lines.append(f"and {len(limits) - MAX_LIMITS} more, in {REPORT_NAME}")
-    flight, count = Counter(limit.fly for limit in limits).most_common(1)[0]
+    flights = Counter(limit.fly for limit in limits if limit.fly)
+    if not flights:  # no manoeuvre is known for this craft
+        return lines
+    ((flight, count),) = flights.most_common(1)
     to_do = flight if flight.startswith(TO_LOG) else f"fly {flight}"
     return [*lines, f"recommended: {to_do}, which settles {count} of {len(limits)}"]

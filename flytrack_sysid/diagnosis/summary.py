@@ -568,7 +568,7 @@ def estimate_joint(linearization: Linearization, extended: FittedModel, refined:
     if fit is not None:
         rows = [row for row, index in enumerate(acting) if index in fit.indices]
         own = [fit.indices.index(acting[row]) for row in rows]
-        of_flights = fit.covariance[np.ix_(own, own)] / TWO_SIDED_95**2
+        of_flights = fit.covariance[np.ix_(own, own)] / fit.quantile**2
         covariance[np.ix_(rows, rows)] += of_flights
     return Joint(names, covariance)
 

@@ -14,6 +14,7 @@ from flytrack_env import nominal_parameters
 from flytrack_env.dynamics import step
 from flytrack_env.effects import WIND, CommandDelay, LinearDrag, QuadraticDrag
 from flytrack_env.model_file import model_from_json
+from flytrack_env.motion import Motion
 from flytrack_loop import adapt as adapting
 from flytrack_loop.adapt import Adapted, Judged, Settings, adapt, describe_adapted, embed
 from flytrack_sysid import LogError
@@ -179,6 +180,12 @@ def test_a_log_that_agrees_leaves_the_policy_as_it_is(log, monkeypatch):
     found = adapt(log, champion, accept=True)
     assert found.checkpoint is champion and not found.is_new
     assert "Nothing to adapt to" in describe_adapted(found)
+
+
+def test_another_motion_within_a_step_is_a_difference():
+    moving = NOMINAL._replace(motion=Motion.CONTINUOUS)
+    assert adapting.is_different(diagnosis(moving, causes=()), NOMINAL)
+    assert not adapting.is_different(diagnosis(moving, causes=()), moving)
 
 
 def judged(finish, lap_s):

@@ -278,6 +278,15 @@ def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):
     assert summary.classify((drag,), Unexplained(flagged=True)) == f"{CAUSES_FOUND}+{UNEXPLAINED}"
 
 
+def test_no_manoeuvre_is_recommended_where_none_is_known(diagnosis):
+    unseen = NotIdentifiable("wind", 0.1, "m/s", (), "")
+    assert "recommended" not in report.text_of(replace(diagnosis, not_identifiable=(unseen,)))
+    flown = replace(unseen, fly="hover")
+    assert "recommended: fly hover" in report.text_of(
+        replace(diagnosis, not_identifiable=(unseen, flown))
+    )
+
+
 @pytest.mark.slow
 def test_page_of_a_log_of_few_channels(diagnosis, measured):
     text = report.html_of(diagnosis, measured.without("w", "f", "v_bat"))
