@@ -71,7 +71,7 @@ class Settings(NamedTuple):
     )
 
 
-class Judged(NamedTuple):
+class FlightResults(NamedTuple):
     """Flights of one policy, each on another plant.
 
     Attributes:
@@ -83,15 +83,15 @@ class Judged(NamedTuple):
     lap_s: np.ndarray
 
     @classmethod
-    def of(cls, outcomes: Outcomes) -> "Judged":
+    def of(cls, outcomes: Outcomes) -> "FlightResults":
         """Return the flights of outcomes."""
         is_complete = outcomes.is_complete()
         laps_s = np.where(is_complete[:, None], outcomes.lap_times_s[:, 1:], np.nan)
         return cls(is_complete, laps_s.mean(axis=1))
 
-    def part(self, first: int, last: int) -> "Judged":
+    def part(self, first: int, last: int) -> "FlightResults":
         """Return some of the flights."""
-        return Judged(self.is_complete[first:last], self.lap_s[first:last])
+        return FlightResults(self.is_complete[first:last], self.lap_s[first:last])
 
     @property
     def speed(self) -> float:
@@ -115,9 +115,9 @@ class Adapted(NamedTuple):
     diagnosis: Diagnosis
     checkpoint: Checkpoint
     is_new: bool
-    known: Judged | None = None
-    old: Judged | None = None
-    new: Judged | None = None
+    known: FlightResults | None = None
+    old: FlightResults | None = None
+    new: FlightResults | None = None
 
 
 def adapt(
@@ -248,14 +248,14 @@ def improve(
 
 def judge(
     env: EpisodicEnvironment, policy: Policy, plants: ModelParameters, seed: int
-) -> tuple[Judged, Judged]:
+) -> tuple[FlightResults, FlightResults]:
     """Return a policy's flights on the first and on the second half of some plants.
 
     Both begin at the same starts, which follow from the seed.
     """
     half = len(jax.tree.leaves(plants)[0]) // 2
     starts = jnp.tile(start_keys(seed, half), 2)
-    flown = Judged.of(race_many(env, policy, starts, NUM_STEPS, NUM_LAPS, models=plants))
+    flown = FlightResults.of(race_many(env, policy, starts, NUM_STEPS, NUM_LAPS, models=plants))
     return flown.part(0, half), flown.part(half, 2 * half)
 
 
@@ -322,7 +322,7 @@ def describe_adapted(found: Adapted) -> str:
     return "\n".join(lines)
 
 
-def _describe_flights(judged: Judged) -> str:
+def _describe_flights(judged: FlightResults) -> str:
     """Return who finishes and how long flying laps take."""
     text = f"finish: {describe_share(share(judged.is_complete))}; flying lap: "
     laps_s = judged.lap_s[judged.is_complete]
@@ -332,7 +332,7 @@ def _describe_flights(judged: Judged) -> str:
     return f"{text}{laps_s.mean():.3f} s, 5/50/95 %: {low:.3f}/{middle:.3f}/{high:.3f} s"
 
 
-def _describe_cost(known: Judged, old: Judged) -> str:
+def _describe_cost(known: FlightResults, old: FlightResults) -> str:
     """Return what the plant's differences cost the old policy."""
     lost = known.is_complete.mean() - old.is_complete.mean()
     text = f"What differs costs the old policy {lost:.0%} of the flights"

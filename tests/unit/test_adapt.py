@@ -16,7 +16,7 @@ from flytrack_env.effects import WIND, CommandDelay, LinearDrag, QuadraticDrag
 from flytrack_env.model_file import model_from_json
 from flytrack_env.motion import Motion
 from flytrack_loop import adapt as adapting
-from flytrack_loop.adapt import Adapted, Judged, Settings, adapt, describe_adapted, embed
+from flytrack_loop.adapt import Adapted, FlightResults, Settings, adapt, describe_adapted, embed
 from flytrack_sysid import LogError
 from flytrack_sysid.check.thrust import thrust_changes
 from flytrack_sysid.diagnosis import Cause, Diagnosis, Unexplained
@@ -190,7 +190,7 @@ def test_another_motion_within_a_step_is_a_difference():
 
 def judged(finish, lap_s):
     is_complete = np.arange(100) < finish
-    return Judged(is_complete, np.where(is_complete, lap_s, np.nan))
+    return FlightResults(is_complete, np.where(is_complete, lap_s, np.nan))
 
 
 @pytest.mark.parametrize(
