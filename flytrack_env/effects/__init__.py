@@ -59,7 +59,7 @@ from flytrack_env.effects.voltage_sag import VOLTAGE_SAG, VoltageSag
 from flytrack_env.effects.wind import WIND, Wind
 from flytrack_env.effects.yaw_reaction import YAW_REACTION, YawReaction
 from flytrack_env.quaternion import Scalar
-from flytrack_env.state import Drone
+from flytrack_env.state import Action, Drone
 
 # The order in which effects of one stage are folded, and that of a model's effects. Commands pass
 # as in a flight controller: the link, the stick's curve, its limit, the limit on acceleration. What
@@ -170,15 +170,22 @@ def start_memories(
 ) -> Memories:
     """Return what the effects of a model remember when an episode begins; None for most.
 
+    Where motors are commanded, an applied action of rates is none of their outputs: what delays
+    commands begins as if all motors had always been commanded its thrust.
+
     Args:
         delay_steps: of delays; every step of an episode carries them, so that fewer are faster.
     """
+    commanded = drone
+    if takes_motors(effects):
+        commanded = drone._replace(applied=Action(*(drone.applied.thrust,) * len(Action._fields)))
 
     def start(parameters: Any) -> Any:
         effect = effect_of(parameters)
         if effect.memory is None:
             return None
-        return effect.memory.start(parameters, drone, *([delay_steps] if effect.max_steps else []))
+        begun = drone if effect.takes_motors else commanded
+        return effect.memory.start(parameters, begun, *([delay_steps] if effect.max_steps else []))
 
     return tuple(start(parameters) for parameters in effects)
 

@@ -103,6 +103,22 @@ def test_a_drone_falls_freely_and_hovers():
     np.testing.assert_allclose(flown[-1, 10:], 0.0, atol=1e-9)
 
 
+def test_a_hover_with_delayed_commands_stays_level():
+    model, start = model_of(BALANCED), hovering(BALANCED)
+    model = model.with_effects(effects.CommandDelay(0.02))
+    drone, _ = begun(model_of(BALANCED), start)
+    memories = effects.start_memories(model.effects, drone)
+    flown = _flown(model, (drone, memories), 2.0 * held(*[HOVER] * 4, steps=20) - 1.0)
+    np.testing.assert_allclose(flown[:, 13:16], 0.0, atol=1e-9)
+    np.testing.assert_allclose(flown[:, 3:6], 0.0, atol=1e-9)
+    turning = drone._replace(applied=Action(0.2, -0.1, 0.1, 0.4))
+    (past, spinning, *_), (stick_past,) = (
+        effects.start_memories(of, turning) for of in (model.effects, (effects.CommandDelay(0.02),))
+    )
+    assert past == (Action(0.4, 0.4, 0.4, 0.4),) * 4 and spinning.speeds == (0.7,) * 4
+    assert stick_past == (turning.applied,) * 4
+
+
 @pytest.mark.parametrize("motor", range(4), ids=NAMES)
 def test_each_motor_turns_the_craft_as_it_should(motor):
     commands = held(*[HOVER] * 4)
