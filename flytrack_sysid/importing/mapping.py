@@ -422,6 +422,8 @@ class MotorFields(RateGainFields):
     def channels(self, table: str) -> list[Channel]:
         """Return the channel of outputs, 0 to 1, if there are columns."""
         low, high = self.low, self.high
+        if self.as_thrust and self.as_command:
+            raise ValueError("as_thrust: found together with as_command, expected one of them")
         if self.as_command and self.columns and len(self.columns) != len(NAMES):
             raise ValueError(
                 f"columns: found {len(self.columns)} motors, expected the 4 of a quadcopter with "
@@ -627,6 +629,13 @@ def _craft(source: str, file: MappingFile) -> Craft:
     if file.frame is None:
         return craft
     try:
+        if file.motors is None or not file.motors.as_command:
+            raise ValueError("expected motors.as_command = true with such a table")
+        stated_kg = file.frame.mass_kg
+        if None not in (stated_kg, craft.mass_kg) and stated_kg != craft.mass_kg:
+            raise ValueError(
+                f"mass_kg: found {stated_kg:g}, and {craft.mass_kg:g} in [craft], expected one mass"
+            )
         frame = file.frame.known()
         mass_kg = craft.mass_kg or frame.mass_kg
         return craft._replace(mass_kg=mass_kg, motors=frame.motors(mass_kg))

@@ -12,6 +12,7 @@ from flytrack_sysid.check import check_log, text_of
 from flytrack_sysid.check.fix import fix_mapping
 from flytrack_sysid.fit import fit
 from flytrack_sysid.importing import import_log, mapping
+from flytrack_sysid.importing.flight import Craft
 from flytrack_sysid.importing.mapping import Frame
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_file import load_log, save_log
@@ -61,6 +62,33 @@ def test_stated_numbers_replace_those_of_a_known_craft_whatever_they_are(monkeyp
     unstated = {name: getattr(known, name) for name in ("front_m", "rear_m", "yaw_arm_m")}
     motors = Frame(**unstated, inertia_kg_m2=known.inertia_kg_m2).motors(0.028)
     assert (motors.up_s, motors.down_s, motors.rotor_momentum) == (0.03, 0.03, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        (
+            "as_command = true",
+            "as_command = true\nas_thrust = true",
+            r"as_thrust: found together",
+        ),
+        ("as_command = true", "", r"frame: expected motors\.as_command = true"),
+        ("[craft]", "[craft]\nmass_kg = 0.7", r"frame\.mass_kg: found 0\.8, and 0\.7 in \[craft\]"),
+    ],
+)
+def test_tables_that_contradict_each_other_are_refused(log, tmp_path, old, new, expected):
+    path, map_file = write_csv(tmp_path, log)
+    map_file.write_text(map_file.read_text().replace(old, new))
+    with pytest.raises(LogError, match=expected):
+        import_log(path, "csv", map_file)
+
+
+def test_a_craft_of_motors_names_what_it_lacks():
+    craft = Craft(mass_kg=0.8, motors=model_of(crafts()).effect("motors"))
+    with pytest.raises(LogError, match=r"a: craft\.voltage_v: missing in log and mapping"):
+        craft.nominal_model("a")
+    with pytest.raises(LogError, match=r"a: craft\.max_rate_deg_s: missing in log and mapping"):
+        craft._replace(motors=None).nominal_model("a")
 
 
 @pytest.mark.parametrize(
