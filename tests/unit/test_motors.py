@@ -1,5 +1,7 @@
 """The body driven by motors, against rigid bodies in NumPy that share no code with it."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,12 +9,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.motor_craft import Pilot, State, advance, fly, hovering, speed_for
-from flytrack_env import effects
+from flytrack_env import effects, nominal_parameters
 from flytrack_env.dynamics import move
 from flytrack_env.effects.motors import Spinning
 from flytrack_env.motors import NAMES
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone, pack, unpack_action
+from flytrack_sysid.inference.score_test import candidates_for, searched_in
 from tests.support.compiling import quick_jit
 from tests.support.motor_models import crafts, model_of
 
@@ -207,3 +210,14 @@ def test_gradients_and_batches():
         np.testing.assert_allclose(getattr(slopes, name)[0], measured, rtol=1e-4)
     alone = _flown(model, start, commands)[-1, 13:16].sum()
     np.testing.assert_allclose(values[0], alone, rtol=1e-9)
+
+
+def test_a_scale_of_the_force_alone_is_not_looked_for():
+    of_motors, of_sticks = (
+        SimpleNamespace(like=model, given_effects=given)
+        for model, given in ((model_of(crafts()), ("motors",)), (nominal_parameters(), ()))
+    )
+    assert "thrust_scale" not in searched_in(of_motors)
+    assert "thrust_scale" in searched_in(of_sticks)
+    searched = {candidate.effect for candidate in candidates_for(of_motors)}
+    assert "motors" in searched and "thrust_scale" not in searched
