@@ -205,6 +205,16 @@ def takes_motors(effects: Effects) -> bool:
     return any(effect_of(parameters).takes_motors for parameters in effects)
 
 
+def check_frame(effects: Effects) -> None:
+    """Raise ValueError for a model with the effect ``motors`` and without their frame."""
+    for parameters in effects:
+        if isinstance(parameters, Motors) and not np.all(np.asarray(parameters.front_y) > 0.0):
+            raise ValueError(
+                f"effects.motors.front_y: found {np.min(parameters.front_y):g}, expected above 0: "
+                "without a frame there are no motors to command"
+            )
+
+
 def acts_on_sticks(effect: Effect) -> bool:
     """Return whether an effect acts on sticks or on the rates that follow them, not on motors.
 
@@ -348,6 +358,7 @@ __all__ = [
     "acts",
     "acts_on_sticks",
     "at_row",
+    "check_frame",
     "check_parameters",
     "delay_steps_of",
     "effect_of",

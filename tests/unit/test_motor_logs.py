@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flytrack_env import nominal_parameters
+from flytrack_env import make, nominal_parameters
+from flytrack_env.effects import Motors
 from flytrack_env.motors import NAMES
 from flytrack_env.toml_file import parse_toml
 from flytrack_sysid.check import check_log, text_of
@@ -16,7 +17,7 @@ from flytrack_sysid.importing.flight import Craft
 from flytrack_sysid.importing.mapping import Frame
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_file import load_log, save_log
-from flytrack_sysid.log_motion import DOUBTFUL_MOTORS, motion_notes
+from flytrack_sysid.log_motion import DOUBTFUL_MOTORS, check_commands, motion_notes
 from flytrack_sysid.plausibility import find_problems
 from flytrack_sysid.validate import validate
 from tests.support.motor_flights import COLUMNS, flown, write_csv
@@ -139,6 +140,16 @@ def test_commands_of_another_kind_than_the_models_are_refused(log):
         fit(log, nominal_parameters(), accept=True)
     with pytest.raises(LogError, match="w: missing, expected the gyro"):
         validate(model, log.without("w"))
+
+
+@pytest.mark.parametrize("has_motors", [True, False])
+def test_motors_without_a_frame_are_refused(log, has_motors):
+    model = nominal_parameters().with_effects(Motors())
+    expected = r"effects\.motors\.front_y: found 0, expected above 0"
+    with pytest.raises(LogError, match=expected):
+        check_commands(replace(log, has_motors=has_motors), model)
+    with pytest.raises(ValueError, match=expected):
+        make("FlyTrackMotors-v0" if has_motors else "FlyTrack-v0", model=model)
 
 
 @pytest.mark.parametrize("origin", ["measured", "simulated"])
