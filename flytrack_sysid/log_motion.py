@@ -7,7 +7,7 @@ measured.
 """
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import takes_motors
+from flytrack_env.effects import check_frame, takes_motors
 from flytrack_env.motion import Motion
 from flytrack_sysid.log import MEASURED, FlightLog, LogError
 
@@ -65,8 +65,13 @@ def motion_notes(
 def check_commands(log: FlightLog, model: ModelParameters) -> None:
     """Raise LogError for a model that takes other commands than the log has, sticks or motors.
 
-    The rates of a model that takes motors follow from torques, so that they have to be measured.
+    Motors without a frame are refused, too. The rates of a model that takes motors follow from
+    torques, so that they have to be measured.
     """
+    try:
+        check_frame(model.effects)
+    except ValueError as error:
+        raise LogError(f"model: {error}") from error
     expects_motors = takes_motors(model.effects)
     if log.has_motors != expects_motors:
         found, expected = ("motors", "sticks") if log.has_motors else ("sticks", "motors")

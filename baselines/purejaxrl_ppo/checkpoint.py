@@ -24,6 +24,7 @@ import flytrack_env
 from baselines.purejaxrl_ppo.config import Config, Width, read_config
 from baselines.purejaxrl_ppo.networks import ActorCritic, Policy, make_network
 from baselines.purejaxrl_ppo.ppo import Runner
+from flytrack_env.effects import BY_NAME, takes_motors
 from flytrack_env.files import read_at_most, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.model_file import model_as_json
@@ -120,7 +121,10 @@ class Checkpoint(NamedTuple):
         return Policy(self.network, self.params)
 
     def check_fits(self, env: Any) -> None:
-        """Raise CheckpointError unless the policy's input is the observation, row by row."""
+        """Raise CheckpointError unless the policy's input is the observation, row by row.
+
+        What it commands, sticks or motors, must be what the environment's model takes, too.
+        """
         shape = env.observation_space(env.default_params).shape
         if shape != tuple(self.meta.get("image_shape") or (self.observation_size,)):
             raise CheckpointError(
@@ -130,6 +134,16 @@ class Checkpoint(NamedTuple):
         if "observation" in self.meta:
             layouts = (self.meta["observation"], observation_layout(env))
             check_equal("checkpoint: observation", *map(_without_wording, layouts))
+        if "model" in self.meta:  # by names alone, so that files of other versions still fly
+            names = dict(self.meta["model"]).get("effects", {})
+            commands_motors = any(BY_NAME[name].takes_motors for name in names if name in BY_NAME)
+            takes = commands_motors, takes_motors(env.default_params.model.effects)
+            trained, flown = ("motors" if of_motors else "sticks" for of_motors in takes)
+            if trained != flown:
+                raise CheckpointError(
+                    f"checkpoint: found a policy that commands {trained} ({self.env_id}), expected "
+                    f"one that commands {flown}, as the environment's model takes"
+                )
 
 
 def observation_layout(env: Any) -> dict[str, Any]:

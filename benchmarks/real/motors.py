@@ -54,7 +54,7 @@ class Craft(NamedTuple):
 CRAFTS = {
     "Betaflight 6S": Craft(("betaflight_acro_log/shortLog.BFL",), "betaflight", "acro_motors"),
     "Gecko": Craft(("bf_gecko/btfl_002.bbl",), "betaflight", "gecko_motors", LAGS),
-    "Crazyflie, log15": Craft(("cf_arpl_motors/log15",), "usd", "arpl_motors"),
+    "Crazyflie, log15": Craft(("cf_arpl_motors/log15",), "usd", "arpl_motors_log15"),
 }
 
 

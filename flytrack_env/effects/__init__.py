@@ -59,7 +59,7 @@ from flytrack_env.effects.voltage_sag import VOLTAGE_SAG, VoltageSag
 from flytrack_env.effects.wind import WIND, Wind
 from flytrack_env.effects.yaw_reaction import YAW_REACTION, YawReaction
 from flytrack_env.quaternion import Scalar
-from flytrack_env.state import Drone
+from flytrack_env.state import Action, Drone
 
 # The order in which effects of one stage are folded, and that of a model's effects. Commands pass
 # as in a flight controller: the link, the stick's curve, its limit, the limit on acceleration. What
@@ -170,15 +170,22 @@ def start_memories(
 ) -> Memories:
     """Return what the effects of a model remember when an episode begins; None for most.
 
+    Where motors are commanded, an applied action of rates is none of their outputs: what delays
+    commands begins as if all motors had always been commanded its thrust.
+
     Args:
         delay_steps: of delays; every step of an episode carries them, so that fewer are faster.
     """
+    commanded = drone
+    if takes_motors(effects):
+        commanded = drone._replace(applied=Action(*(drone.applied.thrust,) * len(Action._fields)))
 
     def start(parameters: Any) -> Any:
         effect = effect_of(parameters)
         if effect.memory is None:
             return None
-        return effect.memory.start(parameters, drone, *([delay_steps] if effect.max_steps else []))
+        begun = drone if effect.takes_motors else commanded
+        return effect.memory.start(parameters, begun, *([delay_steps] if effect.max_steps else []))
 
     return tuple(start(parameters) for parameters in effects)
 
@@ -196,6 +203,16 @@ def acts(effects: Effects, stage: str) -> bool:
 def takes_motors(effects: Effects) -> bool:
     """Return whether the commands of a model are those of four motors (static)."""
     return any(effect_of(parameters).takes_motors for parameters in effects)
+
+
+def check_frame(effects: Effects) -> None:
+    """Raise ValueError for a model with the effect ``motors`` and without their frame."""
+    for parameters in effects:
+        if isinstance(parameters, Motors) and not np.all(np.asarray(parameters.front_y) > 0.0):
+            raise ValueError(
+                f"effects.motors.front_y: found {np.min(parameters.front_y):g}, expected above 0: "
+                "without a frame there are no motors to command"
+            )
 
 
 def acts_on_sticks(effect: Effect) -> bool:
@@ -341,6 +358,7 @@ __all__ = [
     "acts",
     "acts_on_sticks",
     "at_row",
+    "check_frame",
     "check_parameters",
     "delay_steps_of",
     "effect_of",

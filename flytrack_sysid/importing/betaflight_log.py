@@ -14,6 +14,7 @@ import numpy as np
 
 from flytrack_env.effects import effect_of
 from flytrack_env.messages import quote_name, quote_value
+from flytrack_env.motors import NAMES
 from flytrack_sysid.importing.betaflight_settings import RATES_TYPES, full_stick_rate, stick_curve
 from flytrack_sysid.importing.commands import commands_of_motors
 from flytrack_sysid.importing.decoding import decode
@@ -49,7 +50,6 @@ MAX_LIST_LENGTH = 1000  # characters of a list of field names in a message
 PERCENT = 100.0
 # Past full stick: smoothing by a Butterworth filter overshoots a step by 4.3 %.
 MAX_OVERSHOOT = 0.05
-NUM_MOTORS = 4
 FEATURE_3D = 1 << 12  # of the header's features (Betaflight's config/feature.h)
 DSHOT, PWM = (48.0, 2047.0), (1000.0, 2000.0)  # outputs of a motor that is off, and full
 # Settings that change how thrust follows from throttle and voltage: name, neutral values, effect.
@@ -283,7 +283,7 @@ def _motors(table: Table, headers: _Headers) -> list[str]:
     names = [name for name in table.columns if name.startswith("motor[")]
     if not names:
         return []
-    notes = [not_a_quadcopter(f"{len(names)} motors")] if len(names) != NUM_MOTORS else []
+    notes = [not_a_quadcopter(f"{len(names)} motors")] if len(names) != len(NAMES) else []
     if "motorOutput" in headers.values:
         highest = headers.numbers("motorOutput", 2)[1]
         notes.append(saturation(np.max(table.matrix(names), axis=1) >= highest))
@@ -299,8 +299,9 @@ def _motors_as_commands(source: str, table: Table, headers: _Headers) -> np.ndar
             "motors.as_command",
         )
     names = [name for name in table.columns if name.startswith("motor[")]
-    _, high = headers.numbers("motorOutput", 2)
-    low, high = DSHOT if high > PWM[1] or high == DSHOT[1] else PWM
+    # The low end tells protocols apart: motor_output_limit lowers the upper one.
+    lowest, _ = headers.numbers("motorOutput", 2)
+    low, high = DSHOT if lowest < PWM[0] else PWM
     shares = np.clip((table.matrix(names) - low) / (high - low), 0.0, 1.0) if names else None
     return commands_of_motors(source, shares)
 

@@ -67,7 +67,8 @@ class Craft(NamedTuple):
         if max_rate is None and self.motors is not None:  # a unit of its observations only
             max_rate = tuple(nominal.max_rate.tolist())
         if max_rate is None or self.mass_kg is None or self.voltage_v is None:
-            name = next(name for name in Craft._fields if getattr(self, name) is None)
+            needed = self._replace(max_rate_deg_s=max_rate)
+            name = next(name for name in Craft._fields if getattr(needed, name) is None)
             raise LogError(f"{source}: craft.{name}: missing in log and mapping; a model needs it")
         empty_v, full_v = self.voltage_v
         per_volt = float(nominal.battery.full_v) / full_v

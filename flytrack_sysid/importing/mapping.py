@@ -37,6 +37,7 @@ from flytrack_sysid.log_table import MAX_NORM_ERROR, Table
 SHIPPED = Path(__file__).parent.parent / "mappings"
 FRAMES = Path(__file__).parent.parent / "frames.toml"
 NUM_AXES = 3
+LAG_S = (0.03, 0.03)  # of a motor, up and down, where neither mapping nor known craft says it
 UNSIGNED = (1.0, 1.0, 1.0)
 Count = Annotated[int, Meta(ge=1, le=10**9)]
 ThreeNumbers = tuple[Finite, Finite, Finite]
@@ -421,6 +422,8 @@ class MotorFields(RateGainFields):
     def channels(self, table: str) -> list[Channel]:
         """Return the channel of outputs, 0 to 1, if there are columns."""
         low, high = self.low, self.high
+        if self.as_thrust and self.as_command:
+            raise ValueError("as_thrust: found together with as_command, expected one of them")
         if self.as_command and self.columns and len(self.columns) != len(NAMES):
             raise ValueError(
                 f"columns: found {len(self.columns)} motors, expected the 4 of a quadcopter with "
@@ -456,9 +459,9 @@ class Frame(Fields):
         rear_m: how far the rear motors are behind and aside of it.
         inertia_kg_m2: about the body's axes.
         yaw_arm_m: torque of a propeller over its thrust.
-        propellers: "in", as Betaflight's default, or "out".
-        lag_s: of a motor that speeds up, and of one that slows down.
-        rotor_momentum: of a rotor at full command, kg m^2/s.
+        propellers: "in", as Betaflight's default and here, or "out".
+        lag_s: of a motor that speeds up, and of one that slows down; ``LAG_S`` if nothing says it.
+        rotor_momentum: of a rotor at full command, kg m^2/s; 0 if nothing says it.
     """
 
     craft: Text | None = None
@@ -467,9 +470,9 @@ class Frame(Fields):
     rear_m: tuple[Positive, Positive] | None = None
     inertia_kg_m2: ThreePositive | None = None
     yaw_arm_m: Positive | None = None
-    propellers: Literal["in", "out"] = "in"
-    lag_s: tuple[Positive, Positive] = (0.03, 0.03)
-    rotor_momentum: Annotated[float, Meta(ge=0.0)] = 0.0
+    propellers: Literal["in", "out"] | None = None
+    lag_s: tuple[Positive, Positive] | None = None
+    rotor_momentum: Annotated[float, Meta(ge=0.0)] | None = None
 
     def known(self) -> "Frame":
         """Return the frame with the numbers of its known craft; raises ValueError."""
@@ -477,12 +480,8 @@ class Frame(Fields):
             return self
         crafts = _load(FRAMES)
         values = crafts[choose("craft", self.craft, crafts)]
-        default = Frame()
-        given = {
-            name: getattr(self, name)
-            for name in Frame.__struct_fields__
-            if getattr(self, name) != getattr(default, name)
-        }
+        stated = {name: getattr(self, name) for name in Frame.__struct_fields__}
+        given = {name: value for name, value in stated.items() if value is not None}
         return msgspec.convert({**values, **given}, Frame)
 
     def motors(self, mass_kg: float | None) -> Motors:
@@ -498,7 +497,8 @@ class Frame(Fields):
             raise ValueError("mass_kg: missing in [frame] and [craft]; its inertia is over it")
         assert self.front_m and self.rear_m and self.inertia_kg_m2 and self.yaw_arm_m
         radii = np.sqrt(np.array(self.inertia_kg_m2) / mass_kg).tolist()
-        turn = 1.0 if self.propellers == "in" else -1.0
+        turn = -1.0 if self.propellers == "out" else 1.0
+        up_s, down_s = self.lag_s or LAG_S
         motors = Motors(
             *self.front_m,
             *self.rear_m,
@@ -506,9 +506,9 @@ class Frame(Fields):
             radius_y=radii[1],
             radius_z=radii[2],
             yaw_arm=turn * self.yaw_arm_m,
-            rotor_momentum=turn * self.rotor_momentum / mass_kg,
-            up_s=self.lag_s[0],
-            down_s=self.lag_s[1],
+            rotor_momentum=turn * (self.rotor_momentum or 0.0) / mass_kg,
+            up_s=up_s,
+            down_s=down_s,
         )
         for name, bounds in BY_NAME["motors"].ranges.items():
             value = getattr(motors, name)
@@ -629,6 +629,13 @@ def _craft(source: str, file: MappingFile) -> Craft:
     if file.frame is None:
         return craft
     try:
+        if file.motors is None or not file.motors.as_command:
+            raise ValueError("expected motors.as_command = true with such a table")
+        stated_kg = file.frame.mass_kg
+        if None not in (stated_kg, craft.mass_kg) and stated_kg != craft.mass_kg:
+            raise ValueError(
+                f"mass_kg: found {stated_kg:g}, and {craft.mass_kg:g} in [craft], expected one mass"
+            )
         frame = file.frame.known()
         mass_kg = craft.mass_kg or frame.mass_kg
         return craft._replace(mass_kg=mass_kg, motors=frame.motors(mass_kg))

@@ -167,10 +167,15 @@ def searched_in(problem: Problem) -> list[str]:
     """Return the names of the effects that are looked for, in the order of the list.
 
     What acts on sticks and on the rates that follow them is not part of a craft whose motors are
-    commanded.
+    commanded. A scale of its force alone is an exact twin of ``motors.load``.
     """
-    has_sticks = not takes_motors(problem.like.effects)
-    return [effect.name for effect in SEARCHED if has_sticks or not acts_on_sticks(effect)]
+    if not takes_motors(problem.like.effects):
+        return [effect.name for effect in SEARCHED]
+    return [
+        effect.name
+        for effect in SEARCHED
+        if not acts_on_sticks(effect) and effect.name != "thrust_scale"
+    ]
 
 
 def candidates_for(problem: Problem) -> list[Candidate]:

@@ -16,7 +16,8 @@ from baselines.purejaxrl_ppo.checkpoint import (
     observation_layout,
     save_checkpoint,
 )
-from flytrack_env import FlyTrack
+from flytrack_env import FlyTrack, make
+from flytrack_env.model_file import model_as_json
 from flytrack_env.observations import OBSERVATION_SIZE
 from tests.support.tables import table
 
@@ -84,6 +85,22 @@ def test_observations_that_do_not_fit_are_refused(tmp_path, params):
     save_checkpoint(path, params, CONFIG, {**DESCRIPTION, "observation_size": 5})
     with pytest.raises(CheckpointError, match=f"size 5 .*{OBSERVATION_SIZE}"):
         load_checkpoint(path).check_fits(env)
+
+
+@pytest.mark.parametrize("trained", ["sticks", "motors"])
+def test_policies_of_other_commands_are_refused(tmp_path, params, trained):
+    ids = {"sticks": "FlyTrack-v0", "motors": "FlyTrackMotors-v0"}
+    envs = {commands: make(env_id) for commands, env_id in ids.items()}
+    model = json.loads(json.dumps(model_as_json(envs[trained].default_params.model)))
+    description = {**DESCRIPTION, "env_id": ids[trained], "model": model}
+    save_checkpoint(tmp_path / "d.safetensors", params, CONFIG, description)
+    checkpoint = load_checkpoint(tmp_path / "d.safetensors")
+    checkpoint.check_fits(envs.pop(trained))
+    ((other, env),) = envs.items()
+    with pytest.raises(
+        CheckpointError, match=f"commands {trained} .*, expected one that commands {other}"
+    ):
+        checkpoint.check_fits(env)
 
 
 @pytest.mark.parametrize(

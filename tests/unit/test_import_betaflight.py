@@ -207,6 +207,18 @@ def test_motors_are_counted_their_saturation_noted_and_their_mean_is_thrust(read
 
 
 @pytest.mark.parametrize(
+    ("ends", "off", "full"),
+    [("158,2047", 48, 2047), ("158,1647", 48, 2047), ("1070,2000", 1000, 2000)],
+)
+def test_limited_outputs_of_motors_are_shares_of_the_protocols_range(read, ends, off, full):
+    names = [*NAMES, *(f"motor[{number}]" for number in range(4))]
+    motors = 1100 + np.arange(200)[:, None] + np.arange(4)
+    log = log_with(np.column_stack([frames(), motors]), names, motorOutput=ends)
+    commands = read(log, mapping="[motors]\nas_command = true\n", align=False).log["u"]
+    np.testing.assert_allclose(commands[0], 2.0 * (motors[0] - off) / (full - off) - 1.0)
+
+
+@pytest.mark.parametrize(
     ("other", "message"),
     [
         (log_with(rc_rates="220,100,60"), r"craft: full stick .* 600 deg/s.*a\.bbl.* 500 deg/s"),

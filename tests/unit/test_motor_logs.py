@@ -5,16 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flytrack_env import nominal_parameters
+from flytrack_env import make, nominal_parameters
+from flytrack_env.effects import Motors
 from flytrack_env.motors import NAMES
 from flytrack_env.toml_file import parse_toml
 from flytrack_sysid.check import check_log, text_of
 from flytrack_sysid.check.fix import fix_mapping
 from flytrack_sysid.fit import fit
-from flytrack_sysid.importing import import_log
+from flytrack_sysid.importing import import_log, mapping
+from flytrack_sysid.importing.flight import Craft
+from flytrack_sysid.importing.mapping import Frame
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_file import load_log, save_log
-from flytrack_sysid.log_motion import DOUBTFUL_MOTORS, motion_notes
+from flytrack_sysid.log_motion import DOUBTFUL_MOTORS, check_commands, motion_notes
 from flytrack_sysid.plausibility import find_problems
 from flytrack_sysid.validate import validate
 from tests.support.motor_flights import COLUMNS, flown, write_csv
@@ -27,8 +30,8 @@ def log():
 
 
 def test_motors_of_a_table_become_commands_of_a_craft(log, tmp_path):
-    path, mapping = write_csv(tmp_path, log)
-    found = import_log(path, "csv", mapping)
+    path, map_file = write_csv(tmp_path, log)
+    found = import_log(path, "csv", map_file)
     assert found.log.has_motors and not found.problems
     np.testing.assert_allclose(found.log["u"], log["u"], atol=1e-9)
     save_log(tmp_path / "log.npz", found.log)
@@ -42,9 +45,51 @@ def test_motors_of_a_table_become_commands_of_a_craft(log, tmp_path):
 
 
 def test_a_known_craft_has_a_frame_that_a_mapping_may_change(log, tmp_path):
-    path, mapping = write_csv(tmp_path, log, frame='craft = "iris"\npropellers = "out"')
-    motors = import_log(path, "csv", mapping).nominal_model().effect("motors")
+    path, map_file = write_csv(tmp_path, log, frame='craft = "iris"\npropellers = "out"')
+    motors = import_log(path, "csv", map_file).nominal_model().effect("motors")
     assert motors.front_y == 0.09 and motors.yaw_arm == -0.013
+
+
+def test_stated_numbers_replace_those_of_a_known_craft_whatever_they_are(monkeypatch):
+    crafts = mapping._load(mapping.FRAMES)
+    crafts["crazyflie_2"] |= {"propellers": "out", "rotor_momentum": 1e-6}
+    monkeypatch.setattr(mapping, "_load", lambda path: crafts)
+    known = Frame(craft="crazyflie_2").known()
+    assert (known.lag_s, known.propellers, known.rotor_momentum) == ((0.05, 0.05), "out", 1e-6)
+    stated = {"lag_s": (0.03, 0.03), "propellers": "in", "rotor_momentum": 0.0}
+    motors = Frame(craft="crazyflie_2", **stated).known().motors(0.028)
+    assert (motors.up_s, motors.down_s, motors.rotor_momentum) == (0.03, 0.03, 0.0)
+    assert motors.yaw_arm == 0.00596
+    unstated = {name: getattr(known, name) for name in ("front_m", "rear_m", "yaw_arm_m")}
+    motors = Frame(**unstated, inertia_kg_m2=known.inertia_kg_m2).motors(0.028)
+    assert (motors.up_s, motors.down_s, motors.rotor_momentum) == (0.03, 0.03, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        (
+            "as_command = true",
+            "as_command = true\nas_thrust = true",
+            r"as_thrust: found together",
+        ),
+        ("as_command = true", "", r"frame: expected motors\.as_command = true"),
+        ("[craft]", "[craft]\nmass_kg = 0.7", r"frame\.mass_kg: found 0\.8, and 0\.7 in \[craft\]"),
+    ],
+)
+def test_tables_that_contradict_each_other_are_refused(log, tmp_path, old, new, expected):
+    path, map_file = write_csv(tmp_path, log)
+    map_file.write_text(map_file.read_text().replace(old, new))
+    with pytest.raises(LogError, match=expected):
+        import_log(path, "csv", map_file)
+
+
+def test_a_craft_of_motors_names_what_it_lacks():
+    craft = Craft(mass_kg=0.8, motors=model_of(crafts()).effect("motors"))
+    with pytest.raises(LogError, match=r"a: craft\.voltage_v: missing in log and mapping"):
+        craft.nominal_model("a")
+    with pytest.raises(LogError, match=r"a: craft\.max_rate_deg_s: missing in log and mapping"):
+        craft._replace(motors=None).nominal_model("a")
 
 
 @pytest.mark.parametrize(
@@ -57,16 +102,16 @@ def test_a_known_craft_has_a_frame_that_a_mapping_may_change(log, tmp_path):
     ],
 )
 def test_what_no_quadcopter_has_is_refused(log, tmp_path, columns, frame, expected):
-    path, mapping = write_csv(tmp_path, log, columns, frame)
+    path, map_file = write_csv(tmp_path, log, columns, frame)
     with pytest.raises(LogError, match=expected):
-        import_log(path, "csv", mapping)
+        import_log(path, "csv", map_file)
 
 
 def test_a_motor_that_stands_still_is_named(log, tmp_path):
     still = replace(log, channels={**log.channels, "u": log["u"] * [1.0, 1.0, 0.0, 1.0]})
-    path, mapping = write_csv(tmp_path, still)
+    path, map_file = write_csv(tmp_path, still)
     with pytest.raises(LogError, match=r"motor rear_left: found 0\.5 of its range in every row"):
-        import_log(path, "csv", mapping)
+        import_log(path, "csv", map_file)
     assert "motor rear_left: found 0 in every row" in find_problems(still)[0]
 
 
@@ -81,8 +126,8 @@ def test_the_order_of_motors_is_found_and_corrected(log, tmp_path, order):
     held = " ".join(str(motor + 1) for motor in order)
     assert f"hold motors {held}, read as 1 2 3 4" in text_of(found)
     assert any("hold motors" in problem for problem in find_problems(swapped))
-    _, mapping = write_csv(tmp_path, log, columns)
-    fixed = fix_mapping(mapping.read_text(), found.explanations[0])
+    _, map_file = write_csv(tmp_path, log, columns)
+    fixed = fix_mapping(map_file.read_text(), found.explanations[0])
     assert not fixed.left and parse_toml(fixed.text)["motors"]["columns"] == COLUMNS
 
 
@@ -95,6 +140,16 @@ def test_commands_of_another_kind_than_the_models_are_refused(log):
         fit(log, nominal_parameters(), accept=True)
     with pytest.raises(LogError, match="w: missing, expected the gyro"):
         validate(model, log.without("w"))
+
+
+@pytest.mark.parametrize("has_motors", [True, False])
+def test_motors_without_a_frame_are_refused(log, has_motors):
+    model = nominal_parameters().with_effects(Motors())
+    expected = r"effects\.motors\.front_y: found 0, expected above 0"
+    with pytest.raises(LogError, match=expected):
+        check_commands(replace(log, has_motors=has_motors), model)
+    with pytest.raises(ValueError, match=expected):
+        make("FlyTrackMotors-v0" if has_motors else "FlyTrack-v0", model=model)
 
 
 @pytest.mark.parametrize("origin", ["measured", "simulated"])

@@ -1,5 +1,7 @@
 """The body driven by motors, against rigid bodies in NumPy that share no code with it."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,12 +9,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.motor_craft import Pilot, State, advance, fly, hovering, speed_for
-from flytrack_env import effects
+from flytrack_env import effects, nominal_parameters
 from flytrack_env.dynamics import move
 from flytrack_env.effects.motors import Spinning
 from flytrack_env.motors import NAMES
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone, pack, unpack_action
+from flytrack_sysid.inference.score_test import candidates_for, searched_in
 from tests.support.compiling import quick_jit
 from tests.support.motor_models import crafts, model_of
 
@@ -103,6 +106,22 @@ def test_a_drone_falls_freely_and_hovers():
     np.testing.assert_allclose(flown[-1, 10:], 0.0, atol=1e-9)
 
 
+def test_a_hover_with_delayed_commands_stays_level():
+    model, start = model_of(BALANCED), hovering(BALANCED)
+    model = model.with_effects(effects.CommandDelay(0.02))
+    drone, _ = begun(model_of(BALANCED), start)
+    memories = effects.start_memories(model.effects, drone)
+    flown = _flown(model, (drone, memories), 2.0 * held(*[HOVER] * 4, steps=20) - 1.0)
+    np.testing.assert_allclose(flown[:, 13:16], 0.0, atol=1e-9)
+    np.testing.assert_allclose(flown[:, 3:6], 0.0, atol=1e-9)
+    turning = drone._replace(applied=Action(0.2, -0.1, 0.1, 0.4))
+    (past, spinning, *_), (stick_past,) = (
+        effects.start_memories(of, turning) for of in (model.effects, (effects.CommandDelay(0.02),))
+    )
+    assert past == (Action(0.4, 0.4, 0.4, 0.4),) * 4 and spinning.speeds == (0.7,) * 4
+    assert stick_past == (turning.applied,) * 4
+
+
 @pytest.mark.parametrize("motor", range(4), ids=NAMES)
 def test_each_motor_turns_the_craft_as_it_should(motor):
     commands = held(*[HOVER] * 4)
@@ -191,3 +210,14 @@ def test_gradients_and_batches():
         np.testing.assert_allclose(getattr(slopes, name)[0], measured, rtol=1e-4)
     alone = _flown(model, start, commands)[-1, 13:16].sum()
     np.testing.assert_allclose(values[0], alone, rtol=1e-9)
+
+
+def test_a_scale_of_the_force_alone_is_not_looked_for():
+    of_motors, of_sticks = (
+        SimpleNamespace(like=model, given_effects=given)
+        for model, given in ((model_of(crafts()), ("motors",)), (nominal_parameters(), ()))
+    )
+    assert "thrust_scale" not in searched_in(of_motors)
+    assert "thrust_scale" in searched_in(of_sticks)
+    searched = {candidate.effect for candidate in candidates_for(of_motors)}
+    assert "motors" in searched and "thrust_scale" not in searched
