@@ -9,9 +9,10 @@ from matplotlib.figure import Figure
 
 import flytrack_env
 from flytrack_env import ModelParameters, load_track, nominal_parameters
-from flytrack_env.dynamics import move, read_sensors, sensed
-from flytrack_env.effects import Effect, start_memories
+from flytrack_env.dynamics import move, nominal_motor_parameters, read_sensors, sensed
+from flytrack_env.effects import Effect, start_memories, takes_motors
 from flytrack_env.flown_race import STEP_S
+from flytrack_env.motors import NAMES
 from flytrack_env.pictures import drawing
 from flytrack_env.references import shipped_reference
 from flytrack_env.scene import BLUE, GREEN, ORANGE
@@ -64,21 +65,32 @@ def measured(model: ModelParameters) -> np.ndarray:
     start = (drone, start_memories(model.effects, drone))
     commands = np.array(FLIGHT.commands[:NUM_STEPS], np.float32)
     commands[np.arange(NUM_STEPS) // PULSE_STEPS % 2 == 1, 3] -= PULSE
+    if takes_motors(model.effects):  # all motors alike
+        commands = np.repeat(commands[:, 3:], 4, axis=1)
     rows = jax.jit(lambda commands: jax.lax.scan(fly, start, commands)[1])(commands)
     return np.asarray(rows).reshape(NUM_STEPS, 4, 3)
 
 
+def nominal(is_of_motors: bool) -> ModelParameters:
+    """Return the drone that effects are added to."""
+    return nominal_motor_parameters() if is_of_motors else nominal_parameters()
+
+
 @cache
-def without() -> np.ndarray:
-    """Return what the sensors of the nominal drone say: of any effect that is neutral, the same."""
-    return measured(nominal_parameters())
+def without(is_of_motors: bool) -> np.ndarray:
+    """Return what the sensors of a nominal drone say: of any effect that is neutral, the same."""
+    return measured(nominal(is_of_motors))
 
 
 def draw_effect(effect: Effect) -> Figure:
     """Return by how much an effect changes what is measured on a flight with given commands."""
-    model, neutral = nominal_parameters(), effect.parameters()
-    parameters = neutral._replace(**strong(effect))
-    differences = measured(model.with_effects(parameters)) - without()
+    model, changes = nominal(effect.takes_motors), strong(effect)
+    title_of_all = f"A flight with {effect.name} minus one without, same commands"
+    if effect.takes_motors:  # together they hardly turn the craft
+        changes = {NAMES[0]: changes[NAMES[0]]}
+        title_of_all = "A flight with a stronger rear right motor minus one without"
+    parameters = model.effect(effect.name)._replace(**changes)
+    differences = measured(model.with_effects(parameters)) - without(effect.takes_motors)
     figure = drawing.new_figure(8.0, 4.6)
     times_s = STEP_S * np.arange(1, NUM_STEPS + 1)
     for axes, title, values in zip(
@@ -98,9 +110,7 @@ def draw_effect(effect: Effect) -> Figure:
         axes.set_xlabel("time (s)")
     axes_names = figure.axes[0].get_legend_handles_labels()
     figure.legend(*axes_names, loc="outside lower center", ncols=3, frameon=False)
-    figure.suptitle(
-        f"A flight with {effect.name} minus one without, same commands", fontweight="bold"
-    )
+    figure.suptitle(title_of_all, fontweight="bold")
     return figure
 
 
