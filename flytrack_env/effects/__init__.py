@@ -41,7 +41,7 @@ from flytrack_env.effects.learned_law import LEARNED_LAW, LearnedLaw
 from flytrack_env.effects.linear_drag import LINEAR_DRAG, LinearDrag
 from flytrack_env.effects.mocap_latency import MOCAP_LATENCY, MocapLatency
 from flytrack_env.effects.motor_imbalance import MOTOR_IMBALANCE, MotorImbalance
-from flytrack_env.effects.motors import MOTORS, Motors
+from flytrack_env.effects.motors import MOTORS, Motors, as_commanded
 from flytrack_env.effects.quadratic_drag import QUADRATIC_DRAG, QuadraticDrag
 from flytrack_env.effects.quick_rates import QUICK_RATES, QuickRates
 from flytrack_env.effects.rate_cross_coupling import RATE_CROSS_COUPLING, RateCrossCoupling
@@ -59,7 +59,7 @@ from flytrack_env.effects.voltage_sag import VOLTAGE_SAG, VoltageSag
 from flytrack_env.effects.wind import WIND, Wind
 from flytrack_env.effects.yaw_reaction import YAW_REACTION, YawReaction
 from flytrack_env.quaternion import Scalar
-from flytrack_env.state import Action, Drone
+from flytrack_env.state import Drone
 
 # The order in which effects of one stage are folded, and that of a model's effects. Commands pass
 # as in a flight controller: the link, the stick's curve, its limit, the limit on acceleration. What
@@ -177,8 +177,9 @@ def start_memories(
         delay_steps: of delays; every step of an episode carries them, so that fewer are faster.
     """
     commanded = drone
-    if takes_motors(effects):
-        commanded = drone._replace(applied=Action(*(drone.applied.thrust,) * len(Action._fields)))
+    for parameters in effects:
+        if isinstance(parameters, Motors):
+            commanded = as_commanded(parameters, drone)
 
     def start(parameters: Any) -> Any:
         effect = effect_of(parameters)

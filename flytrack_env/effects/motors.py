@@ -247,6 +247,12 @@ def _is_there(motors: Motors) -> Any:
     return motors.front_y > 0.0
 
 
+def as_commanded(motors: Motors, drone: Drone) -> Drone:
+    """Return a drone whose applied action is that of all motors at its thrust, if there are any."""
+    applied = (jnp.where(_is_there(motors), drone.applied.thrust, one) for one in drone.applied)
+    return drone._replace(applied=Action(*applied))
+
+
 def _respond(
     motors: Motors, memory: Spinning, lagged: Action, context: CommandContext
 ) -> tuple[Action, Spinning]:
