@@ -70,7 +70,7 @@ def list_trials(seconds: float, seed: int) -> list[Trial]:
 
 
 def fly(plant: HiddenPlant, policy: Checkpoint, seconds: float, seed: int) -> FlightLog:
-    """Return what common sensors log of a policy's flights, of so many seconds in all.
+    """Return the log, by common sensors, of a policy's flights of a total length.
 
     An accelerometer feels the force in the axes in which it acts, which depend on the motion.
     """
@@ -101,11 +101,11 @@ def felt_after_step(log: FlightLog, gravity: float) -> np.ndarray:
 
 def raced(policy: Checkpoint, plant: HiddenPlant) -> dict[str, Any]:
     """Return the share of starts that finish, and the mean flying lap, s."""
-    found = race(policy, plant_env(policy, plant), START_SEED, STARTS)
-    return {"success": found.success, "flying_lap_s": rounded(found.flying_lap_s)}
+    outcome = race(policy, plant_env(policy, plant), START_SEED, STARTS)
+    return {"success": outcome.success, "flying_lap_s": rounded(outcome.flying_lap_s)}
 
 
-def lap_of(entry: dict[str, Any]) -> str:
+def format_lap(entry: dict[str, Any]) -> str:
     """Return who finishes, and the flying lap."""
     lap_s = entry["flying_lap_s"]
     return f"{entry['success']:.1%}, " + ("-" if lap_s is None else f"{lap_s:.3f} s")
@@ -169,7 +169,7 @@ def plants_table(plants: list[dict[str, Any]]) -> str:
     rows = []
     for one in sorted(plants, key=lambda line: (line["number"], line["motion"])):
         entries = one["entries"]
-        cells = [lap_of(entries[name]) if name in entries else "refused" for name in ENTRIES]
+        cells = [format_lap(entries[name]) if name in entries else "refused" for name in ENTRIES]
         expected = one.get("expected_lap_s")
         cells += ["{:.3f} to {:.3f} s".format(*expected) if expected else "-"]
         named = ", ".join(one.get("named", ())) or one.get("refused", "nothing")
@@ -228,13 +228,13 @@ def measure_plant(trial: Trial) -> dict[str, Any]:
     entries = result["entries"] = {"nothing": raced(policy, plant)}
     begun_s = time.process_time()
     try:
-        found = adapt(log, policy, trial.seed)
+        adapted = adapt(log, policy, trial.seed)
     except ValueError as error:
         return {**result, "refused": str(error)}
     result["cpu_s"] = round(time.process_time() - begun_s, 1)
-    result |= about(found)
-    entries["adapted"] = raced(found.checkpoint, plant)
-    refitted = adapt_to_base(policy, found.diagnosis, trial.seed)
+    result |= about(adapted)
+    entries["adapted"] = raced(adapted.checkpoint, plant)
+    refitted = adapt_to_base(policy, adapted.diagnosis, trial.seed)
     entries["refitted base"] = raced(refitted.checkpoint, plant)
     return result
 
@@ -259,8 +259,8 @@ def adapt_to_base(policy: Checkpoint, diagnosis: Diagnosis, seed: int) -> Adapte
     base = diagnosis.base
     vector = to_vector(base)
     exact = PlausibleModels(base, vector, np.zeros((len(vector), 1)), vector, vector)
-    own = model_from_json(policy.meta["model"], "model")
-    return improve(policy, own, exact, diagnosis, seed, Settings(), lambda unit: ignore)
+    trained_model = model_from_json(policy.meta["model"], "model")
+    return improve(policy, trained_model, exact, diagnosis, seed, Settings(), lambda unit: ignore)
 
 
 def ignore(done: int, total: int) -> None:
@@ -277,10 +277,10 @@ def measure_unchanged(trial: Trial) -> dict[str, Any]:
     log = fly(HiddenPlant(truth), policy, trial.seconds, trial.seed + trial.number)
     begun_s = time.process_time()
     try:
-        found = adapt(log, policy, trial.seed)
+        adapted = adapt(log, policy, trial.seed)
     except ValueError as error:
         return {"refused": str(error)}
-    return {**about(found), "cpu_s": round(time.process_time() - begun_s, 1)}
+    return {**about(adapted), "cpu_s": round(time.process_time() - begun_s, 1)}
 
 
 def main(seconds: float = 10.0, seed: int = 0, page: bool = False) -> None:

@@ -83,7 +83,7 @@ def speed_for(crafts: Crafts, share: np.ndarray) -> np.ndarray:
     return (np.sqrt(b * b + 4.0 * a * np.maximum(share, 0.0)) - b) / (2.0 * a)
 
 
-def thrusts_of(crafts: Crafts, speeds: np.ndarray) -> np.ndarray:
+def compute_thrusts(crafts: Crafts, speeds: np.ndarray) -> np.ndarray:
     """Return the thrust of each motor, N, (n, 4)."""
     linear = crafts.linear[:, None]
     return crafts.thrust * (linear * speeds + (1.0 - linear) * speeds**2)
@@ -91,7 +91,7 @@ def thrusts_of(crafts: Crafts, speeds: np.ndarray) -> np.ndarray:
 
 def specific_force(crafts: Crafts, state: State) -> np.ndarray:
     """Return what an accelerometer at the centre of mass reads, body, m/s^2, (n, 3)."""
-    total = thrusts_of(crafts, state.speeds).sum(axis=1)
+    total = compute_thrusts(crafts, state.speeds).sum(axis=1)
     air = np.einsum("nij,ni->nj", state.turn, state.vel)
     force = -crafts.drag * air - crafts.quadratic * np.abs(air) * air
     force[:, :2] -= (crafts.rotor_drag * total)[:, None] * air[:, :2]
@@ -102,7 +102,7 @@ def specific_force(crafts: Crafts, state: State) -> np.ndarray:
 def _change(crafts: Crafts, state: State, commands: np.ndarray) -> State:
     lag = np.where(commands > state.speeds, crafts.up_s[:, None], crafts.down_s[:, None])
     spin_up = (commands - state.speeds) / lag
-    thrusts = thrusts_of(crafts, state.speeds)
+    thrusts = compute_thrusts(crafts, state.speeds)
     force = np.zeros((len(crafts), 4, 3))
     force[..., 2] = thrusts
     torque = np.cross(crafts.places, force).sum(axis=1)
@@ -126,11 +126,11 @@ def advance(crafts: Crafts, state: State, commands: np.ndarray, step_s: float = 
     def moved(change: State, share: float) -> State:
         return State(*(a + share * step_s * b for a, b in zip(state, change, strict=True)))
 
-    one = _change(crafts, state, commands)
-    two = _change(crafts, moved(one, 0.5), commands)
-    three = _change(crafts, moved(two, 0.5), commands)
-    four = _change(crafts, moved(three, 1.0), commands)
-    changes = zip(one, two, three, four, strict=True)
+    k1 = _change(crafts, state, commands)
+    k2 = _change(crafts, moved(k1, 0.5), commands)
+    k3 = _change(crafts, moved(k2, 0.5), commands)
+    k4 = _change(crafts, moved(k3, 1.0), commands)
+    changes = zip(k1, k2, k3, k4, strict=True)
     return moved(State(*((a + 2.0 * b + 2.0 * c + d) / 6.0 for a, b, c, d in changes)), 1.0)
 
 

@@ -22,10 +22,10 @@ def run_adapt(flags: Adapt) -> None:
         raise ValueError(f"--out {flags.out}: found a file that is read, expected another")
     log = load_log(flags.log)
     print(f"{describe(log)}\npolicy: {checkpoint.path.name}", flush=True)  # what follows takes long
-    found = adapt(log, checkpoint, flags.seed, accept=flags.accept, report=ProgressBar)
-    if found.is_new:
-        new = found.checkpoint
+    adapted = adapt(log, checkpoint, flags.seed, accept=flags.accept, report=ProgressBar)
+    if adapted.is_new:
+        new = adapted.checkpoint
         save_checkpoint(flags.out, new.params, new.config, new.meta)
     else:
         write_atomically(flags.out, checkpoint.path.read_bytes())
-    print(f"{describe_adapted(found)}\nwritten: {flags.out}")
+    print(f"{describe_adapted(adapted)}\nwritten: {flags.out}")

@@ -157,14 +157,14 @@ def adapt_to_flight(
     try:
         log = fly_log(plant, checkpoint, flown[0], LOG_SECONDS, noise=1.0)
         save_log(out / "race_log.npz", log)
-        found = adapt(log, checkpoint, flown[0], report=ProgressBar)
+        adapted = adapt(log, checkpoint, flown[0], report=ProgressBar)
     except ValueError as error:  # a policy that learned nothing flies nothing to learn from
         print(f"not adapted: {error}")
         return None
-    print(describe_adapted(found))
-    if not found.is_new:
+    print(describe_adapted(adapted))
+    if not adapted.is_new:
         return None
-    new = found.checkpoint
+    new = adapted.checkpoint
     save_checkpoint(out / "adapted.safetensors", new.params, new.config, new.meta)
     return score(fly_many(plant_env(new, plant), new.policy, *flown).outcome)
 

@@ -35,5 +35,5 @@ def adapt_to_flight(data: Data, policy: Policy) -> Policy:
     """
     if policy.checkpoint is None:
         raise PolicyError(f"policy: found {policy.name}, expected a checkpoint, to be improved")
-    found = adapt(data.fly(policy, data.seconds_left), policy.checkpoint)
-    return policy_of(found.checkpoint, f"{policy.name}, adapted")
+    adapted = adapt(data.fly(policy, data.seconds_left), policy.checkpoint)
+    return policy_of(adapted.checkpoint, f"{policy.name}, adapted")

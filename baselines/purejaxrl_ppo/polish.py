@@ -162,8 +162,10 @@ def polish(
         policy_params: Any, key: jax.Array, done: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         key_model, key_start = jax.random.split(key)
-        own = params if draw_model is None else params.replace(model=draw_model(key_model, done))
-        flown = fly(env, Policy(policy.network, policy_params), key_start, own, settings)
+        flown_params = params
+        if draw_model is not None:
+            flown_params = params.replace(model=draw_model(key_model, done))
+        flown = fly(env, Policy(policy.network, policy_params), key_start, flown_params, settings)
         is_complete = flown.gates >= last_gate
         return jnp.where(
             is_complete, flown.time_s, 0.0

@@ -208,7 +208,7 @@ def action_of(speed: Scalar) -> Scalar:
     return 2.0 * speed - 1.0
 
 
-def thrusts_of(
+def compute_thrusts(
     speeds: tuple[Scalar, ...], health: tuple[Scalar, ...], battery_v: Scalar, thrust_coeffs: Any
 ) -> tuple[Scalar, ...]:
     """Return the thrusts of the motors, N."""
@@ -225,7 +225,7 @@ def _substep(state: Turn, inputs: SubstepInputs) -> Turn:
         speed + jnp.where(command > speed, inputs.up, inputs.down) * (command - speed)
         for speed, command in zip(before, inputs.commands, strict=True)
     )
-    thrusts = thrusts_of(speeds, inputs.health, inputs.battery_v, inputs.thrust_coeffs)
+    thrusts = compute_thrusts(speeds, inputs.health, inputs.battery_v, inputs.thrust_coeffs)
     means = [0.5 * (one + two) for one, two in zip(state.thrusts, thrusts, strict=True)]
     torque = Vec3(*(moment(means, axis) for axis in zip(*inputs.levers, strict=True)))
     # Rotors turn against the torque on their craft.
@@ -262,7 +262,7 @@ def _respond(
     full, now = context.full_stick_b, context.drone.applied
     inputs = compute_once(SubstepInputs.of(motors, context))
     rates_b = Vec3(now.roll * full.x, now.pitch * full.y, now.yaw * full.z)
-    thrusts = thrusts_of(memory.speeds, inputs.health, inputs.battery_v, inputs.thrust_coeffs)
+    thrusts = compute_thrusts(memory.speeds, inputs.health, inputs.battery_v, inputs.thrust_coeffs)
     moved = Turn(rates_b, memory.speeds, thrusts)
     for _ in range(num_substeps):
         moved = compute_once(_substep(moved, inputs))
@@ -275,7 +275,9 @@ def _respond(
 
 def _thrust(motors: Motors, memory: Spinning, thrust: Scalar, context: ForceContext) -> Scalar:
     """Return the sum of the motors' thrusts, over the share by which the craft is heavier."""
-    each = thrusts_of(memory.speeds, motors.health, context.drone.battery_v, context.thrust_coeffs)
+    each = compute_thrusts(
+        memory.speeds, motors.health, context.drone.battery_v, context.thrust_coeffs
+    )
     return jnp.where(_is_there(motors), sum(each) / (1.0 + motors.load), thrust)
 
 

@@ -713,7 +713,7 @@ class _Refinement(NamedTuple):
         return fit, kept
 
     def _losses(self, target: Target, fit: Fit) -> np.ndarray:
-        """Return the costs of all blocks, none of which the model was fitted to, (blocks,)."""
+        """Return the cross-validated cost of each block, learnt ones first, (blocks,)."""
         held_out = target._replace(windows=self.flight_test.windows)
         return np.concatenate([fit.losses, held_out.losses(fit.vector)])
 
