@@ -25,7 +25,6 @@ from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import CANDIDATES
 from flytrack_sysid.inference.search import (
     FittedModel,
-    HeldParameter,
     SearchState,
     add_effect,
     score_candidates,
@@ -109,7 +108,7 @@ def _scale_known(state: SearchState, model: FittedModel) -> Known:
     curve = state.problem.parameter_indices(THRUST_COEFFS)
     vector = model.vector.copy()
     vector[curve] = state.problem.start[curve]
-    state = replace(state, held=tuple(HeldParameter(field, "") for field in THRUST_COEFFS))
+    state = replace(state, held=THRUST_COEFFS)
     nominal = state.fitted(model.candidates, vector)
     state, linearization = state.linearized(nominal.vector)
     scores = [

@@ -1,7 +1,6 @@
-"""Select effects: drop unneeded ones, swap rivals, and replace base changes by one effect."""
+"""Select effects: drop unneeded ones, and swap rivals in that explain more."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,23 +8,20 @@ from scipy import stats
 
 from flytrack_env.dynamics import collective_thrust
 from flytrack_env.effects import takes_motors
-from flytrack_sysid.inference.parameters import TAUS, THRUST_COEFFS
+from flytrack_sysid.inference.parameters import TAUS
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import (
     ALL_BASE_CAUSES,
     Candidate,
     Linearization,
     candidates_for,
-    compute_costs,
     estimate_inflation,
     solve,
     threshold,
 )
 from flytrack_sysid.inference.search import (
-    MAX_REFITTED,
     PER_PARAMETER,
     FittedModel,
-    HeldParameter,
     SearchState,
     add_effect,
     score_candidates,
@@ -39,12 +35,6 @@ MAX_RIVALS = 3
 # gain: first order is less exact for large changes, and least exact for effects with probes.
 NEARLY, NEAR_SHARE, PROBE_SHARE = 60.0, 0.15, 0.25
 CLEARLY_CHEAPER = 0.5  # of cost and price: swaps that save less would go back and forth
-IMMATERIAL = 0.01  # of a lag or a drain
-IMMATERIAL_THRUST = 0.003  # of the weight, rms over the flown rows
-HOPELESS = 0.01  # of the cost, above the limit to first order: not worth a fit
-# Twenty seconds; chosen for cost. On ten hidden plants of 40 s each the names were those of a
-# search on all chunks.
-SCREENED_CHUNKS = 4
 
 
 class Ablation(NamedTuple):
@@ -55,8 +45,7 @@ class Ablation(NamedTuple):
         inflation: of that gain's variance.
         num_parameters: of its parameters, those that the log determines.
         rivals: effect -> how much worse (chi2) the model is with that one instead.
-        swaps: effect -> the refitted model with that one instead, of the better rivals, and of the
-            effect itself with another group of its parameters.
+        swaps: effect -> the refitted model with that one instead, of the better rivals.
         without: the refitted model without the effect.
     """
 
@@ -172,12 +161,6 @@ def _with_rivals(
         if rival not in swaps and beside.get(rival, np.inf) < EQUIVALENT:
             swaps[rival] = with_candidate(state, model, effect, scored.candidate, limit)
             rivals[rival] = swaps[rival].cost - model.cost
-    for group in other_groups(linearization, model, effect):
-        swaps[effect] = min(
-            with_candidate(state, model, effect, group, limit),
-            swaps.get(effect, model),
-            key=price,
-        )
     return ablation._replace(rivals=rivals, swaps=swaps)
 
 
@@ -199,39 +182,6 @@ def with_candidate(
     dropped = {*model.candidate(effect).fields} - {*other.fields}
     vector = state.problem.at_start(model.vector, sorted(dropped))
     return state.fitted(candidates, vector, limit=limit)
-
-
-def other_groups(linearization: Linearization, model: FittedModel, effect: str) -> list[Candidate]:
-    """Return candidates of an effect with more, fewer or other parameters, cheaper to first order.
-
-    Other parameters are returned if they gain enough beside the effect's own.
-    """
-    problem, current = linearization.problem, model.candidate(effect)
-    current_fields, result = set(current.fields), []
-    by_fields = {
-        alternative.fields: alternative
-        for alternative in candidates_for(problem)
-        if alternative.effect == effect
-    }
-    smaller_groups = [
-        tuple(field for field in current.fields if field not in group) for group in current.groups
-    ]
-    by_fields |= {fields: current._replace(fields=fields) for fields in smaller_groups if fields}
-    for candidate in by_fields.values():
-        added = {*candidate.fields} - current_fields
-        changed = sorted(added or current_fields - {*candidate.fields})
-        columns = [linearization.column(field) for field in changed]
-        given = linearization.columns_at(model.indices, without=columns)
-        price = PER_PARAMETER * len(changed)
-        if not added:
-            size = (model.vector - problem.start)[problem.parameter_indices(changed)]
-            is_cheaper = size @ linearization.projected(columns, given)[0] @ size < price
-        else:
-            gain = linearization.gain(columns, given)
-            is_cheaper = gain is not None and gain.robust > price
-        if is_cheaper:
-            result.append(candidate)
-    return result
 
 
 def select_effects(
@@ -391,18 +341,6 @@ def thrust_over_weight(problem: Problem, coefficients: np.ndarray) -> float:
     return float(np.sqrt(np.mean(thrust[is_scored] ** 2))) / weight
 
 
-def _is_immaterial(problem: Problem, fields: Sequence[str], model: FittedModel) -> bool:
-    """Return whether a lag, drain or thrust curve differs by too little to matter.
-
-    Rounding causes differences of that size.
-    """
-    indices = problem.parameter_indices(fields)
-    change = model.vector[indices] - problem.start[indices]
-    if fields != THRUST_COEFFS:
-        return bool(np.all(np.abs(change) < IMMATERIAL * np.abs(problem.start[indices])))
-    return thrust_over_weight(problem, change) < IMMATERIAL_THRUST
-
-
 def base_change(
     state: SearchState, linearization: Linearization, model: FittedModel, fields: Sequence[str]
 ) -> BaseChange | None:
@@ -413,7 +351,7 @@ def base_change(
         for field, index in zip(fields, problem.parameter_indices(fields), strict=True)
         if index in free and linearization.acting([linearization.column(field)])
     ]
-    if not acting or _is_immaterial(problem, fields, model):
+    if not acting:
         return None
     indices = problem.parameter_indices(acting)
     marginal = Marginal(linearization, model, acting)
@@ -434,81 +372,3 @@ def base_changes(
         if set(fields) <= set(state.problem.names)
     }
     return {name: change for name, change in changes.items() if change is not None}
-
-
-def explain_base_by_effect(
-    state: SearchState, model: FittedModel
-) -> tuple[SearchState, FittedModel | None]:
-    """Return a model with one more effect and nominal base parameters, if it explains as much.
-
-    For example, a delay of all commands looks like four longer lags.
-    """
-    state, linearization = state.linearized(model.vector)
-    changes = base_changes(state, linearization, model).values()
-    changed = tuple(field for change in changes for field in change.fields)
-    lags = tuple(field for field in changed if field in TAUS)
-    for fields in dict.fromkeys((changed, lags)):
-        if fields and _may_be_explained(state, model, fields):
-            state, simpler = _best_instead(state, model, fields)
-            if simpler is not None:
-                return state, simpler
-    return state, None
-
-
-def _may_be_explained(state: SearchState, model: FittedModel, fields: Sequence[str]) -> bool:
-    """Return whether some chunks allow at most one effect instead of changes of the base.
-
-    What fits worse on the log fits worse on a part, only less clearly. This settles most logs whose
-    base differs from nominal at a fraction of the rows.
-    """
-    problem = state.problem.thinned(SCREENED_CHUNKS)
-    white = problem.whitened_residuals(model.vector)
-    model = model._replace(cost=compute_costs(problem, model.vector[None], white)[0])
-    few = replace(state, problem=problem, linearization=None)
-    return any(True for _ in _cheaper_instead(few, model, fields))
-
-
-class Instead(NamedTuple):
-    """A cheaper model with base parameters held, of ``fields`` of one more effect if any."""
-
-    state: SearchState
-    model: FittedModel
-    fields: tuple[str, ...]
-    price: float
-
-
-def _cheaper_instead(
-    state: SearchState, model: FittedModel, fields: Sequence[str]
-) -> Iterator[Instead]:
-    """Yield cheaper models with base parameters held and at most one more effect."""
-    problem, held = state.problem, (HeldParameter(field, "") for field in fields)
-    state = replace(state, held=(*state.held, *held))
-    reduced = state.fitted(model.candidates, problem.at_start(model.vector, fields))
-    state, nearby = state.linearized(reduced.vector)
-    limit = model.cost + PER_PARAMETER * len(fields)
-    if reduced.cost < limit:
-        yield Instead(state, reduced, (), reduced.cost)
-    max_cost = limit + reduced.cost * HOPELESS
-    for one in score_candidates(state, nearby, reduced)[:MAX_REFITTED]:
-        if reduced.cost - one.gain.chi2 > max_cost and not one.candidate.probes:
-            continue
-        trial = add_effect(state, nearby, reduced, one, max_cost)
-        cost = trial.cost + PER_PARAMETER * one.candidate.num_priced
-        if cost < limit:
-            yield Instead(state, trial, one.candidate.fields, cost)
-
-
-def _best_instead(
-    state: SearchState, model: FittedModel, fields: Sequence[str]
-) -> tuple[SearchState, FittedModel | None]:
-    """Return the best model with base parameters held and at most one more effect, if cheaper."""
-    best: Instead | None = None
-    for instead in _cheaper_instead(state, model, fields):
-        if best is not None and instead.price >= best.price:
-            continue
-        best = instead
-    if best is None:
-        return state, None  # this state keeps its slopes, of the model without anything held
-    effect = "".join(one.effect for one in best.model.candidates if one not in model.candidates)
-    held = (HeldParameter(field, effect) for field in fields)
-    return replace(best.state, held=(*state.held, *held)), best.model

@@ -28,7 +28,6 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, LearnedLaw
 from flytrack_sysid.diagnosis.model_selection import ablate_all
-from flytrack_sysid.diagnosis.onset import ended
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.inference.free_flight import (
     HORIZONS_S,
@@ -814,40 +813,15 @@ def reduced(selection: Selection, refined: Refined) -> Selection:
             )
         )
     if refined.kept:
-        kept = selection if refined.kept == model.candidates else _narrowed(selection, refined.kept)
-        if not _flies_worse(kept, refined.flight_test):
-            return kept
-    state, base = selection.state, selection.base
-    # A removed effect held base parameters at nominal. They are free again, as in the base's fit.
-    held = tuple(
-        parameter
-        for parameter in state.held
-        if state.problem.names.index(parameter.field) not in base.indices
-    )
-    return selection._replace(state=replace(state, held=held), model=base)
+        return selection if refined.kept == model.candidates else _narrowed(selection, refined.kept)
+    return selection._replace(model=selection.base)
 
 
 def _narrowed(selection: Selection, kept: Sequence[Candidate]) -> Selection:
     """Return the selection with some of its effects only, fitted to single steps again."""
     state, model = selection.state, selection.model
     removed = [candidate.effect for candidate in model.candidates if candidate not in kept]
-    state = replace(
-        state, held=tuple(parameter for parameter in state.held if parameter.effect not in removed)
-    )
     model = state.fitted(kept, state.problem.without(model.vector, removed))
     state, linearization = state.linearized(model.vector)
     ablations = ablate_all(state, model, linearization)
     return selection._replace(state=state, model=model, ablations=ablations)
-
-
-def _flies_worse(selection: Selection, flight_test: FlightTest | None) -> bool:
-    """Return whether a model, after its last change within the log, predicts worse than its base.
-
-    The comparison uses held-out flights.
-    """
-    if flight_test is None:
-        return False
-    vector = selection.state.problem.without(selection.model.vector, ended(selection))
-    if selection.unexplained.flagged:
-        return flight_test.worst_ratio(vector) >= 1.0
-    return flight_test.is_surely_worse(vector)

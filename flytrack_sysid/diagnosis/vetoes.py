@@ -69,21 +69,15 @@ Veto = Callable[[Selection, Problem], list[str]]
 
 
 def select(state: SearchState, base: FittedModel, model: FittedModel) -> Selection:
-    """Swap or remove effects, or replace base changes by an effect, while that helps."""
+    """Swap or remove effects while that helps."""
     state, model, ablations = model_selection.select_effects(state, model)
-    while True:
-        state, simpler = model_selection.explain_base_by_effect(state, model)
-        if simpler is None:
-            return Selection(state, base, model, ablations)
-        state, model, ablations = model_selection.select_effects(state, simpler)
+    return Selection(state, base, model, ablations)
 
 
 def reject(selection: Selection, effects: Sequence[str]) -> Selection:
-    """Return the selection without some effects, which stay refused; free the base they held."""
+    """Return the selection without some effects, which stay refused."""
     state, model = selection.state, selection.model
-    freed = {parameter.field for parameter in state.held if parameter.effect in effects}
-    held = tuple(parameter for parameter in state.held if parameter.field not in freed)
-    state = replace(state, refused=(*state.refused, *effects), held=held)
+    state = replace(state, refused=(*state.refused, *effects))
     for effect in effects:
         model = model_selection.without_effect(state, model, effect)
     state, model, ablations = model_selection.select_effects(state, model)

@@ -84,18 +84,6 @@ class FittedModel(NamedTuple):
         return (*others, candidate._replace(fields=fields))
 
 
-class HeldParameter(NamedTuple):
-    """A base parameter held at nominal.
-
-    Attributes:
-        field: its name.
-        effect: that explains its change, "" if none does.
-    """
-
-    field: str
-    effect: str
-
-
 @dataclass(frozen=True, eq=False)
 class SearchState:
     """State of a search; every step of the search returns a new one.
@@ -111,7 +99,7 @@ class SearchState:
     problem: Problem
     unobservable: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
-    held: tuple[HeldParameter, ...] = ()
+    held: tuple[str, ...] = ()
     linearization: Linearization | None = None
 
     @classmethod
@@ -135,7 +123,7 @@ class SearchState:
         Without measured voltages the drain stays nominal: the replay assumes a voltage at every
         row, so that a drop within a step would pass for thrust.
         """
-        held_fields = {parameter.field for parameter in self.held}
+        held_fields = {*self.held}
         if measured_voltage_range(self.problem.chunks) is None:
             held_fields.add(DRAIN)
         return self.problem.parameter_indices(
