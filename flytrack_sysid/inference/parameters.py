@@ -62,13 +62,13 @@ def neutral_value(name: str) -> float:
 
 def to_vector(model: ModelParameters) -> np.ndarray:
     """Return a model's numbers except its battery's, in the order of ``names_of``, float64."""
-    leaves = jax.tree.leaves(model._replace(battery=NO_BATTERY))
+    leaves = jax.tree.leaves(_numbers_of(model))
     return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in leaves])
 
 
 def from_vector(vector: Any, like: ModelParameters) -> ModelParameters:
-    """Return a model with these numbers, and structure and battery of another; differentiable."""
-    leaves, structure = jax.tree.flatten(like._replace(battery=NO_BATTERY))
+    """Return a model with these numbers, and all else as in another; differentiable."""
+    leaves, structure = jax.tree.flatten(_numbers_of(like))
     sizes = [np.size(leaf) for leaf in leaves]
     ends = np.cumsum(sizes)
     split_values = [vector[end - size : end] for size, end in zip(sizes, ends, strict=True)]
@@ -76,7 +76,23 @@ def from_vector(vector: Any, like: ModelParameters) -> ModelParameters:
     reshaped = [
         jnp.reshape(values, shape) for values, shape in zip(split_values, shapes, strict=True)
     ]
-    return jax.tree.unflatten(structure, reshaped)._replace(battery=like.battery)
+    model = jax.tree.unflatten(structure, reshaped)
+    effects = tuple(
+        values._replace(**{static: getattr(given, static)})
+        if (static := effect_of(given).static)
+        else values
+        for values, given in zip(model.effects, like.effects, strict=True)
+    )
+    return model._replace(battery=like.battery, effects=effects)
+
+
+def _numbers_of(model: ModelParameters) -> ModelParameters:
+    """Return a model of the numbers of ``names_of`` only."""
+    effects = tuple(
+        values._replace(**{static: ()}) if (static := effect_of(values).static) else values
+        for values in model.effects
+    )
+    return model._replace(battery=NO_BATTERY, effects=effects)
 
 
 def in_batches(program: Callable[[np.ndarray], Any], values: np.ndarray, size: int) -> np.ndarray:

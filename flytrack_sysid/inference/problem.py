@@ -41,6 +41,7 @@ from flytrack_sysid.inference.chunks import (
     spread_chunks,
 )
 from flytrack_sysid.inference.lateness import Late
+from flytrack_sysid.inference.law_table import tabulated
 from flytrack_sysid.inference.parameters import TAUS, from_vector, names_of, range_of, to_vector
 from flytrack_sysid.inference.record import Record
 from flytrack_sysid.inference.replay import ReplayState, Step, replay_row, start_replay
@@ -381,9 +382,9 @@ class Problem:
     def with_law(self, law: LearnedLaw) -> "Problem":
         """Return the problem whose vectors end with the parameters of a law.
 
-        At the start, the scale of the law is 0.
+        At the start, the scale of the law is 0. All laws share the compiled programs.
         """
-        like = self.like.with_effects(law._replace(scale=0.0))
+        like = self.like.with_effects(tabulated(law._replace(scale=0.0)))
         like = jax.tree.map(lambda leaf: np.asarray(leaf, float), like)
         names, start = names_of(like), to_vector(like)
         low, high = (

@@ -25,7 +25,7 @@ from flytrack_env.files import write_atomically
 # LLVM's first level compiles a replay in a sixth of the time that its third level takes, into a
 # program that is as fast and computes the same bits.
 fast_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 1})
-UNKEPT = "LearnedLaw"  # an effect whose structure the text of a tree does not determine
+UNKEPT = "Law["  # in the structure of models with a law: each is traced for itself
 
 
 def keep_trace(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,0 +1,98 @@
+"""Laws as tables: the same values as the laws of the grammar, and one program for all."""
+
+import jax
+import numpy as np
+import pytest
+
+from flytrack_env.effects import LearnedLaw
+from flytrack_env.effects.grammar import (
+    EXPONENTS,
+    ORDERS,
+    QUANTITIES,
+    SHAPES,
+    Factor,
+    Law,
+    Moment,
+    Term,
+)
+from flytrack_env.quaternion import Vec3
+from flytrack_env.state import Action
+from flytrack_sysid.inference.law_table import FRAMES, SIDES, TERMS_OF_SIDE, tabulated
+
+POWERS = [("power", (exponent, 70.0)) for exponent in EXPONENTS]  # no pole
+FACTORS = [
+    *(
+        Factor(quantity, shape, numbers)
+        for quantity in QUANTITIES
+        for shape, numbers in (*POWERS, ("bump", (0.5, 2.0)), ("step", (0.1, 0.7)))
+    ),
+    Factor("time", "saturation", (3.0,)),
+    *(Factor("heading", "wave", (order, 0.4 * order)) for order in ORDERS),
+    Factor("position", "place", (1.0, -2.0, 3.0, 4.0)),
+]
+
+
+def draw_moment(rng):
+    """Return a moment of a drone in flight, in float64."""
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return Moment(
+        pos_w=Vec3(*rng.normal(0.0, 3.0, 3)),
+        rates_b=Vec3(*rng.normal(0.0, 2.0, 3)),
+        body_axes_w=tuple(Vec3(*axis) for axis in axes),
+        airspeed_b=Vec3(*rng.normal(0.0, 5.0, 3)),
+        applied=Action(*rng.uniform(-1.0, 1.0, 4)),
+        thrust_acc=rng.uniform(0.0, 30.0),
+        battery_v=rng.uniform(18.0, 25.0),
+        time_s=rng.uniform(0.0, 30.0),
+    )
+
+
+def draw_law(rng, factors):
+    """Return a law with a term for each factor or pair of factors, at random in all else."""
+    terms = []
+    for number, own in enumerate(factors):
+        coefficients, errors = (tuple(rng.normal(size=3).tolist()) for _ in range(2))
+        frame = FRAMES[rng.integers(len(FRAMES))]
+        if frame == "air":
+            coefficients, errors = (coefficients[0], 0.0, 0.0), (errors[0], 0.0, 0.0)
+        acts = SIDES[number // TERMS_OF_SIDE]
+        terms.append(Term(acts, frame, tuple(own), coefficients, errors))
+    return Law(tuple(terms))
+
+
+def value_of(law, acts, moment, spread):
+    """Return the vector of a law's terms on a side."""
+    terms = [term.at(moment, spread) for term in law.terms if term.acts == acts]
+    return sum((np.array(term) for term in terms), start=np.zeros(3))
+
+
+def test_a_table_has_the_values_of_its_law():
+    rng, spread = np.random.default_rng(3), 0.7
+    assert {factor.shape for factor in FACTORS} == {*SHAPES}
+    with jax.enable_x64(True), jax.disable_jit():
+        for first in range(0, len(FACTORS), 2 * TERMS_OF_SIDE):
+            own = FACTORS[first : first + 2 * TERMS_OF_SIDE]
+            law = draw_law(rng, [(one, FACTORS[rng.integers(len(FACTORS))]) for one in own])
+            moment, table = draw_moment(rng), tabulated(LearnedLaw(1.0, 0.0, law)).law
+            for acts in SIDES:
+                expected = value_of(law, acts, moment, spread)
+                found = value_of(table, acts, moment, spread)
+                np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, TERMS_OF_SIDE + 1])
+def test_absent_terms_and_factors_add_nothing(count):
+    rng = np.random.default_rng(4)
+    law = draw_law(rng, [(FACTORS[index],) for index in range(count)])
+    with jax.enable_x64(True), jax.disable_jit():
+        moment, table = draw_moment(rng), tabulated(LearnedLaw(1.0, 0.0, law)).law
+        for acts in SIDES:
+            np.testing.assert_allclose(
+                value_of(table, acts, moment, 0.0), value_of(law, acts, moment, 0.0), rtol=1e-9
+            )
+
+
+def test_all_laws_have_the_structure_of_one():
+    rng = np.random.default_rng(5)
+    laws = [tabulated(LearnedLaw(1.0, 0.0, draw_law(rng, [(factor,)]))) for factor in FACTORS[::40]]
+    assert len({jax.tree.structure(law) for law in laws}) == 1
