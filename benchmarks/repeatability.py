@@ -115,7 +115,7 @@ def trials(plants: int) -> list[Trial]:
 
 
 def measure(trial: Trial) -> dict[str, Any]:
-    """Diagnose a flight: causes with equivalents, values and times to half response."""
+    """Diagnose a flight: causes with their classes, values and times to half response."""
     flight = (simulated if trial.craft.startswith(PLANT) else measured)(trial)
     start = process_time()
     diagnosis = diagnose(flight.log, flight.model)
@@ -123,7 +123,9 @@ def measure(trial: Trial) -> dict[str, Any]:
         "effect": flight.effect,
         "cpu_s": process_time() - start,
         "verdict": diagnosis.verdict,
-        "causes": {cause.effect: sorted(cause.equivalent) for cause in diagnosis.causes},
+        "causes": {
+            cause.effect: sorted({*cause.equivalent, *cause.family}) for cause in diagnosis.causes
+        },
         "negligible": [cause.effect for cause in diagnosis.negligible],
         "unsettled": list(diagnosis.unsettled),
         "values": {
@@ -146,7 +148,7 @@ def measure(trial: Trial) -> dict[str, Any]:
 
 
 def is_same_class(one: Line, other: Line) -> bool:
-    """Return whether each cause of either is a cause or an equivalent of one of the other."""
+    """Return whether each cause of either is a cause, or of the class of one, of the other."""
 
     def covers(some: Line, names: Iterable[str]) -> bool:
         known = {name for cause, alike in some["causes"].items() for name in (cause, *alike)}

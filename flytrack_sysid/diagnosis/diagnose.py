@@ -15,6 +15,7 @@ from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis import craft, summary
 from flytrack_sysid.diagnosis.beyond import Learned, with_and_without, with_learned
+from flytrack_sysid.diagnosis.families import with_families
 from flytrack_sysid.diagnosis.first_look import FirstLook
 from flytrack_sysid.diagnosis.late_poses import with_late_poses
 from flytrack_sysid.diagnosis.learned import find_learned
@@ -33,7 +34,7 @@ from flytrack_sysid.diagnosis.onset import (
     with_changes,
 )
 from flytrack_sysid.diagnosis.outliers import find_outliers, outlier_notes
-from flytrack_sysid.diagnosis.refinement import Refined, reduced, refine
+from flytrack_sysid.diagnosis.refinement import Refined, reduced, refine, with_effects
 from flytrack_sysid.diagnosis.result import Cause, Diagnosis
 from flytrack_sysid.diagnosis.size import split_by_size
 from flytrack_sysid.diagnosis.vetoes import (
@@ -41,6 +42,7 @@ from flytrack_sysid.diagnosis.vetoes import (
     EXPLAINED_BY_CHANGE,
     Selection,
     apply_vetoes,
+    examined,
     reject,
     select,
 )
@@ -263,14 +265,14 @@ def vetoed_in_time(selection: Selection, parts: Split) -> tuple[Selection, dict[
     """
     selection = with_changes(selection, parts.test, parts.log)
     selection, rejected = apply_vetoes(selection, held_out_under(selection, parts.test))
-    contradicted = {name for name, veto in rejected.items() if veto == CONTRADICTED}
-    if contradicted:
+    gone = contradicted(rejected)
+    if gone:
         later = with_changes(selection, parts.test, parts.log)
         if later is not selection:
             selection, further = apply_vetoes(later, held_out_under(later, parts.test))
             rejected |= further
             if active_windows(selection):
-                rejected |= dict.fromkeys(contradicted, EXPLAINED_BY_CHANGE)
+                rejected |= dict.fromkeys(gone, EXPLAINED_BY_CHANGE)
                 rejected = {
                     name: veto
                     for name, veto in rejected.items()
@@ -289,17 +291,45 @@ def refined_within_range(
     """
     refused: tuple[Cause, ...] = ()
     while True:
-        refined = refined_by_prediction(selection, parts)
-        at_bound = summary.causes_at_end(selection, refined, test)
+        tried, refined = judged_by_flights(selection, rejected, parts)
+        at_bound = summary.causes_at_end(tried, refined, test)
         if not at_bound:
-            return VettedModel(selection, rejected, refused, refined)
-        selection, further = apply_vetoes(
-            reject(selection, [cause.effect for cause in at_bound]), test
-        )
-        rejected, refused = {**rejected, **further}, (*refused, *at_bound)
+            kept = {candidate.effect for candidate in refined.kept}
+            rejected = {name: veto for name, veto in rejected.items() if name not in kept}
+            removed = tuple(name for name in refined.removed if name not in rejected)
+            return VettedModel(tried, rejected, refused, refined._replace(removed=removed))
+        stuck = [cause.effect for cause in at_bound]
+        selection, further = apply_vetoes(reject(tried, stuck), test)
+        rejected = {name: veto for name, veto in rejected.items() if name not in stuck} | further
+        refused = (*refused, *at_bound)
 
 
-def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
+def judged_by_flights(
+    selection: Selection, rejected: Mapping[str, str], parts: Split
+) -> tuple[Selection, Refined]:
+    """Return a selection with the effects that flights may bring back, and its refinement.
+
+    Beside something unexplained, the noise of single steps is no measure of a gain. So flights
+    judge effects again that held-out single steps contradict.
+    """
+    doubted = contradicted(rejected)
+    if doubted and selection.unexplained.flagged:
+        tried = with_effects(selection, doubted)
+        refined = refined_by_prediction(tried, parts, doubted)
+        kept = {candidate.effect for candidate in refined.kept}
+        if refined.fit is not None:
+            return examined(tried) if kept & {*doubted} else tried, refined
+    return selection, refined_by_prediction(selection, parts)
+
+
+def contradicted(rejected: Mapping[str, str]) -> list[str]:
+    """Return the effects that held-out single steps contradict, and no change explains."""
+    return [name for name, veto in rejected.items() if veto == CONTRADICTED]
+
+
+def refined_by_prediction(
+    selection: Selection, parts: Split, doubted: Sequence[str] = ()
+) -> Refined:
     """Return which effects of a selected model predict held-out flights better than its base does.
 
     Flights are from the last part of the log, in which the same effects act as at its end. Effects
@@ -309,7 +339,13 @@ def refined_by_prediction(selection: Selection, parts: Split) -> Refined:
     since = np.arange(len(parts.log)) >= first_row_as_at_end(selection, parts.test)
     log, is_explained = parts.log.select(since), not selection.unexplained.flagged
     refined = refine(
-        selection.state, selection.base, last_model, log, parts.held_out[since], is_explained
+        selection.state,
+        selection.base,
+        last_model,
+        log,
+        parts.held_out[since],
+        is_explained,
+        doubted,
     )
     kept = {candidate.effect: candidate for candidate in refined.kept}
     kept |= {one.effect: one for one in model.candidates if one not in last_model.candidates}
@@ -351,7 +387,6 @@ def name_causes(vetted: VettedModel, parts: Split) -> NamedModel:
     selection = selection._replace(state=replace(state, linearization=linearization))
     effects = summary.effect_causes(selection, test, linearization)
     in_base, lost_in_base = summary.base_causes(selection, test, linearization, effects)
-    contradicted = [name for name, veto in vetted.rejected.items() if veto == CONTRADICTED]
     fit = refined.fit
     extended = model if fit is None else model._replace(vector=fit.vector)
     before = [*effects, *in_base]
@@ -375,7 +410,7 @@ def name_causes(vetted: VettedModel, parts: Split) -> NamedModel:
         extended=extended,
         found=causes,
         negligible=negligible,
-        lost=(*contradicted, *lost_in_base),
+        lost=(*contradicted(vetted.rejected), *lost_in_base),
         neutral=neutral,
     )
 
@@ -406,7 +441,7 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
     named = name_causes(vetted, parts)
     selection, linearization = named.selection, named.linearization
     problem, unexplained = selection.state.problem, selection.unexplained
-    causes = tuple(one for one in named.found if not one.beyond)
+    causes = with_families((one for one in named.found if not one.beyond), unexplained)
     beyond = (*vetted.refused, *(one for one in named.found if one.beyond))
     outliers = find_outliers((problem, test), named.extended.vector)
     vectors = {

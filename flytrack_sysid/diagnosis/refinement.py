@@ -44,6 +44,7 @@ from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import (
     Candidate,
     base_fields,
+    candidates_for,
     prior_information,
     solve,
     step_inside,
@@ -547,6 +548,7 @@ def refine(
     log: FlightLog,
     held_out: np.ndarray,
     is_explained: bool,
+    doubted: Sequence[str] = (),
 ) -> Refined:
     """Select the effects of a model that predict held-out flights better, and fit their values.
 
@@ -556,6 +558,7 @@ def refine(
         held_out: rows of the log that no fit uses, (num_rows,) bool.
         is_explained: whether one-step residuals are noise only. The model is then the most likely
             one already, and stands unless it predicts a horizon worse than the base.
+        doubted: effects that held-out single steps contradict: flights of these rows decide.
     """
     learnt, held_out_windows = (
         sample_windows(log, ~held_out, MAX_FITTED_WINDOWS),
@@ -571,7 +574,13 @@ def refine(
         return unrefined
     acting = _acting(problem, _probed(problem, extended, candidates), candidates, learnt)
     refinement = _Refinement(
-        flight_test, learnt, base.vector, tuple(state.base_indices), acting, is_explained
+        flight_test,
+        learnt,
+        base.vector,
+        tuple(state.base_indices),
+        acting,
+        is_explained,
+        tuple(doubted),
     )
     is_at_bound = bool(at_bounds(problem, extended, refinement.fields_of(candidates)))
     if is_explained and not is_at_bound and not flight_test.is_surely_worse(extended):
@@ -590,6 +599,7 @@ class _Refinement(NamedTuple):
         acting: the effects that change the predictions. Effects of sensors that windows do not
             contain are not among them; their values stay as they are.
         is_explained: as in ``refine``.
+        doubted: as in ``refine``.
     """
 
     flight_test: FlightTest
@@ -598,6 +608,7 @@ class _Refinement(NamedTuple):
     base_indices: tuple[int, ...]
     acting: tuple[str, ...]
     is_explained: bool
+    doubted: tuple[str, ...]
 
     def fields_of(self, candidates: Sequence[Candidate]) -> list[str]:
         """Return the parameters of effects that act on the windows."""
@@ -657,12 +668,16 @@ class _Refinement(NamedTuple):
             tried = [candidate for candidate in kept if candidate.effect in self.acting]
             fits = [self._without(target, fit, kept, candidate) for candidate in tried]
             losses = np.stack([self._losses(target, one) for one in (fit, *fits)])
-            sure = sureness((losses[1:] - losses[0]).T)
+            losses_more = (losses[1:] - losses[0]).T
+            sure = sureness(losses_more)
             worth = np.sqrt(losses[1:].sum(axis=1) / losses[0].sum()) - 1.0
             needed = np.where(
                 (worth >= WORTHWHILE) & (sure >= LIKELY), np.maximum(sure, SURE), sure
             )
             needed[:] = needed if flight_test.matters.any() else np.inf  # no cell is evidence
+            held_out_sure = sureness(losses_more[len(fit.losses) :])
+            is_doubted = np.array([candidate.effect in self.doubted for candidate in tried])
+            needed[is_doubted & (held_out_sure < LIKELY)] = -np.inf
             without = {
                 candidate.effect: reduced_fit.vector
                 for candidate, reduced_fit in zip(tried, fits, strict=True)
@@ -817,11 +832,30 @@ def reduced(selection: Selection, refined: Refined) -> Selection:
     return selection._replace(model=selection.base)
 
 
+def with_effects(selection: Selection, effects: Sequence[str]) -> Selection:
+    """Return the selection with some effects added, fitted to single steps again."""
+    problem, model = selection.state.problem, selection.model
+    added: dict[str, Candidate] = {}
+    for candidate in candidates_for(problem):
+        known = added.get(candidate.effect, candidate)
+        if candidate.effect in effects and len(candidate.fields) >= len(known.fields):
+            added[candidate.effect] = candidate
+    candidates = (*model.candidates, *added.values())
+    return _fitted_again(selection, candidates, _probed(problem, model.vector, candidates))
+
+
 def _narrowed(selection: Selection, kept: Sequence[Candidate]) -> Selection:
     """Return the selection with some of its effects only, fitted to single steps again."""
-    state, model = selection.state, selection.model
+    model = selection.model
     removed = [candidate.effect for candidate in model.candidates if candidate not in kept]
-    model = state.fitted(kept, state.problem.without(model.vector, removed))
-    state, linearization = state.linearized(model.vector)
+    return _fitted_again(selection, kept, selection.state.problem.without(model.vector, removed))
+
+
+def _fitted_again(
+    selection: Selection, candidates: Sequence[Candidate], vector: np.ndarray
+) -> Selection:
+    """Return the selection with these effects, fitted to single steps from a vector."""
+    model = selection.state.fitted(candidates, vector)
+    state, linearization = selection.state.linearized(model.vector)
     ablations = ablate_all(state, model, linearization)
     return selection._replace(state=state, model=model, ablations=ablations)

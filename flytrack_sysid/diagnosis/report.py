@@ -106,6 +106,8 @@ def format_span(cause: Cause) -> str:
 def _confused(cause: Cause) -> str:
     if cause.equivalent:
         return f"this log cannot tell it from: {list_words(cause.equivalent[:MAX_LISTED])}"
+    if cause.family:
+        return "it may stand for other laws of the same response"
     return f"no; the closest is: {words_of(cause.closest)}" if cause.closest else "not compared"
 
 
@@ -122,6 +124,20 @@ def _faults(diagnosis: Diagnosis) -> str:
         for fault, names in by_fault.items()
     ]
     return f"The model {', and it '.join(clauses)}."
+
+
+def _families(diagnosis: Diagnosis) -> str:
+    """Return a sentence on names that stand for their families; empty without any."""
+    names = [cause.effect for cause in diagnosis.causes if cause.family]
+    if not names:
+        return ""
+    others = [name for cause in diagnosis.causes for name in cause.family if name not in names]
+    listed = list_words(list(dict.fromkeys(others)))
+    times = " The times to half of it hold." if diagnosis.half_response_s else ""
+    return (
+        f"While something in the response to the commands is unexplained, {list_words(names)} may "
+        f"stand for other laws of it ({listed}), which another flight may show.{times}"
+    )
 
 
 def describe_fault(cause: str, diagnosis: Diagnosis) -> str:
@@ -216,7 +232,7 @@ def describe_verdict(diagnosis: Diagnosis) -> Verdict:
     if not diagnosis.causes:
         text = f"The model is wrong, and no known cause explains it.{depends}"
         return Verdict(" ".join(filter(None, [text, beyond, _learned(diagnosis)])), "open")
-    parts = [_faults(diagnosis), _gain(diagnosis), beyond]
+    parts = [_faults(diagnosis), _families(diagnosis), _gain(diagnosis), beyond]
     if unexplained.depends_on:
         parts.append(f"Something else remains that no known cause explains.{depends}")
     parts.append(_learned(diagnosis))
@@ -554,6 +570,7 @@ def text_of(diagnosis: Diagnosis) -> str:
             for equivalent in cause.equivalent
         ]
         twins = f"; not told apart from {', '.join(names)}" if names else ""
+        twins += f"; or its family: {', '.join(cause.family)}" if cause.family else ""
         lines.append(
             f"  {cause.effect}{format_span(cause)}: {values}; held-out gain "
             f"{cause.heldout_gain:.4g}{twins}"

@@ -72,6 +72,8 @@ class Cause:
         closest: the closest rival; base parameters have none.
         beyond: describes a value at the end of its searched range, such as "delay_s at least
             0.04 s": the true cause may be beyond the list.
+        family: other laws of the same response, while something in it is unexplained: the log
+            shows that the response differs, and not for certain which of its laws.
         onset_s: when it began, in the log's time (s); None if it acts from the log's first row.
         end_s: when it ended, in the log's time (s); None if it acts until the log's last row.
     """
@@ -86,6 +88,7 @@ class Cause:
     lambda_sep: float
     closest: str = ""
     beyond: str = ""
+    family: tuple[str, ...] = ()
     onset_s: Estimated | None = None
     end_s: Estimated | None = None
 

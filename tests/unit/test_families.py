@@ -1,0 +1,32 @@
+"""Names of a response stand for their family only where something in it is unexplained."""
+
+import pytest
+
+from flytrack_env.effects import BY_NAME
+from flytrack_sysid.diagnosis.families import FAMILIES, with_families
+from flytrack_sysid.diagnosis.result import Cause, Unexplained
+from flytrack_sysid.inference.parameters import TAUS
+
+NONE: set[str] = set()
+CASES = [
+    ("second_order_rates", {"rate"}, {"tau_roll", "command_delay", "imu_latency"}),
+    ("second_order_rates", {"force"}, NONE),
+    ("second_order_rates", NONE, NONE),
+    ("tau_thrust", {"force"}, {"command_delay", "thrust_lag_asymmetry"}),
+    ("command_delay", {"rate", "force"}, {"tau_roll", "tau_thrust"}),
+    ("linear_drag", {"rate", "force"}, NONE),
+]
+
+
+@pytest.mark.parametrize(("cause", "sides", "family"), CASES)
+def test_a_family_is_of_the_side_that_is_unexplained(cause, sides, family):
+    shares = {f"{side}: stochastic": 1.0 for side in sides}
+    named = Cause(cause, (), "rates", {}, 1.0, 1.0, 1.0, 1.0)
+    (found,) = with_families([named], Unexplained(bool(shares), shares=shares))
+    assert family <= {*found.family} and cause not in found.family
+    assert bool(found.family) == bool(family)
+
+
+def test_members_are_effects_or_lags():
+    members = {name for family in FAMILIES.values() for name in family}
+    assert members <= {*BY_NAME, *TAUS}
