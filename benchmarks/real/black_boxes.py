@@ -25,7 +25,7 @@ import optax
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.diagnosis.refinement import FlightErrors
+from flytrack_sysid.diagnosis.flight_errors import FlightErrors
 from flytrack_sysid.inference.free_flight import HORIZONS_S, Windows
 from flytrack_sysid.inference.one_step import columns, predict
 from flytrack_sysid.inference.record import fill_gaps

@@ -29,7 +29,7 @@ from benchmarks.report import table
 from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_sysid import FlightLog, import_log
 from flytrack_sysid.diagnosis import joined
-from flytrack_sysid.diagnosis.refinement import FlightErrors, sample_windows
+from flytrack_sysid.diagnosis.flight_errors import FlightErrors, sample_windows
 from flytrack_sysid.inference.free_flight import (
     HORIZONS_S,
     QUANTITIES,

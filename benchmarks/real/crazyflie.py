@@ -29,7 +29,7 @@ from benchmarks.real.black_boxes import (
 from benchmarks.report import ROOT, table
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid import FlightLog, import_log
-from flytrack_sysid.diagnosis import joined, refinement
+from flytrack_sysid.diagnosis import flight_errors, joined, refinement
 from flytrack_sysid.diagnosis.diagnose import split
 from flytrack_sysid.inference.free_flight import HORIZONS_S, QUANTITIES, make_windows
 from flytrack_sysid.inference.noise import fit_noise
@@ -109,9 +109,9 @@ def measure_fold(folder: Path, policy: str, seconds: float) -> dict[str, Any]:
     vectors = {"refitted_base": base, "extended": extended}
     if refined.base is not None:
         vectors["refitted_to_flights"] = refined.base
-    errors = refinement.errors_at(problem, np.stack(list(vectors.values())), windows).errors
+    errors = flight_errors.errors_at(problem, np.stack(list(vectors.values())), windows).errors
     results = {
-        name: refinement.FlightErrors(error[None], windows)
+        name: flight_errors.FlightErrors(error[None], windows)
         for name, error in zip(vectors, errors, strict=True)
     }
     plain = from_vector(base, problem.like)._replace(effects=())
@@ -119,7 +119,9 @@ def measure_fold(folder: Path, policy: str, seconds: float) -> dict[str, Any]:
     boxes = {**fit_linear_boxes(rows), "network": fit_network(rows)}
     results |= {name: fly_windows(black_box, windows, steps) for name, black_box in boxes.items()}
     seen = make_windows(training, np.ones(len(training), bool), SPACING_S, MAX_WINDOWS)
-    results["placebo"] = refinement.FlightErrors(refinement.placebo_errors(seen, windows), windows)
+    results["placebo"] = flight_errors.FlightErrors(
+        flight_errors.placebo_errors(seen, windows), windows
+    )
     return {
         "policy": policy,
         "rows": len(training),
@@ -135,7 +137,7 @@ def measure_fold(folder: Path, policy: str, seconds: float) -> dict[str, Any]:
 
 
 def error_ratios(
-    base: refinement.FlightErrors, extended: refinement.FlightErrors, segment: np.ndarray
+    base: flight_errors.FlightErrors, extended: flight_errors.FlightErrors, segment: np.ndarray
 ) -> dict[str, list[list[float]]]:
     """Return the extended model's errors over the base's, (horizons, quantities), by flight.
 
@@ -146,7 +148,7 @@ def error_ratios(
         part = segment == number
         windows = extended.windows._replace(counts=extended.windows.counts[:, part])
         base_rms, rms = (
-            refinement.FlightErrors(model.errors[:, :, part], windows).rms()[0]
+            flight_errors.FlightErrors(model.errors[:, :, part], windows).rms()[0]
             for model in (base, extended)
         )
         ratios[str(number)] = np.nan_to_num(rms / base_rms, nan=0.0).round(4).tolist()

@@ -11,8 +11,9 @@ import numpy as np
 
 from flytrack_env.dynamics import collective_thrust
 from flytrack_env.thrust import hover_action
+from flytrack_sysid.diagnosis.flight_fit import LAG_STEP
 from flytrack_sysid.diagnosis.model_selection import Marginal
-from flytrack_sysid.diagnosis.refinement import LAG_STEP, Refined
+from flytrack_sysid.diagnosis.refinement import Refined
 from flytrack_sysid.diagnosis.result import Estimated, HalfResponse, Lift
 from flytrack_sysid.inference.parameters import STICKS, THRUST_COEFFS
 from flytrack_sysid.inference.problem import Problem

@@ -9,8 +9,7 @@ import numpy as np
 
 from flytrack_env.effects.grammar import Law
 from flytrack_sysid.diagnosis.beyond import Learned
-from flytrack_sysid.diagnosis.law_search import MIN_EXPECTED_GAIN, FittedLaw, Side, find_law
-from flytrack_sysid.diagnosis.refinement import (
+from flytrack_sysid.diagnosis.flight_errors import (
     LIKELY,
     LIKELY_WORSE,
     WORSE_ANYWHERE,
@@ -18,6 +17,7 @@ from flytrack_sysid.diagnosis.refinement import (
     FlightTest,
     errors_at,
 )
+from flytrack_sysid.diagnosis.law_search import MIN_EXPECTED_GAIN, FittedLaw, Side, find_law
 from flytrack_sysid.diagnosis.unexplained import (
     build_waves,
     find_dependences,

@@ -10,432 +10,42 @@ therefore
    held-out rows, and to first order those of each block of training rows without this block,
 4. holds parameters at nominal that an effect does not need.
 
-It also fits a placebo, which predicts from the state at the start alone, without the commands.
-Where the placebo predicts as well as the models, the flights contain no evidence about the response
-to the commands, and the diagnosis names nothing from there.
+Where a placebo without the commands predicts as well as the models, the diagnosis names nothing.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
-import jax
 import numpy as np
-from scipy import special, stats
-from scipy.spatial.transform import Rotation
 
-from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, LearnedLaw
+from flytrack_sysid.diagnosis.flight_errors import (
+    LIKELY,
+    MAX_FITTED_WINDOWS,
+    FlightTest,
+    errors_at,
+    sample_windows,
+    sureness,
+    tabulate_errors,
+)
+from flytrack_sysid.diagnosis.flight_fit import Fit, Target, at_bounds
 from flytrack_sysid.diagnosis.model_selection import ablate_all
 from flytrack_sysid.diagnosis.vetoes import Selection
-from flytrack_sysid.inference.free_flight import (
-    HORIZONS_S,
-    QUANTITIES,
-    UNITS,
-    WINDOWS_PER_BATCH,
-    Windows,
-    cut_batches,
-    make_windows,
-    prediction_errors,
-)
-from flytrack_sysid.inference.parameters import DRAIN, from_vector, in_batches
+from flytrack_sysid.inference.free_flight import HORIZONS_S, UNITS, Windows
+from flytrack_sysid.inference.parameters import DRAIN
 from flytrack_sysid.inference.problem import Problem
-from flytrack_sysid.inference.score_test import (
-    Candidate,
-    base_fields,
-    candidates_for,
-    prior_information,
-    solve,
-    step_inside,
-)
+from flytrack_sysid.inference.score_test import Candidate, base_fields, candidates_for
 from flytrack_sysid.inference.search import FittedModel, SearchState
-from flytrack_sysid.inference.trace_cache import keep_trace
 from flytrack_sysid.log import FlightLog
 
-BATCH = 8  # models that are evaluated at once
-SPACING_S, SHORT_SPACING_S = 0.25, 0.05
-# Limits for the fit and for the held-out score. Windows overlap, so that fewer windows contain
-# nearly as much information, and a fit replays them often.
-MAX_FITTED_WINDOWS, MAX_SCORED_WINDOWS = WINDOWS_PER_BATCH, 3 * WINDOWS_PER_BATCH
-MIN_WINDOWS, MIN_BLOCKS = 12, 3  # a cell with fewer is not scored
-RIDGE = 0.05  # penalty of the placebo, in units of its regressors' variance
 ALWAYS_FITTED_S = 0.25  # horizons up to this are fitted even where the placebo is as good
-OUTLIER = 3.0  # Huber loss: linear beyond this multiple of the base model's RMS error
-MAX_ROUNDS, REFIT_ROUNDS, MIN_GAIN = (
-    10,
-    2,
-    1e-3,
-)  # iterations of a fit, and of a fit without an effect; smallest relative decrease of the cost
-LAG_STEP = 0.5  # of the time between rows: the least step of a lag for intervals
+MAX_ROUNDS, REFIT_ROUNDS = 10, 2  # iterations of a fit, and of a fit without an effect
 NEUTRAL = 1e-3  # largest distance from nominal, relative to a parameter's scale
-DAMPINGS = np.array([1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0])[:BATCH]
 # An effect has to improve the prediction of blocks by SURE standard errors over them. LIKELY
 # standard errors are enough where it is worth the share WORTHWHILE of the error: single steps have
 # shown it already.
-SURE, LIKELY, WORTHWHILE = 2.0, 1.0, 0.02
-SURE_OF_COMMANDS = 1.64  # the same for the better of the models over the placebo, one-sided 95 %
-# A horizon is worse if the ratio of its error to the base's is above LIKELY_WORSE, and if it is
-# worse by LIKELY standard errors over blocks where the commands matter, or by WORSE_ANYWHERE where
-# they do not and only chance changes the error. A ratio that rounds to 1.00 counts as equal.
-LIKELY_WORSE, WORSE_ANYWHERE = 1.005, 2.0
-# Standard errors by which a horizon has to be worse before a model is doubted whose one-step
-# residuals are noise: among twenty cells, one is always worse by one standard error.
-SURELY_WORSE = 3.0
-
-
-class FlightErrors(NamedTuple):
-    """Errors on windows, measured minus predicted: (models, horizons, windows, quantities, 3)."""
-
-    errors: np.ndarray
-    windows: Windows
-
-    @property
-    def squares(self) -> np.ndarray:
-        """Squared size of the errors, (models, horizons, windows, quantities)."""
-        return np.square(self.errors).sum(axis=-1)
-
-    def rms(self) -> np.ndarray:
-        """Return the RMS of the errors, (models, horizons, quantities); NaN without windows."""
-        counts = self.windows.counts.sum(axis=1)
-        mean = self.squares.sum(axis=2) / np.maximum(counts, 1)
-        return np.where(counts > 0, np.sqrt(mean), np.nan)
-
-    def by_block(self, scale: np.ndarray) -> np.ndarray:
-        """Return the contribution of each block to the relative mean squares.
-
-        Args:
-            scale: errors that they are relative to, (horizons, quantities).
-
-        Returns:
-            Contributions, (models, blocks, horizons, quantities).
-        """
-        counts = np.maximum(self.windows.counts.sum(axis=1), 1)
-        relative = self.squares / (np.square(scale) * counts)[:, None]
-        return self.windows.sums_by_block(np.moveaxis(relative, 2, 0)).swapaxes(0, 1)
-
-    @property
-    def scale(self) -> np.ndarray:
-        """RMS errors of the first model as a divisor, (horizons, quantities); 1 without windows."""
-        return np.maximum(np.nan_to_num(self.rms()[0], nan=1.0), 1e-9)
-
-    def against(self, base: "FlightErrors") -> tuple[np.ndarray, np.ndarray]:
-        """Compare the errors of the first model with those of a base model.
-
-        Returns:
-            Ratio of the RMS errors to the base's, and the increase of the mean squares in standard
-            errors; both (horizons, quantities).
-        """
-        increase = self.by_block(base.scale)[0] - base.by_block(base.scale)[0]
-        return self.rms()[0] / base.scale, sureness(increase)
-
-
-def sureness(differences: np.ndarray) -> np.ndarray:
-    """Return the sum of differences by block, (blocks, ...), in standard errors of that sum."""
-    num_blocks = max(len(differences), 2)
-    centred = differences - differences.mean(axis=0)
-    spread = np.sqrt(np.square(centred).sum(axis=0) * num_blocks / (num_blocks - 1))
-    return differences.sum(axis=0) / np.maximum(spread, 1e-300)
-
-
-@keep_trace
-def _errors(vectors: jax.Array, like: ModelParameters, windows: Windows) -> jax.Array:
-    return jax.vmap(lambda vector: prediction_errors(from_vector(vector, like), windows))(vectors)
-
-
-def errors_at(problem: Problem, vectors: np.ndarray, windows: Windows) -> FlightErrors:
-    """Return the errors of models on windows; all numbers of windows share one compiled program.
-
-    Args:
-        vectors: parameters of the models, (num_vectors, num_parameters).
-    """
-
-    def errors_of_batch(batch_vectors: np.ndarray) -> np.ndarray:
-        by_batch = [
-            np.asarray(_errors(batch_vectors, problem.like, batch))
-            for batch in cut_batches(windows)
-        ]
-        return np.concatenate(by_batch, axis=2)[:, :, : len(windows.start)]
-
-    errors = in_batches(errors_of_batch, vectors, BATCH)
-    # A model whose prediction diverges gets a large, finite error.
-    errors = np.nan_to_num(np.clip(errors, -1e6, 1e6), nan=1e6)
-    return FlightErrors(errors.reshape(*errors.shape[:-1], len(QUANTITIES), 3), windows)
-
-
-def _regressors(windows: Windows) -> np.ndarray:
-    """Return the placebo's input, (windows, regressors): the state at the start."""
-    row, record = windows.first_free - 1, windows.record
-    turned = Rotation.from_quat(record.quat[row], scalar_first=True).as_matrix().reshape(-1, 9)
-    return np.concatenate(
-        [record.vel_w[row], record.pos_w[row], turned, windows.gyro_b[row]], axis=1
-    )
-
-
-def _changes(windows: Windows) -> np.ndarray:
-    """Return the change of the state up to each horizon, (horizons, windows, quantities, 3)."""
-    row, record = windows.first_free - 1, windows.record
-    start = Rotation.from_quat(record.quat[row], scalar_first=True)
-    changes = []
-    for end in windows.ends:
-        turn = start.inv() * Rotation.from_quat(record.quat[end], scalar_first=True)
-        levels = (windows.gyro_b, record.vel_w, record.pos_w)
-        changes.append(
-            np.stack([turn.as_rotvec(), *(level[end] - level[row] for level in levels)], axis=1)
-        )
-    return np.stack(changes)
-
-
-def placebo_errors(learnt: Windows, held_out_windows: Windows) -> np.ndarray:
-    """Return the errors of ridge regression on the start state, (1, horizons, windows, ...)."""
-    regressors, changes = _regressors(learnt), _changes(learnt)
-    mean, spread = regressors.mean(axis=0), regressors.std(axis=0) + 1e-9
-    rows, held_out_rows = (
-        np.c_[(values - mean) / spread, np.ones(len(values))]
-        for values in (regressors, _regressors(held_out_windows))
-    )
-    measured, errors = _changes(held_out_windows), []
-    for index in range(len(HORIZONS_S)):
-        is_used = learnt.counts[index].any(axis=-1)
-        # Without a window of this length, the placebo predicts no change, and nothing is scored.
-        damping = RIDGE * max(is_used.sum(), 1) * np.diag([*np.ones(len(mean)), 1e-9])
-        target = changes[index].reshape(len(rows), -1)[is_used]
-        slopes = np.linalg.solve(
-            rows[is_used].T @ rows[is_used] + damping, rows[is_used].T @ target
-        )
-        predicted = (held_out_rows @ slopes).reshape(len(held_out_rows), len(QUANTITIES), 3)
-        residuals = measured[index] - predicted
-        turns = (Rotation.from_rotvec(values[:, 0]) for values in (predicted, measured[index]))
-        residuals[:, 0] = (next(turns).inv() * next(turns)).as_rotvec()
-        errors.append(residuals)
-    return np.where(held_out_windows.counts[..., None], np.stack(errors), 0.0)[None]
-
-
-class Fit(NamedTuple):
-    """A model fitted to windows.
-
-    Attributes:
-        vector: all parameters, (num_parameters,).
-        indices: the free parameters.
-        covariance: covariance of the free parameters, (indices, indices), times the square of
-            ``quantile``: roots of its diagonal are half-widths of 95 % intervals. Parameters at the
-            end of their range are held there, and have none.
-        half_widths: half of the 95 % interval of each free index; of those at the end of their
-            range as if it went on.
-        losses: cost of each block of windows without a fit to this block, (blocks,), to first
-            order (Takeuchi, "Distribution of informational statistics and a criterion of model
-            fitting", Suri-Kagaku 153, 1976).
-    """
-
-    vector: np.ndarray
-    indices: tuple[int, ...]
-    covariance: np.ndarray
-    half_widths: np.ndarray
-    losses: np.ndarray
-
-    @property
-    def quantile(self) -> float:
-        """Standard deviations in half of a 95 % interval, Student's t for the number of blocks."""
-        return float(stats.t.ppf(0.975, max(len(self.losses), 2) - 1))
-
-
-def huber_loss(residuals: np.ndarray) -> np.ndarray:
-    """Return the Huber loss of relative errors, summed over the last axis; small ones' squares."""
-    return 2.0 * special.huber(OUTLIER, residuals).sum(axis=-1)
-
-
-class Target(NamedTuple):
-    """The cost that a fit minimises: errors on windows, relative to a scale.
-
-    Attributes:
-        problem: the parameters, their ranges and priors.
-        windows: free flights that are compared with the log.
-        scale: errors that count as 1, (horizons, quantities).
-        is_fitted: cells that the fit takes into account, (horizons, quantities).
-    """
-
-    problem: Problem
-    windows: Windows
-    scale: np.ndarray
-    is_fitted: np.ndarray
-
-    def residuals(self, vectors: np.ndarray) -> np.ndarray:
-        """Return relative errors, (num_vectors, windows, horizons * quantities * 3)."""
-        weight = np.where(self.is_fitted, 1.0 / self.scale, 0.0)
-        errors = errors_at(self.problem, vectors, self.windows).errors * weight[:, None, :, None]
-        return np.moveaxis(errors, 2, 1).reshape(len(vectors), len(self.windows.start), -1)
-
-    def cost(self, residuals: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-        """Return the Huber loss plus the weak prior of each model, (num_vectors,)."""
-        robust = huber_loss(residuals).sum(axis=1)
-        return robust + np.square(vectors - self.problem.start) @ prior_information(self.problem)
-
-    def fitted(self, vector: np.ndarray, indices: Sequence[int], rounds: int) -> Fit:
-        """Fit a model from a start vector by damped Gauss-Newton with one-sided differences."""
-        problem, free_indices = self.problem, np.array(indices, int)
-        vector = problem.clipped(vector)
-        for _ in range(rounds):
-            information, scores, cost = self.linearized(vector, indices)
-            prior, pull = (
-                prior_information(problem)[free_indices],
-                (vector - problem.start)[free_indices],
-            )
-            candidates = self._ways(
-                vector, free_indices, information, scores.sum(axis=0) + prior * pull
-            )
-            costs = self.cost(self.residuals(candidates), candidates)
-            best = int(np.argmin(costs))
-            if costs[best] > cost * (1.0 - MIN_GAIN):
-                break
-            vector = candidates[best]
-        information, scores, _ = self.linearized(vector, indices, LAG_STEP * self.step_s)
-        whole = self._covariance(information, scores)
-        room = 1e-6 * problem.scale[free_indices]
-        is_inside = (vector - problem.low)[free_indices] > room
-        is_inside &= (problem.high - vector)[free_indices] > room
-        inside = np.ix_(is_inside, is_inside)
-        covariance = np.zeros_like(whole)
-        covariance[inside] = self._covariance(information[inside], scores[:, is_inside])
-        variances = np.where(is_inside, np.diag(covariance), np.diag(whole))
-        by_block = self.windows.sums_by_block(scores[:, is_inside])
-        moved = solve(information[inside], by_block.T).T
-        losses = self.losses(vector) + 2.0 * (by_block * moved).sum(axis=1)
-        return Fit(vector, tuple(indices), covariance, np.sqrt(variances), losses)
-
-    def losses(self, vector: np.ndarray) -> np.ndarray:
-        """Return the cost of each block of windows, (blocks,)."""
-        return self.windows.sums_by_block(huber_loss(self.residuals(vector[None])[0]))
-
-    @property
-    def step_s(self) -> float:
-        """Usual time between rows, s."""
-        return float(np.median(self.windows.record.step_s))
-
-    def linearized(
-        self, vector: np.ndarray, indices: Sequence[int], least_lag_s: float = 0.0
-    ) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return information, scores of windows, (windows, indices), and cost of a vector.
-
-        Args:
-            vector: all parameters.
-            indices: of the free ones.
-            least_lag_s: as of ``Problem.nudged``.
-        """
-        problem = self.problem
-        moved, step = problem.nudged(vector, indices, least_lag_s=least_lag_s)
-        residuals = self.residuals(np.concatenate([vector[None], moved]))
-        columns = (residuals[1:] - residuals[0]) / step[:, None, None]
-        root = np.sqrt(OUTLIER / np.maximum(np.abs(residuals[0]), OUTLIER))
-        scores = np.einsum("pwn,wn->wp", columns, residuals[0] * root**2)
-        flat = (columns * root).reshape(len(step), -1)
-        information = flat @ flat.T + np.diag(prior_information(problem)[list(indices)])
-        return information, scores, float(self.cost(residuals[:1], vector[None])[0])
-
-    def _ways(
-        self,
-        vector: np.ndarray,
-        free_indices: np.ndarray,
-        information: np.ndarray,
-        gradient: np.ndarray,
-    ) -> np.ndarray:
-        """Return the vector after the step of each damping; parameters at a bound stay there."""
-
-        def newton_step(free: np.ndarray, damping: float) -> np.ndarray:
-            inner = information[np.ix_(free, free)]
-            return -solve(inner + damping * np.diag(np.diag(inner)), gradient[free])
-
-        candidates = np.repeat(vector[None], len(DAMPINGS), axis=0)
-        for index, damping in enumerate(DAMPINGS):
-            candidates[index, free_indices] += step_inside(
-                self.problem, vector, free_indices, partial(newton_step, damping=damping)
-            )
-        return self.problem.clipped(candidates)
-
-    def _covariance(self, information: np.ndarray, scores: np.ndarray) -> np.ndarray:
-        """Return the sandwich covariance from the scores of blocks, scaled to 95 % intervals.
-
-        The scale is the quantile of Student's t distribution.
-        """
-        by_block = self.windows.sums_by_block(scores)
-        inverse = solve(information, np.eye(len(information)))
-        num_blocks = max(len(by_block), 2)
-        covariance = inverse @ (by_block.T @ by_block * num_blocks / (num_blocks - 1)) @ inverse
-        return covariance * stats.t.ppf(0.975, num_blocks - 1) ** 2
-
-
-class FlightTest(NamedTuple):
-    """Held-out windows, and the errors of the refitted base and of the placebo on them.
-
-    Attributes:
-        problem: the parameters of the models.
-        windows: held-out free flights.
-        base: errors of the refitted base.
-        placebo: errors of the placebo.
-        scale: RMS errors of the base, (horizons, quantities).
-        matters: cells that are evidence, (horizons, quantities): a model that gets the commands
-            predicts better than the placebo.
-    """
-
-    problem: Problem
-    windows: Windows
-    base: FlightErrors
-    placebo: FlightErrors
-    scale: np.ndarray
-    matters: np.ndarray
-
-    @classmethod
-    def of(
-        cls, problem: Problem, learnt: Windows, held_out_windows: Windows, base: np.ndarray
-    ) -> "FlightTest":
-        """Build the test of a base model; only that model decides which cells are evidence."""
-        errors = errors_at(problem, base[None], held_out_windows)
-        placebo = FlightErrors(placebo_errors(learnt, held_out_windows), held_out_windows)
-        matters = np.zeros(errors.scale.shape, bool)
-        flight_test = cls(problem, held_out_windows, errors, placebo, errors.scale, matters)
-        return flight_test._with_evidence(errors)
-
-    @property
-    def is_known(self) -> np.ndarray:
-        """Whether a cell has enough held-out windows for a score, (horizons, quantities)."""
-        counts = self.windows.counts
-        blocks = self.windows.sums_by_block(counts.swapaxes(0, 1).astype(int))
-        return (counts.sum(axis=1) >= MIN_WINDOWS) & ((blocks > 0).sum(axis=0) >= MIN_BLOCKS)
-
-    def tested(self, *vectors: np.ndarray) -> FlightErrors:
-        """Return the errors of models on the held-out windows."""
-        return errors_at(self.problem, np.stack(vectors), self.windows)
-
-    def seeing(self, vector: np.ndarray) -> "FlightTest":
-        """Return the test with those cells added as evidence where a model beats the placebo."""
-        return self._with_evidence(self.tested(vector))
-
-    def _with_evidence(self, errors: FlightErrors) -> "FlightTest":
-        gain = self.placebo.by_block(self.scale)[0] - errors.by_block(self.scale)[0]
-        beats = sureness(gain) > SURE_OF_COMMANDS
-        return self._replace(matters=self.matters | (beats & self.is_known))
-
-    def is_surely_worse(self, vector: np.ndarray) -> bool:
-        """Return whether a model predicts any horizon significantly worse than the base does."""
-        ratio, z_scores = self.tested(vector).against(self.base)
-        return bool(np.any(self.is_known & (ratio > LIKELY_WORSE) & (z_scores > SURELY_WORSE)))
-
-    def worst_ratio(self, vector: np.ndarray) -> float:
-        """Return the largest ratio of a model's errors to the base's among cells that are worse.
-
-        Returns:
-            The ratio; 0 if no cell is worse.
-        """
-        ratio, z_scores = self.tested(vector).against(self.base)
-        is_worse = (ratio > LIKELY_WORSE) & (
-            z_scores > np.where(self.matters, LIKELY, WORSE_ANYWHERE)
-        )
-        return float(np.max(ratio[self.is_known & is_worse], initial=0.0))
-
-    def losses(self, *vectors: np.ndarray) -> np.ndarray:
-        """Return mean squares relative to the base's in cells of evidence, (models, blocks)."""
-        squares = self.tested(*vectors).by_block(self.scale)
-        is_used = self.matters if self.matters.any() else self.is_known
-        return squares[..., is_used].mean(axis=-1)
+SURE, WORTHWHILE = 2.0, 0.02
 
 
 class Refined(NamedTuple):
@@ -498,30 +108,6 @@ class Refined(NamedTuple):
             for name in ("position", "attitude", "rates")
         )
         return next((errors[key] for key in keys if key in errors), {})
-
-
-def sample_windows(
-    log: FlightLog, rows: np.ndarray, max_windows: int = MAX_SCORED_WINDOWS
-) -> Windows | None:
-    """Return windows over some rows of a log; None if there are none."""
-    windows = make_windows(log, rows, SPACING_S, max_windows)
-    if len(windows.start) < WINDOWS_PER_BATCH:  # a chunk costs the same, full or not
-        windows = make_windows(log, rows, SHORT_SPACING_S, WINDOWS_PER_BATCH)
-    return windows if len(windows.start) else None
-
-
-def at_bounds(problem: Problem, vector: np.ndarray, fields: Sequence[str]) -> list[str]:
-    """Return those parameters that are at the end of their searched range, except for shapes."""
-    result = []
-    for index in problem.parameter_indices(fields):
-        effect, _, field = problem.names[index].partition(".")
-        low, high, value = problem.low[index], problem.high[index], vector[index]
-        room = 1e-6 * max(abs(value), 1.0)
-        is_shape = bool(field) and field in BY_NAME[effect].search.shapes
-        is_neutral = bool(field) and abs(value - problem.start[index]) <= room
-        if not (is_shape or is_neutral) and not low + room < value < high - room:
-            result.append(problem.names[index])
-    return result
 
 
 def widened(problem: Problem, fields: Sequence[str]) -> Problem:
@@ -790,19 +376,6 @@ def _probed(problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate
         if _is_neutral(problem, vector, [probe.field]):
             result[problem.names.index(probe.field)] = probe.value
     return result
-
-
-def tabulate_errors(rms: np.ndarray) -> dict[str, dict[str, float]]:
-    """Arrange RMS errors, (horizons, quantities), by quantity with unit and by horizon in s."""
-    return {
-        f"{quantity}_{UNITS[quantity].replace('/', '_per_')}": {
-            f"{horizon:g}": float(value)
-            for horizon, value in zip(HORIZONS_S, rms[:, index], strict=True)
-            if np.isfinite(value)
-        }
-        for index, quantity in enumerate(QUANTITIES)
-        if np.isfinite(rms[:, index]).any()
-    }
 
 
 def reduced(selection: Selection, refined: Refined) -> Selection:

@@ -8,6 +8,8 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, effect_of
 from flytrack_sysid.diagnosis import vetoes
+from flytrack_sysid.diagnosis.flight_errors import errors_at, tabulate_errors
+from flytrack_sysid.diagnosis.flight_fit import at_bounds
 from flytrack_sysid.diagnosis.identifiability import advise, unit_of, unseen_effects
 from flytrack_sysid.diagnosis.model_selection import (
     BaseChange,
@@ -17,7 +19,7 @@ from flytrack_sysid.diagnosis.model_selection import (
     equivalents,
     separation,
 )
-from flytrack_sysid.diagnosis.refinement import Refined, at_bounds, errors_at, tabulate_errors
+from flytrack_sysid.diagnosis.refinement import Refined
 from flytrack_sysid.diagnosis.result import (
     CAUSES_FOUND,
     CHANNELS,

@@ -18,10 +18,11 @@ from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, vetoes
 from flytrack_sysid.diagnosis.craft import lift_of
 from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
+from flytrack_sysid.diagnosis.flight_fit import Fit
 from flytrack_sysid.diagnosis.learned import improves_flights
 from flytrack_sysid.diagnosis.model_selection import Ablation
 from flytrack_sysid.diagnosis.onset import windowed
-from flytrack_sysid.diagnosis.refinement import Fit, Refined
+from flytrack_sysid.diagnosis.refinement import Refined
 from flytrack_sysid.diagnosis.report import describe_verdict
 from flytrack_sysid.diagnosis.result import Cause, Estimated
 from flytrack_sysid.diagnosis.size import is_bent

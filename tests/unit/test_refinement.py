@@ -6,14 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
-from flytrack_sysid.diagnosis.refinement import (
-    Fit,
-    FlightTest,
-    errors_at,
-    refine,
-    sample_windows,
-    superfluous,
-)
+from flytrack_sysid.diagnosis.flight_errors import FlightTest, errors_at, sample_windows
+from flytrack_sysid.diagnosis.flight_fit import Fit
+from flytrack_sysid.diagnosis.refinement import refine, superfluous
 from flytrack_sysid.inference.chunks import cut_chunks
 from flytrack_sysid.inference.free_flight import QUANTITIES
 from flytrack_sysid.inference.problem import Problem
