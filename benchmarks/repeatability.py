@@ -127,7 +127,7 @@ def measure(trial: Trial) -> dict[str, Any]:
             cause.effect: sorted({*cause.equivalent, *cause.family}) for cause in diagnosis.causes
         },
         "negligible": [cause.effect for cause in diagnosis.negligible],
-        "unsettled": list(diagnosis.unsettled),
+        "unsettled": [*diagnosis.unsettled, *(cause.effect for cause in diagnosis.beyond)],
         "values": {
             f"{cause.effect}.{name}": [value.value, *value.ci95]
             for cause in diagnosis.causes

@@ -312,7 +312,8 @@ def judged_by_flights(
     Beside something unexplained, the noise of single steps is no measure of a gain. So flights
     judge effects again that held-out single steps contradict.
     """
-    doubted = contradicted(rejected)
+    held_out = (CONTRADICTED, EXPLAINED_BY_CHANGE)
+    doubted = [name for name, veto in rejected.items() if veto in held_out]
     if doubted and selection.unexplained.flagged:
         tried = with_effects(selection, doubted)
         refined = refined_by_prediction(tried, parts, doubted)

@@ -248,6 +248,7 @@ class _Refinement(NamedTuple):
             candidate
             for candidate in refined.kept
             if not _is_neutral(refined.problem, fit.vector, candidate.fields)
+            and (candidate.effect in self.acting or candidate.effect not in self.doubted)
         ]
         removed = [candidate.effect for candidate in refined.kept if candidate not in kept]
         while any(candidate.effect in self.acting for candidate in kept):
