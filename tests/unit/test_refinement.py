@@ -84,6 +84,18 @@ def test_an_effect_that_no_block_of_flights_needs_is_removed(dragged):
     )
 
 
+def test_doubted_effects_stay_only_where_flights_show_them(dragged):
+    _, log, problem, earlier = dragged
+    with jax.enable_x64(True):
+        base = FittedModel((), problem.start, 0.0, ())
+        model = base._replace(candidates=(DRAG, BIAS), vector=earlier.fit.vector)
+        doubted = ("linear_drag", "accelerometer_bias")  # no flight depends on the second
+        rows = held_out_rows(log)
+        found = refine(SearchState(problem), base, model, log, rows, False, doubted)
+    assert [one.effect for one in found.kept] == ["linear_drag"]
+    assert found.removed == ("accelerometer_bias",)
+
+
 @pytest.mark.parametrize(
     ("values", "halves", "expected"),
     [
