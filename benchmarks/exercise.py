@@ -64,7 +64,7 @@ def draw_curves(metrics: dict[str, np.ndarray], config: Config) -> Figure:
 
 def draw_stages(checkpoints: dict[int, Path]) -> Figure:
     """Return position densities of evaluation flights after numbers of environment steps."""
-    figure = new_figure(11.0, 5.2)
+    figure = new_figure(11.0, 4.4)
     image: Any = None
     all_axes = figure.subplots(1, len(checkpoints), sharex=True, sharey=True)
     for axes, (steps, path) in zip(all_axes, checkpoints.items(), strict=True):
@@ -73,7 +73,7 @@ def draw_stages(checkpoints: dict[int, Path]) -> Figure:
         flown = fly_many(env, checkpoint.policy, EVALUATION_SEED, NUM_EPISODES, NUM_STEPS, NUM_LAPS)
         image = draw_density(axes, flown.positions(), env.track, NUM_EPISODES)
         gates = score(flown.outcome).gates
-        axes.set_title(f"{steps / 1e6:.1f} M steps: {gates:.1f} gates", fontsize=9)
+        axes.set_title(f"{steps / 1e6:.1f} M steps: {gates:.1f} gates", fontsize=9, pad=12)
         axes.set(xlabel="x (m)", aspect="equal")
         print(f"{steps} steps: {gates:.2f} gates a flight", flush=True)
     all_axes[0].set_ylabel("y (m)")

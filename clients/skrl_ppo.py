@@ -25,6 +25,8 @@ SETTINGS = {
     "mini_batches": 32,
     "learning_rate": 1e-3,
     "value_loss_scale": 0.5,
+    "value_clip": 0.0,
+    "time_limit_bootstrap": True,
     "experiment": {"write_interval": 0, "checkpoint_interval": 0},
 }
 
