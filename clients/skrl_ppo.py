@@ -14,7 +14,7 @@ from skrl.utils.model_instantiators.torch import deterministic_model, gaussian_m
 
 from clients.flights import Outcome, outcome_of
 
-RETURN_MARGIN, GATE_MARGIN = 5.0, 2.0
+RETURN_MARGIN, GATE_MARGIN = 0.8, 0.3
 NUM_ENVS, NUM_STEPS, NUM_UPDATES = 256, 64, 60
 NETWORK = [
     {"name": "net", "input": "OBSERVATIONS", "layers": [64, 64], "activations": "tanh"},

@@ -13,9 +13,12 @@ FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--allow-file-access
 # Code and wide tables may scroll sideways in a box of their own, and nothing may be cut vertically.
 FIND_CLIPPED = """
 const found = [];
-const say = (what, element) =>
-  found.push(`${what}: ${element.tagName} ${(element.src || element.textContent).trim().slice(0, 80)}`);
-for (const element of document.querySelectorAll("p, li, h1, h2, h3, table, math, img, figure, pre")) {
+const say = (what, element) => {
+  const text = (element.src || element.textContent).trim().slice(0, 80);
+  found.push(`${what}: ${element.tagName} ${text}`);
+};
+const all = "p, li, h1, h2, h3, table, math, img, figure, pre";
+for (const element of document.querySelectorAll(all)) {
   const box = element.getBoundingClientRect();
   if (!box.width) continue;
   if (element.tagName === "IMG" && !element.naturalWidth) say("missing", element);
@@ -92,7 +95,8 @@ class Browser:
         };
         const element = document.querySelector(arguments[0]);
         let ground = element;
-        while (ground.parentElement && /, 0\\)$|transparent/.test(getComputedStyle(ground).backgroundColor))
+        const colour = of => getComputedStyle(of).backgroundColor;
+        while (ground.parentElement && /, 0\\)$|transparent/.test(colour(ground)))
           ground = ground.parentElement;
         const [dark, light] = [getComputedStyle(element).color,
           getComputedStyle(ground).backgroundColor].map(luminance).sort((a, b) => a - b);
