@@ -141,9 +141,7 @@ def import_log(
         raise LogError(f"{loaded.source}: rows.logs: a file of format {format} holds one log")
     flights_read = [(path, flight) for path in files for flight in READERS[format](path, loaded)]
     notes = tuple(note for _, flight in flights_read for note in flight.notes)
-    flights, ground_notes = _flights_in_the_air(
-        flights_read, loaded, format in DENSE_FORMATS
-    )
+    flights, ground_notes = _flights_in_the_air(flights_read, loaded, format in DENSE_FORMATS)
     notes += ground_notes
     sources = [flight.log.source for flight in flights]
     log = _concatenate([flight.log for flight in flights], sources)
