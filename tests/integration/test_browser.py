@@ -45,10 +45,10 @@ def site(browser, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def report(browser, tmp_path_factory):
-    """The report of a diagnosis of half a minute of the shipped black box."""
+    """The report of a diagnosis of a minute of the shipped black box."""
     folder = tmp_path_factory.mktemp("report")
     log = str(folder / "log.npz")
-    main(["collect", "--minutes", "0.5", "--noise", "1", "--out", log])
+    main(["collect", "--minutes", "1", "--noise", "1", "--out", log])
     main(["diagnose", log, "--motion", "euler", "--out", str(folder / "diagnosis")])
     return folder / "diagnosis" / "report.html"
 

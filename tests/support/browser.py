@@ -15,7 +15,7 @@ FIND_CLIPPED = """
 const found = [];
 const say = (what, element) => {
   const text = (element.src || element.textContent).trim().slice(0, 80);
-  found.push(`${what}: ${element.tagName} ${text}`);
+  found.push(`${what}: ${element.tagName.toUpperCase()} ${text}`);
 };
 const all = "p, li, h1, h2, h3, table, math, img, figure, pre";
 for (const element of document.querySelectorAll(all)) {
@@ -25,7 +25,7 @@ for (const element of document.querySelectorAll(all)) {
   const style = getComputedStyle(element);
   if (style.overflowY !== "visible" && element.scrollHeight > element.clientHeight + 1)
     say("cut below", element);
-  if (SIDEWAYS.includes(element.tagName) && style.overflowX !== "visible"
+  if (SIDEWAYS.includes(element.tagName.toUpperCase()) && style.overflowX !== "visible"
       && element.scrollWidth > element.clientWidth + 1) say("cut at the right", element);
   const holder = element.closest(".scroll, .md-typeset__scrollwrap");
   if (box.right > innerWidth + 1 && !(holder && MAY_SCROLL)) say("outside of the window", element);
