@@ -46,23 +46,6 @@ def test_contradiction_is_found_and_corrected(tmp_path, monkeypatch):
     assert not names["fixed"].problems
 
 
-def test_flight_log(tmp_path, monkeypatch):
-    names = run_examples(tutorial("flight_log"), tmp_path, monkeypatch)
-    assert len(names["log"]) > 2500 and set(names["log"].channels) == {
-        "u",
-        "q",
-        "v",
-        "w",
-        "f",
-        "v_bat",
-    }
-    assert load_model(tmp_path / "model.json").tau[:3] == pytest.approx([0.04] * 3, rel=0.02)
-    assert names["errors"].one_step.channels["f"].nrmse > 0.2  # the model lacks the drag
-    assert {cause.effect for cause in names["diagnosis"].causes} == {"linear_drag", "thrust_curve"}
-    drag = load_model(tmp_path / "diagnosis" / "extended_model.json").effect("linear_drag")
-    assert drag == pytest.approx((0.4, 0.4, 0.2), rel=0.05)
-
-
 def test_better_policy(tmp_path, monkeypatch):
     names = run_examples(tutorial("better_policy"), tmp_path, monkeypatch)
     loop, errors = (
