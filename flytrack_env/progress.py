@@ -75,7 +75,9 @@ class LineBar:
         """Return the line that is written."""
         now_s = time.monotonic()
         parts = [f"{_as_clock(now_s - self._began_s)} so far"]
-        if self.total:
+        if self.unit and not self.total:
+            parts.insert(0, f"{self.n} {self.unit}")
+        elif self.total:
             count = tqdm.format_sizeof if self._is_large else str
             parts.insert(0, f"{count(self.n)} of {count(self.total)} {self.unit}")
             done, is_known = self.n - self._initial, self.total >= MIN_STEPS

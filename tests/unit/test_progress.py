@@ -55,6 +55,7 @@ def test_the_time_left_is_told_once_it_is_known_and_the_clock_does_not_jump(monk
 
 def test_a_callback_closes_its_bar_with_a_last_line(quick, capsys):
     report = ProgressBar("flights")
+    assert report.bar.line() == "0 flights, 00:00 so far"  # nobody knows yet of how many
     report(1, 48)
     time.sleep(0.2)
     report(48, 48)
