@@ -25,6 +25,7 @@ PACKAGES = (
     *(f"flytrack{name}/" for name in ("", "_bench", "_env", "_fly", "_loop", "_sysid")),
 )
 CLONE_ONLY = "firmware/"
+OF_GITHUB = ".github/"
 HEADLESS = {
     "JAX_PLATFORMS": "cpu",
     "MPLBACKEND": "agg",
@@ -161,7 +162,7 @@ def contents(session: nox.Session) -> None:
     # The folder with GPL-3 is for clones: it is in no release.
     if released := {name for name in in_wheel | in_source if name.startswith(CLONE_ONLY)}:
         session.error(f"found {sorted(released)}, expected nothing of {CLONE_ONLY} in a release")
-    tracked = {path for path in tracked if not path.startswith(CLONE_ONLY)}
+    tracked = {path for path in tracked if not path.startswith((CLONE_ONLY, OF_GITHUB))}
     if missing := tracked - in_source - {".gitignore", ".ci/run"}:
         session.error(f"{source.name}: lacks {sorted(missing)}")
 

@@ -37,7 +37,7 @@ LINES = report.RESULTS / "adapt.jsonl"
 POLICY, DT_S, NUM_LAPS, NUM_STEPS = "robust", 0.01, 25, 1000
 PLANT, UNCHANGED = "plant", "unchanged"
 NUM_PLANTS, NUM_UNCHANGED = 8, 20
-AS_MODELS = {"handout": "handout", "semi_implicit": "semi_implicit", "fine": "continuous"}
+AS_MODELS = {"handout": "euler", "semi_implicit": "semi_implicit", "fine": "continuous"}
 ENTRIES = ("nothing", "refitted base", "adapted")
 STARTS, START_SEED = 256, 7
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 
 from baselines.purejaxrl_ppo import Config
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
@@ -20,7 +19,7 @@ from baselines.purejaxrl_ppo.networks import Policy
 from baselines.purejaxrl_ppo.training import Trainer, is_due
 from benchmarks import report
 from flytrack_env.files import write_atomically
-from flytrack_env.pictures.drawing import new_figure, png_of
+from flytrack_env.pictures.drawing import new_figure, plain, png_of
 
 TARGET_SUCCESS, TARGET_STEPS = 0.95, 3_000_000
 # Half as many steps per update as by default: it learns to finish sooner, and to be fast later.
@@ -95,20 +94,36 @@ def row_of(seed: int, points: list[Point]) -> list[str]:
 
 
 def draw(path: Path, curves: dict[int, list[Point]]) -> None:
-    """Write a PNG of success and flying lap over environment steps, a line a seed."""
-    figure = new_figure(8, 6)
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    for seed, points in curves.items():
-        steps = np.array([point.steps for point in points]) / 1e6
-        upper.plot(
-            steps, [100 * point.success for point in points], marker="o", label=f"seed {seed}"
+    """Write a PNG of success over environment steps, a panel a seed before those of all others."""
+    num_columns = min(5, len(curves))
+    num_rows = -(-len(curves) // num_columns)
+    figure = new_figure(2.0 * num_columns + 0.8, 1.7 * num_rows + 0.7)
+    all_axes = figure.subplots(num_rows, num_columns, sharex=True, sharey=True, squeeze=False)
+    lines = {
+        seed: ([p.steps / 1e6 for p in points], [100 * p.success for p in points])
+        for seed, points in curves.items()
+    }
+    for axes in all_axes.flat[len(curves) :]:
+        axes.set_visible(False)
+    for axes, (seed, line) in zip(all_axes.flat, lines.items(), strict=False):
+        for other in lines.values():
+            plain(axes).plot(*other, color="0.85", linewidth=0.9)
+        axes.plot(*line, color="#0072B2", linewidth=1.8)
+        axes.axhline(100 * TARGET_SUCCESS, color="0.5", linestyle=":", linewidth=0.9)
+        held, last = held_from(curves[seed]), curves[seed][-1]
+        text = "not held" if held is None else f"held from {held.steps / 1e6:.2f} M"
+        axes.set_title(f"seed {seed}: {text}", fontsize=8, loc="left")
+        axes.annotate(
+            f"{last.flying_lap_s:.2f} s",
+            (0.97, 0.08),
+            xycoords="axes fraction",
+            ha="right",
+            fontsize=8,
         )
-        lower.plot(steps, [point.flying_lap_s for point in points], marker="o")
-    upper.axhline(100 * TARGET_SUCCESS, color="0.5", linestyle=":")
-    upper.set(ylabel=f"{NUM_LAPS} laps completed (%)", title="FlyTrack-v0 from scratch")
-    upper.legend()
-    lower.set(xlabel="environment steps (millions)", ylabel="mean flying lap (s)")
-    write_atomically(path, png_of(figure))
+        axes.tick_params(labelsize=8)
+    figure.supxlabel("environment steps (millions); flying lap at the end", fontsize=9)
+    figure.supylabel(f"{NUM_LAPS} laps completed (%)", fontsize=9)
+    write_atomically(path, png_of(figure, dpi=140))
 
 
 def main(seeds: int = 5, out: Path = report.RESULTS / "learning_curve.md") -> None:

@@ -34,7 +34,7 @@ def act_of(model: Any) -> Act:
 
 def sb3(seed: int) -> Act:
     """Return Stable-Baselines3's PPO."""
-    model = sb3_ppo.make_ppo(seed)
+    model = sb3_ppo.make_model(seed)
     model.learn(STEPS)
     return act_of(model)
 

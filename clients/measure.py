@@ -11,8 +11,10 @@ from clients import (
     evosax_es,
     purejaxrl_loop,
     rejax_ppo,
+    sb3_contrib_trpo,
     sb3_ppo,
     sbx_ppo,
+    skrl_ppo,
     torchrl_ppo,
 )
 
@@ -20,6 +22,8 @@ CLIENTS = {
     "rejax": rejax_ppo,
     "stable-baselines3": sb3_ppo,
     "sbx-rl": sbx_ppo,
+    "sb3-contrib": sb3_contrib_trpo,
+    "skrl": skrl_ppo,
     "torchrl": torchrl_ppo,
     "evosax": evosax_es,
     "gymnasium": cleanrl_loop,  # a loop of one's own, with Gymnasium's wrappers

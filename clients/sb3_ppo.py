@@ -21,18 +21,18 @@ def make_envs(num_envs: int) -> VecMonitor:
     return VecMonitor(SameStepVecEnv(envs))
 
 
-def make_ppo(seed: int, algorithm: type = PPO) -> Any:
-    """Return Stable-Baselines3's PPO, or sbx's, for FlyTrack-v0, not trained yet."""
+def make_model(seed: int, algorithm: type = PPO, **settings: Any) -> Any:
+    """Return PPO, or an algorithm with the same interface, for FlyTrack-v0, not trained yet."""
     torch.set_num_threads(1)  # more threads compete with those of JAX
     return algorithm(
         "MlpPolicy",
         make_envs(256),
         n_steps=64,
         batch_size=512,
-        n_epochs=4,
         learning_rate=1e-3,
         device="cpu",
         seed=seed,
+        **(settings or {"n_epochs": 4}),
     )
 
 
@@ -50,9 +50,9 @@ def evaluate(model: Any) -> tuple[float, float]:
     return float(mean_return), float(np.mean(gates))
 
 
-def measure(seed: int, algorithm: type = PPO) -> Outcome:
+def measure(seed: int, algorithm: type = PPO, **settings: Any) -> Outcome:
     """Train and return the evaluations before and after."""
-    model = make_ppo(seed, algorithm)
+    model = make_model(seed, algorithm, **settings)
     return_before, gates_before = evaluate(model)
     model.learn(1_000_000)
     return_after, gates_after = evaluate(model)

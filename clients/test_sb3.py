@@ -88,7 +88,7 @@ def test_unsupported_environments_and_options_are_refused() -> None:
 
 
 def test_the_entry_of_the_benchmark_flies_what_was_trained() -> None:
-    model = sb3_ppo.make_ppo(seed=1)
+    model = sb3_ppo.make_model(seed=1)
     observations = np.random.default_rng(0).normal(size=(16, 29)).astype(np.float32)
     expected, _ = model.predict(observations, deterministic=True)
     np.testing.assert_allclose(

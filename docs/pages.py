@@ -75,7 +75,7 @@ def with_links(markdown: str, path: str, page: str) -> str:
 def site_pages() -> dict[str, str]:
     """Return all pages that the site adds or changes, by their path on it."""
     sources = {str(path.relative_to(ROOT)): path for path in sorted((ROOT / "docs").rglob("*.md"))}
-    sources |= {path: ROOT / path for path in COPIED}
+    sources |= {path: ROOT / path for path in ("README.md", *COPIED)}
     ids = "".join(f"- [{env_id}](envs/{env_id}.md)\n" for env_id in ENVIRONMENTS)
     appended = {
         "effects.md": effects_table(),

@@ -186,8 +186,10 @@ def as_json(result: Score) -> dict[str, float | None]:
 
 
 def describe_race(result: Score, num_episodes: int) -> str:
-    """Return a race in one line."""
+    """Return a race in one line; times of laps that nobody completed are left out."""
+    times = [("first lap", result.first_lap_s), ("flying lap", result.flying_lap_s)]
+    laps = [f"{name} {seconds:.2f} s" for name, seconds in times if not np.isnan(seconds)]
     return (
         f"{result.success:.1%} of {num_episodes} noisy starts finish {NUM_LAPS} laps on the black "
-        f"box; first lap {result.first_lap_s:.2f} s, flying lap {result.flying_lap_s:.2f} s"
+        f"box; {', '.join(laps) or 'no lap was completed'}"
     )

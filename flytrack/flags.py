@@ -15,7 +15,7 @@ EXCITATION_OR_SCRIPT = create_mutex_group(required=False)
 Paths = Positional[tuple[Path, ...]]
 OptionalPath = Annotated[Path | None, arg(metavar="PATH", help_behavior_hint=NO_HINT)]
 SomeLogs = Annotated[tuple[Path, ...], arg(metavar="LOG [LOG ...]", help_behavior_hint=NO_HINT)]
-MotionName = Literal["auto", "handout", "semi_implicit", "continuous"]
+MotionName = Literal["auto", "euler", "semi_implicit", "continuous", "handout"]  # handout: euler
 
 
 @dataclass(frozen=True)

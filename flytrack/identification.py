@@ -13,7 +13,7 @@ from flytrack_env.extras import import_object
 from flytrack_env.files import write_atomically
 from flytrack_env.model_file import ModelFileError
 from flytrack_env.plants import Plant
-from flytrack_env.progress import ProgressBar
+from flytrack_env.progress import ProgressBar, waiting
 from flytrack_sysid.check import Check as CheckOfLog
 from flytrack_sysid.check import check_environment, check_log, check_plant, write_check
 from flytrack_sysid.check import text_of as text_of_check
@@ -79,7 +79,8 @@ def run_import(flags: Import) -> None:
     check_name(flags.out)
     if flags.model_out is not None:
         check_model_name(flags.model_out)
-    found = import_log(flags.files, flags.format, flags.map, not flags.keep_clocks)
+    with waiting(f"read {len(flags.files)} files"):
+        found = import_log(flags.files, flags.format, flags.map, not flags.keep_clocks)
     written = [flags.out, flags.out.with_suffix(".import.json")]
     model = None if flags.model_out is None else found.nominal_model()  # before anything is written
     save_log(flags.out, found.log)
@@ -102,16 +103,17 @@ def run_check(flags: Check) -> int:
     if flags.fix is not None and flags.map is None:
         raise ValueError("--fix: found without --map, expected the mapping to correct")
     model = None if flags.model is None else load_model(flags.model)
-    if flags.plant is not None:
-        found, log = check_of_plant(flags.plant, flags.layout), None
-    else:
-        assert flags.log is not None
-        log = (
-            load_log(flags.log)
-            if flags.map is None
-            else import_log(flags.log, flags.format, flags.map).log
-        )
-        found = check_log(log, model)
+    with waiting("check"):
+        if flags.plant is not None:
+            found, log = check_of_plant(flags.plant, flags.layout), None
+        else:
+            assert flags.log is not None
+            log = (
+                load_log(flags.log)
+                if flags.map is None
+                else import_log(flags.log, flags.format, flags.map).log
+            )
+            found = check_log(log, model)
     print(text_of_check(found))
     if flags.out is not None:
         print_written(write_check(flags.out, found, found.corrected if log is None else log))
@@ -161,7 +163,8 @@ def run_fit(flags: Fit) -> None:
     requested = None if flags.motion == "auto" else Motion(flags.motion)
     told = start.motion
     if required_motion(log, requested) is None:
-        start = start._replace(motion=motion_of(log, start))
+        with waiting("find how the craft moves within a step"):
+            start = start._replace(motion=motion_of(log, start))
     every, bar = flags.hold_out_every, ProgressBar("rounds")
     found = fit(log, start, fixed, flags.effect, every, bar, requested, accept=True)  # checked
     provenance = found.provenance()
@@ -184,7 +187,8 @@ def run_validate(flags: Validate) -> None:
     log = load_log(flags.log)
     check_plausible(log, flags.accept)
     rows, note = judged_rows(flags.model, log)
-    found = validate(model, log, rows)
+    with waiting("fly the model beside the log"):
+        found = validate(model, log, rows)
     found = found._replace(notes=(note, *found.notes))
     written = write_validation(flags.out, found, flags.model.name, log)
     print(text_of(found, flags.model.name, log))
@@ -210,7 +214,9 @@ def run_diagnose(flags: Diagnose) -> None:
     if flags.quick:
         if before:
             raise ValueError("--quick: found beside --before, expected one of the two")
-        print(f"{first_look(logs, model, held_out, motion).text()}\n{NOT_CHECKED}")
+        with waiting("first look"):
+            look = first_look(logs, model, held_out, motion)
+        print(f"{look.text()}\n{NOT_CHECKED}")
         return
     if flags.out is None:
         raise ValueError("--out: missing, expected a folder for the report, or --quick")
@@ -221,7 +227,8 @@ def run_diagnose(flags: Diagnose) -> None:
         diagnosis = diagnose(
             logs, model, held_out, bar, motion, lambda look: bar.write(look.text())
         )
-    written = write_diagnosis(flags.out, diagnosis, log)
+    with waiting("draw the report"):
+        written = write_diagnosis(flags.out, diagnosis, log)
     print(text_of_diagnosis(diagnosis))
     recording = flags.out / RECORDING_NAME
     models = {"nominal": diagnosis.nominal, "extended": diagnosis.extended}
@@ -235,7 +242,8 @@ def run_plan(flags: Plan) -> None:
     """Plan the flights, write their script and print what they are for."""
     check_script_name(flags.out)
     model = nominal_parameters() if flags.model is None else load_model(flags.model)
-    found = next_flight(flags.diagnosis, model, flags.seed)
+    with waiting("fly every manoeuvre in simulation"):
+        found = next_flight(flags.diagnosis, model, flags.seed)
     save_script(flags.out, found.script)
     print(found.describe())
     print_written([flags.out])

@@ -61,7 +61,7 @@ class ModelParameters(NamedTuple):
     g: Scalar
     battery_drain_v_per_min: Scalar = 1.0
     effects: Effects = ()
-    motion: Motion = Motion.HANDOUT
+    motion: Motion = Motion.EULER
     battery: Battery = Battery()
 
     def with_effects(self, *parameters: Any) -> "ModelParameters":
@@ -171,7 +171,7 @@ def start_rates(drone: Drone, params: ModelParameters) -> Vec3:
     memories = effects.start_memories(params.effects, drone)
     held = Action(0.0, 0.0, 0.0, 0.0)
     # Held this long, the rates settle to the same values under every motion.
-    at_once = params._replace(motion=Motion.HANDOUT)
+    at_once = params._replace(motion=Motion.EULER)
     return _rates(drone, memories, drone.applied, held, HELD_S, at_once)[-1]
 
 

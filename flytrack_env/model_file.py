@@ -73,7 +73,7 @@ class _ModelFields(Fields):
     g: Number
     battery_drain_v_per_min: Number
     effects: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
-    motion: Motion = Motion.HANDOUT
+    motion: Motion = Motion.EULER
     battery: _BatteryFields = msgspec.field(default_factory=_BatteryFields)
 
 

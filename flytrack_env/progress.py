@@ -1,39 +1,144 @@
-"""Progress of long work: a bar on a terminal, a line every 10 s elsewhere.
+"""Progress of long work: a bar on a terminal, lines elsewhere.
+
+A line comes within 5 s, and then every 10 s, also where the work itself says nothing for minutes,
+as in a compilation. The time left is told once some of the work that counts is done.
 
 tqdm comes with the extras.
 """
 
 import sys
+import threading
+import time
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, TextIO
 
 from tqdm import tqdm
 
-LINE_EVERY_S = 10.0
-LINE = "{desc}{n_fmt} of {total_fmt}{unit}, {elapsed} so far, {remaining} left{postfix}"
+FIRST_LINE_S, LINE_EVERY_S = 4.0, 10.0
+MIN_STEPS = 10  # of a work whose time left is told: a few stages differ too much in length
 
 
-class Lines:
-    """A stream that takes tqdm's bar, which is drawn over and over, and writes it as lines."""
+class LineBar:
+    """What stands in for tqdm's bar where there is no terminal: it writes lines.
 
-    def __init__(self, stream: TextIO):
-        self.stream = stream
+    Args:
+        unit: what is counted.
+        total: how much is to be done; None if nothing is counted.
+        initial: how much was done before.
+        desc: what is done.
+        is_large: numbers are written with k and M.
+        stream: of the lines.
+    """
+
+    def __init__(
+        self,
+        unit: str,
+        total: int | None = None,
+        initial: int = 0,
+        desc: str = "",
+        is_large: bool = False,
+        stream: TextIO | None = None,
+    ):
+        self.unit, self.total, self.n, self.desc = unit, total, initial, desc
+        self._is_large, self._stream, self._postfix = is_large, stream or sys.stderr, ""
+        self._began_s = self._counted_from_s = time.monotonic()
+        self._initial, self._written, self._is_closed = initial, "", threading.Event()
+        # A bar that is dropped without an end, as by an error, must not go on writing.
+        beat = threading.Thread(
+            target=_write_lines, args=(weakref.ref(self), self._is_closed), daemon=True
+        )
+        beat.start()
+
+    def update(self, count: int) -> None:
+        """Count what was done."""
+        self.n += count
+
+    def unpause(self) -> None:
+        """Leave what has passed out of the time left: it was no work of the kind that counts."""
+        self._counted_from_s = time.monotonic()
+
+    def set_description(self, desc: str) -> None:
+        """Change what is done."""
+        self.desc = desc
+
+    def set_postfix_str(self, text: str, refresh: bool = True) -> None:
+        """Change what stands behind the numbers."""
+        self._postfix = text
 
     def write(self, text: str) -> None:
-        """Write a line, unless there is nothing in it."""
-        if text := text.strip():
-            self.stream.write(f"{text}\n")
+        """Write a text at once, to standard output."""
+        print(text, flush=True)
 
-    def flush(self) -> None:
-        """Pass on what was written."""
-        self.stream.flush()
+    def line(self) -> str:
+        """Return the line that is written."""
+        now_s = time.monotonic()
+        parts = [f"{_as_clock(now_s - self._began_s)} so far"]
+        if self.unit and not self.total:
+            parts.insert(0, f"{self.n} {self.unit}")
+        elif self.total:
+            count = tqdm.format_sizeof if self._is_large else str
+            parts.insert(0, f"{count(self.n)} of {count(self.total)} {self.unit}")
+            done, is_known = self.n - self._initial, self.total >= MIN_STEPS
+            if done > 0 and is_known:
+                each_s = (now_s - self._counted_from_s) / done
+                parts.append(f"{_as_clock(each_s * (self.total - self.n))} left")
+        text = ", ".join(filter(None, (*parts, self._postfix)))
+        return f"{self.desc}: {text}" if self.desc else text
+
+    def refresh(self) -> None:
+        """Write the line."""
+        self._written = self.line()
+        self._stream.write(f"{self._written}\n")
+        self._stream.flush()
+
+    def close(self) -> None:
+        """End the lines; one more is written if any was."""
+        if not self._is_closed.is_set() and self._written and self.total:
+            self.refresh()
+        self._is_closed.set()
 
 
-def progress_bar(unit: str, **options: Any) -> Any:
-    """Return a bar of tqdm on stderr; ``options`` are tqdm's. Off a terminal it writes lines."""
-    if not sys.stderr.isatty():
-        options |= {"file": Lines(sys.stderr), "bar_format": LINE, "delay": LINE_EVERY_S}
-        options |= {"mininterval": LINE_EVERY_S, "maxinterval": LINE_EVERY_S, "miniters": 1}
-    return tqdm(unit=f" {unit}", **options)
+def _as_clock(seconds: float) -> str:
+    """Return a time as minutes and seconds."""
+    return tqdm.format_interval(seconds)
+
+
+def _write_lines(bar: "weakref.ref[LineBar]", is_closed: threading.Event) -> None:
+    """Write a bar's line until it is closed or gone."""
+    wait_s = FIRST_LINE_S
+    while not is_closed.wait(wait_s):
+        alive = bar()
+        if alive is None:
+            return
+        alive.refresh()
+        wait_s = LINE_EVERY_S
+        del alive
+
+
+def progress_bar(unit: str, total: int | None = None, **options: Any) -> Any:
+    """Return a bar on stderr: tqdm's on a terminal, lines elsewhere.
+
+    Args:
+        unit: what is counted.
+        total: how much is to be done.
+        options: of tqdm: ``initial``, ``desc``, ``leave`` and ``unit_scale``.
+    """
+    if sys.stderr.isatty():
+        return tqdm(unit=f" {unit}", total=total, **options)
+    initial, desc = options.get("initial", 0), options.get("desc", "")
+    return LineBar(unit, total, initial, desc, options.get("unit_scale", False))
+
+
+@contextmanager
+def waiting(what: str) -> Iterator[None]:
+    """Say from time to time what is done, while nothing of it can be counted."""
+    bar = LineBar("", desc=what)
+    try:
+        yield
+    finally:
+        bar.close()
 
 
 class ProgressBar:

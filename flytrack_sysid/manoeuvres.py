@@ -121,7 +121,7 @@ def _low_passes(
 
 
 @_manoeuvre(
-    "Level, throw the thrust stick between both ends, in short jabs and held for half a second."
+    "High and away from people, level: thrust stick to both ends, in jabs and for half a second."
 )
 def _thrust_steps(
     number: int, hover: float, rng: np.random.Generator
@@ -158,7 +158,9 @@ def _stick_amplitudes(
     return _start(hover, STARTS_V[number]), command
 
 
-@_manoeuvre("Throw all four sticks from side to side as fast as you can, small and large.")
+@_manoeuvre(
+    "High and away from people, move all four sticks quickly to both sides, a little, then more."
+)
 def _fast_switching(
     number: int, hover: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -167,7 +169,9 @@ def _fast_switching(
     return _start(hover, STARTS_V[number]), size * np.stack(command, axis=1)
 
 
-@_manoeuvre("Turn at full stick for two seconds: flips, rolls, yaw, and yaw with a roll.")
+@_manoeuvre(
+    "High and away from people, turn at full stick for two seconds: flips, rolls, yaw, and both."
+)
 def _spins(number: int, hover: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     command = _swing(hover, HOVER_SWING, rng)
     command[:, :3] = SPIN_STICKS[number]

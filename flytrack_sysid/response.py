@@ -92,7 +92,7 @@ def _of_stick(model: ModelParameters, stick: jax.Array, stick_step: jax.Array) -
         held = drone._replace(rates_b=moved.after.rates_b, applied=moved.after.applied)
         return (held, moved.memories), response(moved)
 
-    at_once = model._replace(motion=Motion.HANDOUT)
+    at_once = model._replace(motion=Motion.EULER)
     values = jax.lax.scan(step, (drone, memories), length=round(WATCHED_S / step_s))[1]
     before, steady = (
         response(move(drone, memories, held, STEP_S if has_loop else HELD_S, at_once))

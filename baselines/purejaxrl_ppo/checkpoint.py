@@ -28,6 +28,7 @@ from flytrack_env.effects import BY_NAME, takes_motors
 from flytrack_env.files import read_at_most, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.model_file import model_as_json
+from flytrack_env.motion import OLD_EULER, Motion
 from flytrack_env.validation import convert
 
 SUFFIX = ".safetensors"
@@ -416,6 +417,8 @@ def check_same_run(start: Checkpoint, description: dict[str, Any]) -> None:
     """
     config = {**start.config.as_json(), "total_timesteps": description["config"]["total_timesteps"]}
     found = {"config": config, **{name: start.meta.get(name) for name in SAME_RUN}}
+    if isinstance(found["model"], dict) and found["model"].get("motion") == OLD_EULER:
+        found["model"] = {**found["model"], "motion": Motion.EULER.value}
     check_equal(start.path, found, {name: description[name] for name in found})
     names = ("software", "machine")
     lines = find_differences(

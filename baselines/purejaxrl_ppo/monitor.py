@@ -115,11 +115,22 @@ def draw_position_density(
         num_flights: that the positions are from.
         label: what stands beside the track's name.
     """
+    figure = Figure(figsize=(8, 9))  # placed by hand: a layout engine draws everything twice
+    axes, scale = figure.add_axes(AXES), figure.add_axes(SCALE)
+    image = draw_density(axes, positions, track, num_flights)
+    # Plain numbers: what parses the powers of ten keeps, in its exceptions, all that the callers
+    # hold.
+    figure.colorbar(image, cax=scale, label="time per flight in 0.1 m x 0.1 m (ms)", format="%g")
+    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+    axes.set_title("Position density: " + ", ".join(filter(None, (track.name, label))))
+    write_atomically(path, png_of(figure, dpi=100))
+
+
+def draw_density(axes: Any, positions: np.ndarray, track: Track, num_flights: int) -> Any:
+    """Draw the heat map of ``draw_position_density`` and return it, for a colour bar."""
     corners = np.array([gate.position[:2] for gate in track.gates] + [track.start_position[:2]])
     low, high = corners.min(axis=0) - MARGIN_M, corners.max(axis=0) + MARGIN_M
     edges = [np.arange(a, b + BIN_M, BIN_M) for a, b in zip(low, high, strict=True)]
-    figure = Figure(figsize=(8, 9))  # placed by hand: a layout engine draws everything twice
-    axes, scale = figure.add_axes(AXES), figure.add_axes(SCALE)
     axes.set_facecolor(matplotlib.colormaps["viridis"](0.0))
     *_, image = axes.hist2d(
         positions[:, 0],
@@ -129,13 +140,8 @@ def draw_position_density(
         cmin=LIMITS_MS[0] * 1e-3,
         norm=LogNorm(*LIMITS_MS),
     )
-    # Plain numbers: what parses the powers of ten keeps, in its exceptions, all that the callers
-    # hold.
-    figure.colorbar(image, cax=scale, label="time per flight in 0.1 m x 0.1 m (ms)", format="%g")
     draw_gates(axes, track, [0, 1])
     label_from_above(axes, track)
     axes.plot(*track.start_position[:2], "o", color="white", markersize=5)
     axes.text(track.start_position[0], track.start_position[1] - 0.8, "start", color="white")
-    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
-    axes.set_title("Position density: " + ", ".join(filter(None, (track.name, label))))
-    write_atomically(path, png_of(figure, dpi=100))
+    return image

@@ -19,6 +19,8 @@ LOCAL = "local"  # tracking URI: an SQLite file in the folder of the run
 SQLITE, LOCAL_STORE, LOCAL_ARTIFACTS = "sqlite:///", "mlflow.db", "mlflow_artifacts"
 LOCAL_PAGE = "http://127.0.0.1:5000"  # of `mlflow ui`
 EXPERIMENT = "flytrack"
+METRICS_TAB = "model-metrics"  # of a run's page
+DENSITY, DENSITY_FILES = "density", "position_density"  # key of the charts; how their files begin
 # Groups in which MLflow shows metrics; all others are of the race.
 GROUPS = {
     **dict.fromkeys(("policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction"), "ppo"),
@@ -151,7 +153,8 @@ class Tracker:
         else:
             self._create_run(client)
         self._client = client
-        page = f"/#/experiments/{client.get_run(self.run_id).info.experiment_id}/runs/{self.run_id}"
+        experiment_id = client.get_run(self.run_id).info.experiment_id
+        page = f"/#/experiments/{experiment_id}/runs/{self.run_id}/{METRICS_TAB}"
         if self._uri.startswith("http"):
             print(f"MLflow: {self._uri.rstrip('/')}{page}")
         else:
@@ -178,6 +181,7 @@ class Tracker:
 
     def _send(self, records: list[Record]) -> None:
         from mlflow.entities import Metric
+        from PIL import Image  # which matplotlib brings
 
         metrics = [
             Metric(f"{GROUPS.get(name, 'race')}/{name}", value, record.time_ms, record.step)
@@ -189,3 +193,9 @@ class Tracker:
         for record in records:
             for path, folder in record.files:
                 self._client.log_artifact(self.run_id, str(path), folder)
+                if path.name.startswith(DENSITY_FILES):
+                    with Image.open(path) as chart:  # shown among the metrics, with a slider
+                        step, time_ms = record.step, record.time_ms
+                        self._client.log_image(
+                            self.run_id, chart, key=DENSITY, step=step, timestamp=time_ms
+                        )

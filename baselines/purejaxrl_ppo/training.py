@@ -31,7 +31,7 @@ from baselines.purejaxrl_ppo.tracking import LOCAL, RUN_FILE, Tracker
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.files import locked_folder
 from flytrack_env.params import EnvParams
-from flytrack_env.progress import progress_bar
+from flytrack_env.progress import LineBar, progress_bar
 from flytrack_env.validation import convert
 
 Metrics = dict[str, np.ndarray]
@@ -299,7 +299,8 @@ class Run:
                 self._store(files.step_file(0))
             jax.block_until_ready(self.trainer.update(self.runner))  # compiles
             bar.set_description("train")
-            bar.unpause()
+            if isinstance(bar, LineBar):  # tqdm's clock would jump back
+                bar.unpause()
             while self.update < config.num_updates and not signals:
                 self._advance()
                 bar.set_postfix_str(self._format_progress(), refresh=False)

@@ -38,6 +38,8 @@ READERS = {
 FORMATS = tuple(READERS)
 FORMATS_OF_SEVERAL_LOGS = ("betaflight",)
 MAX_MANIFEST_BYTES = 2**24
+# Betaflight logs at up to 8 kHz. A diagnosis at 500 Hz takes minutes, and sees lags of 2 ms.
+DENSE_FORMATS, DENSE_STEP_S = ("betaflight",), 0.002
 MIN_THRUST = -0.9  # command: in flight it exceeds a twentieth of the thrust range at some time
 
 
@@ -139,7 +141,7 @@ def import_log(
         raise LogError(f"{loaded.source}: rows.logs: a file of format {format} holds one log")
     flights_read = [(path, flight) for path in files for flight in READERS[format](path, loaded)]
     notes = tuple(note for _, flight in flights_read for note in flight.notes)
-    flights, ground_notes = _flights_in_the_air(flights_read, loaded)
+    flights, ground_notes = _flights_in_the_air(flights_read, loaded, format in DENSE_FORMATS)
     notes += ground_notes
     sources = [flight.log.source for flight in flights]
     log = _concatenate([flight.log for flight in flights], sources)
@@ -174,9 +176,14 @@ def _parts(flight: ImportedFlight) -> list[ImportedFlight]:
 
 
 def _flights_in_the_air(
-    flights_read: list[tuple[Path, ImportedFlight]], mapping: Mapping
+    flights_read: list[tuple[Path, ImportedFlight]], mapping: Mapping, is_dense: bool
 ) -> tuple[list[ImportedFlight], tuple[str, ...]]:
     """Return the flights with only the rows that are selected and in the air, and notes.
+
+    Args:
+        flights_read: the flights, each with its file.
+        mapping: selects rows.
+        is_dense: the format logs more rows than a diagnosis needs.
 
     Raises:
         LogError: nothing flies in any of them.
@@ -186,7 +193,10 @@ def _flights_in_the_air(
         flights_read, find_ground([flight.log for _, flight in flights_read]), strict=True
     ):
         log, source = flight.log, flight.log.source
-        is_used = _is_selected(path, log, mapping)
+        every = mapping.rows.every or (_usual_every(log) if is_dense else 1)
+        if mapping.rows.every is None and every > 1:
+            notes.append(f"{source}: one row of {every} is used; rows.every = 1 uses all")
+        is_used = _is_selected(path, log, mapping, every)
         if flight.is_landed is not None:
             is_ground = is_ground | flight.is_landed
         num_used, num_ground = is_used.sum(), np.sum(is_used & is_ground)
@@ -226,7 +236,12 @@ def _with_measured_voltage(log: FlightLog) -> tuple[FlightLog, list[str]]:
     return replace(log, channels=channels), [f"{problem}: interpolated between the others"]
 
 
-def _is_selected(path: Path, log: FlightLog, mapping: Mapping) -> np.ndarray:
+def _usual_every(log: FlightLog) -> int:
+    """Return which share of a log's rows leaves about 500 Hz: one of so many."""
+    return max(1, round(DENSE_STEP_S / float(np.median(usual_step(log)))))
+
+
+def _is_selected(path: Path, log: FlightLog, mapping: Mapping, every: int) -> np.ndarray:
     """Return which rows of a file's log the mapping selects, (num_rows,) bool."""
     rows = mapping.rows
     since_start = log.time - log.time[:1]
@@ -238,7 +253,7 @@ def _is_selected(path: Path, log: FlightLog, mapping: Mapping) -> np.ndarray:
             [(since_start >= low) & (since_start <= high) for low, high in rows.ranges_s], axis=0
         )
     index = np.arange(len(log))
-    is_used &= index % rows.every == 0
+    is_used &= index % every == 0
     if rows.above_m is not None:
         is_used &= _is_airborne(log, rows.above_m, mapping.source)
     if rows.manifest is not None:

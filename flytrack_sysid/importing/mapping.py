@@ -85,7 +85,8 @@ class UsedRows(Fields):
     """Which rows to use.
 
     Attributes:
-        every: only each n-th row is used.
+        every: only each n-th row is used; None: all, but of a Betaflight log above 500 Hz as many
+            as leave about 500 Hz.
         above_m: only the longest stretch of rows that are this much higher than the first is used.
         from_s: first time that is used, after the first row.
         to_s: last time that is used, after the first row.
@@ -95,7 +96,7 @@ class UsedRows(Fields):
         on_ground: whether rows on the ground are used, too.
     """
 
-    every: Count = 1
+    every: Count | None = None
     above_m: Positive | None = None
     from_s: Finite = 0.0
     to_s: Positive | None = None

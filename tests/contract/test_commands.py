@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,14 @@ from flytrack_sysid.split import HELD_OUT_EVERY
 from tests.support.pages import ROOT, commands
 from tests.support.slow import slow_but
 
-PAGES = ("README.md", "docs/quick_start.md")
+PAGES = (
+    "README.md",
+    *(
+        f"docs/{name}.md"
+        for name in ("quick_start", "algorithm", "exercise", "betaflight", "claims")
+    ),
+)
+SCRIPTS = {"train_ppo.py": "train", "eval_agent.py": "eval"}  # what each is the command of
 LINES = sorted(
     {line for page in PAGES for line in commands((ROOT / page).read_text(encoding="utf-8"))}
 )
@@ -57,6 +65,9 @@ def help_of(*arguments):
 @pytest.mark.parametrize("line", LINES)
 def test_a_command_of_the_docs_and_its_flags_exist(line):
     words = shlex.split(line)
+    if words[0] == "python" and words[1] in SCRIPTS:
+        assert (ROOT / words[1]).is_file()
+        words[:2] = ["flytrack", SCRIPTS[words[1]]]
     if words[0] == "make":
         assert re.search(
             rf"^{words[1]}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE
@@ -65,6 +76,8 @@ def test_a_command_of_the_docs_and_its_flags_exist(line):
         flags = [word for word in words if word.startswith("--")]
         text = help_of(words[1])
         assert all(re.search(rf"{flag}\b", text) for flag in flags), text
+    elif words[:2] == ["python", "-m"]:
+        assert find_spec(words[2]) is not None, line
     else:
         assert words[0] in ("mlflow", "rerun", "flytrack"), line
 

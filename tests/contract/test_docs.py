@@ -22,6 +22,10 @@ REFERENCE = {
     for module in re.findall(r"^::: ([\w.]+)$", path.read_text(), re.MULTILINE)
 }
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+READ_FIRST = [ROOT / "README.md", DOCS / "results/index.md"]
+FOUR_PAGES = [DOCS / f"{name}.md" for name in ("algorithm", "exercise", "betaflight", "claims")]
+CLAIM = re.compile(r"^(- \*\*|\| \[).*?(?=^- |^\| |^$)", re.MULTILINE | re.DOTALL)
+NUMBER = re.compile(r"(?<![\w.,-])\d+(?:[.,]\d+)*(?:e\+\d+)?(?![\w-])")
 FAST = "wrappers.md"  # one page's examples run in the fast tests
 RUN = (
     "environment.md",
@@ -33,7 +37,7 @@ RUN = (
     "check.md",
     "camera.md",
 )
-RUN = (FAST, *RUN, "diagnosis.md", "quick_start.md", "faq.md")
+RUN = (FAST, *RUN, "diagnosis.md", "quick_start.md", "faq.md", "exercise.md", "../README.md")
 
 
 def test_every_public_package_is_in_the_reference():
@@ -55,6 +59,32 @@ def test_what_a_page_imports_is_public(path):
                 if name in REFERENCE and not hasattr(module, alias.name):
                     importlib.import_module(name)  # a module is no attribute before
                 assert hasattr(module, alias.name), f"{node.module} has no {alias.name}"
+
+
+def claims(path):
+    """Return the lines of a page that link to a result, each with the text of the result's page."""
+    found = []
+    for match in CLAIM.finditer(path.read_text(encoding="utf-8")):
+        (target,) = re.findall(r"\]\((?:docs/results/)?(\w+\.md)\)", match[0])
+        page = (DOCS / "results" / target).read_text(encoding="utf-8")
+        cells = match[0].split("|")[2:4] if match[0].startswith("|") else [match[0].split("](")[0]]
+        found.append((" ".join(cells), page))
+    return found
+
+
+@pytest.mark.parametrize("path", READ_FIRST, ids=lambda path: path.name)
+def test_a_number_of_a_claim_is_on_the_page_that_it_links_to(path):
+    assert len(claims(path)) >= 5
+    for claim, page in claims(path):
+        numbers = set(NUMBER.findall(claim))
+        assert numbers, claim
+        assert numbers <= set(NUMBER.findall(page)), (claim, numbers - set(NUMBER.findall(page)))
+
+
+@pytest.mark.parametrize("path", [*READ_FIRST, *FOUR_PAGES], ids=lambda path: path.name)
+def test_a_page_that_is_read_first_has_short_cells(path):
+    for line in path.read_text(encoding="utf-8").splitlines():
+        assert all(len(cell.strip()) <= 100 for cell in line.split("|")[1:-1]), line
 
 
 @pytest.mark.parametrize("page", slow_but([FAST], RUN))

@@ -163,7 +163,8 @@ def test_collected_log_and_blackbox_are_the_same_flight(tmp_path):
     assert len(log) > 4000 and again.channels.keys() == log.channels.keys()
     boxes = sorted((tmp_path / "box").iterdir())
     assert len(boxes) == 24  # of the excitation; the search for hover is too short
-    box = import_log(boxes[0], "betaflight").log
+    (tmp_path / "all.toml").write_text("[rows]\nevery = 1\n")
+    box = import_log(boxes[0], "betaflight", tmp_path / "all.toml").log
     flown = log.select(log.segment == 0)
 
     def seen(channel, shift_s):

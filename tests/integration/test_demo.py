@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo import monitor
+from baselines.purejaxrl_ppo.flights import Score
 from flytrack.cli import main
+from flytrack.demo import describe_race
 from flytrack_env import load_model, load_track
 
 
@@ -26,9 +28,16 @@ def test_demo_writes_everything(tmp_path):
     assert summary["noisy_starts"]["episodes"] == 16
     assert load_model(out / "model.json").tau.shape == (4,)
     assert summary["adapted"] is None and "not adapted: " in text.getvalue()  # nothing was learned
-    assert "noisy starts finish 3 laps" in text.getvalue()
+    assert "noisy starts finish 3 laps" in text.getvalue() and "nan s" not in text.getvalue()
     with pytest.raises(SystemExit):
         main(arguments)  # it does not overwrite a run
+
+
+def test_times_of_laps_that_nobody_flew_are_left_out():
+    nothing = Score(0.0, 0.0, float("nan"), float("nan"))
+    assert describe_race(nothing, 16).endswith("on the black box; no lap was completed")
+    first = Score(0.5, 8.0, 4.0, float("nan"))
+    assert describe_race(first, 16).endswith("on the black box; first lap 4.00 s")
 
 
 def test_density_is_time_per_flight_in_bins(tmp_path, monkeypatch):

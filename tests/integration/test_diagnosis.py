@@ -218,7 +218,7 @@ def test_every_log_is_diagnosed_or_refused(name, diagnosed):
 # Of the one with drag, the fast test sees that nothing else is named.
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "motion"), [("clean", Motion.CONTINUOUS), ("simulated", Motion.HANDOUT)]
+    ("name", "motion"), [("clean", Motion.CONTINUOUS), ("simulated", Motion.EULER)]
 )
 def test_a_clean_plant_is_consistent_with_its_model(name, motion, diagnosed):
     _, found = diagnosed(name)

@@ -50,7 +50,8 @@ def test_everything_is_recorded_once_though_the_run_was_cut_off(
     trainer.train(tmp_path, SEED, options)
     client, run = only_run(uri)
     page = f"http://127.0.0.1:5000/#/experiments/{run.info.experiment_id}/runs/{run.info.run_id}"
-    assert capsys.readouterr().out.count(f"MLflow: {page} after `mlflow ui") == 1
+    metrics_page = f"{page}/model-metrics"
+    assert capsys.readouterr().out.count(f"MLflow: {metrics_page} after `mlflow ui") == 1
     description = load_checkpoint(tmp_path / "final.safetensors").meta
     parts = {part: description[part] for part in ("config", "environment", "model")}
     expected = tracking.describe_params(parts) | {"seed": str(SEED), "env_id": ENV_ID}
@@ -66,6 +67,9 @@ def test_everything_is_recorded_once_though_the_run_was_cut_off(
     ]
     names = {file.path for file in client.list_artifacts(run.info.run_id, "evaluation")}
     assert f"evaluation/position_density_{7 * BATCH}.png" in names
+    charts = [file.path for file in client.list_artifacts(run.info.run_id, "images")]
+    shown = {path for path in charts if path.endswith(".png") and path.startswith("images/density")}
+    assert len(shown) == 2  # one of each evaluation
     assert f"evaluation/rollout_{4 * BATCH}.npy" in names
     assert len(client.list_artifacts(run.info.run_id, "checkpoints")) == 5
     load_rollout(tmp_path / "evaluation" / f"rollout_{7 * BATCH}.npy")

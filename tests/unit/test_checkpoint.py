@@ -87,6 +87,18 @@ def test_observations_that_do_not_fit_are_refused(tmp_path, params):
         load_checkpoint(path).check_fits(env)
 
 
+def test_a_run_of_an_older_version_continues(tmp_path, params):
+    """Its file calls the Euler step by the old name."""
+    path = tmp_path / "a.safetensors"
+    now = checkpoint_module.describe_run(FlyTrack(), "FlyTrack-v0", "flytrack", CONFIG, 0)
+    old = {**now, "model": {**now["model"], "motion": "handout"}}
+    save_checkpoint(path, params, CONFIG, old, TRAINING)
+    checkpoint_module.check_same_run(load_checkpoint(path), now)
+    other = {**now, "model": {**now["model"], "motion": "continuous"}}
+    with pytest.raises(CheckpointError, match=r"model\.motion: found 'euler'"):
+        checkpoint_module.check_same_run(load_checkpoint(path), other)
+
+
 @pytest.mark.parametrize("trained", ["sticks", "motors"])
 def test_policies_of_other_commands_are_refused(tmp_path, params, trained):
     ids = {"sticks": "FlyTrack-v0", "motors": "FlyTrackMotors-v0"}

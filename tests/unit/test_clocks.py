@@ -106,11 +106,11 @@ def test_lateness_is_found_where_there_is_one():
     def found(late_s):
         truth, log = scripted(3, SECONDS, mocap_late_s=late_s)
         with jax.enable_x64(True):
-            return estimate_motion(log, model_of(truth), np.ones(len(log), bool), Motion.HANDOUT)
+            return estimate_motion(log, model_of(truth), np.ones(len(log), bool), Motion.EULER)
 
     late = found(POSE_LATE_S)
     assert 0.0 < late.sigma_s < 1e-3 and abs(late.late_s - POSE_LATE_S) < 4.0 * late.sigma_s
-    assert found(0.0) == MotionEstimate(Motion.HANDOUT, is_sure=True)
+    assert found(0.0) == MotionEstimate(Motion.EULER, is_sure=True)
 
 
 @pytest.mark.slow

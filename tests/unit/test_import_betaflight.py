@@ -45,10 +45,12 @@ def log_with(rows=None, names=NAMES, **headers):
 
 @pytest.fixture
 def read(tmp_path):
-    """Return the import of logs one after the other, as a flash chip has them."""
+    """Return the import of all rows of logs one after the other, as a flash chip has them."""
 
     def import_content(*logs, mapping="", **options):
         (tmp_path / "a.bbl").write_bytes(b"".join(logs))
+        mapping = mapping if "[rows]" in mapping else f"[rows]\n{mapping}"
+        mapping = mapping.replace("[rows]", "[rows]\nevery = 1")
         (tmp_path / "map.toml").write_text(mapping)
         return import_log(tmp_path / "a.bbl", "betaflight", tmp_path / "map.toml", **options)
 
@@ -76,6 +78,16 @@ def test_logs_of_one_file_become_segments_and_lost_frames_no_rows(read):
     assert np.bincount(imported.log.segment).tolist() == [200, 190]
     assert [source.rpartition("a.bbl")[2] for source in imported.sources] == [", log 1", ", log 2"]
     assert np.diff(imported.log.time[200:]).max() == pytest.approx(11 * STEP_S)
+
+
+@pytest.mark.parametrize(("step_s", "every"), [(125e-6, 16), (500e-6, 4), (1e-3, 2), (2e-3, 1)])
+def test_rows_beyond_500_hz_are_left_out_unless_a_mapping_says_how_many(tmp_path, step_s, every):
+    path = tmp_path / "a.bbl"
+    path.write_bytes(log_with(frames_of(flying(200, step_s))))
+    imported = import_log(path, "betaflight")
+    assert len(imported.log) == -(-200 // every)
+    assert np.median(np.diff(imported.log.time)) == pytest.approx(0.002)
+    assert (f"one row of {every} is used" in " ".join(imported.notes)) == (every > 1)
 
 
 @pytest.mark.parametrize(("rates_type", "rc_rate", "super_rate", "deg_s"), CASES["full_stick"])
@@ -241,7 +253,7 @@ def test_real_log_holds_what_another_decoder_found(tmp_path):
     folder = shared(BETAFLIGHT)
     with gzip.open(folder / "shortLog_decoded_1kHz.csv.gz", "rt") as file:
         decoded = np.genfromtxt(file, delimiter=",", names=True, deletechars="")
-    (tmp_path / "map.toml").write_text('[rows]\non_ground = "keep"\n')
+    (tmp_path / "map.toml").write_text('[rows]\non_ground = "keep"\nevery = 1\n')
     imported = import_log(folder / "shortLog.BFL", "betaflight", tmp_path / "map.toml")
     log = imported.log
     assert imported.problems == ()

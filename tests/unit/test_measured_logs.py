@@ -125,11 +125,11 @@ def test_measured_logs_are_replayed_continuously(truth):
     log = replace(truth, origin="measured")
     assert motion_of(log, NOMINAL) is Motion.CONTINUOUS
     assert what_is_fitted(log, NOMINAL)[0].motion is Motion.CONTINUOUS
-    assert what_is_fitted(log, NOMINAL, motion=Motion.HANDOUT)[0].motion is Motion.HANDOUT
+    assert what_is_fitted(log, NOMINAL, motion=Motion.EULER)[0].motion is Motion.EULER
     parts = split(log, NOMINAL, None, None)
     for motion in (parts.motion_estimate.motion, parts.train.like.motion, parts.test.like.motion):
         assert motion is Motion.CONTINUOUS
-    assert "the model says handout" in " ".join(parts.warnings)
+    assert "the model says euler" in " ".join(parts.warnings)
     errors, continuous = validate(NOMINAL, log), validate(CONTINUOUS, log)
     assert errors.one_step == continuous.one_step
     assert errors.one_step != validate(NOMINAL, replace(log, origin="simulated")).one_step

@@ -63,6 +63,18 @@ def test_minimal_file_by_hand(tmp_path):
     assert_same_model(load_model(nested), model)
 
 
+def test_the_old_name_of_the_euler_step_is_read_and_the_new_one_written(tmp_path):
+    old, new = tmp_path / "old.json", tmp_path / "new.json"
+    old.write_text(json.dumps({**FIELDS, "motion": "handout"}), encoding="utf-8")
+    model = load_model(old)
+    assert model.motion is Motion.EULER
+    save_model(new, model, {})
+    assert json.loads(new.read_text(encoding="utf-8"))["motion"] == "euler"
+    old.write_text(json.dumps({**FIELDS, "motion": "hand"}), encoding="utf-8")
+    with pytest.raises(ModelFileError, match="motion: found 'hand'"):
+        load_model(old)
+
+
 def test_a_file_without_a_battery_is_warned_of(tmp_path):
     path = tmp_path / "m.json"
     path.write_text(json.dumps({n: FIELDS[n] for n in FIELDS if n != "battery"}), encoding="utf-8")

@@ -103,7 +103,7 @@ def test_a_continuous_step_is_that_of_the_differential_equations(model, most, le
     coarse, fine = errors(model, 0.01, exact), errors(model, 0.005, exact)
     assert np.all(coarse < most)
     assert np.all(coarse / fine > least_order)
-    assert np.all(errors(model._replace(motion=Motion.HANDOUT), 0.01, exact) > 3.0 * coarse)
+    assert np.all(errors(model._replace(motion=Motion.EULER), 0.01, exact) > 3.0 * coarse)
 
 
 def test_a_semi_implicit_force_has_the_attitude_after_the_step():
@@ -111,7 +111,7 @@ def test_a_semi_implicit_force_has_the_attitude_after_the_step():
         drone, command = unpack(jnp.asarray(START)), Action(0.5, -0.3, 0.2, 0.4)
         at_once, semi = (
             move(drone, (), command, 0.01, PLAIN._replace(motion=motion)).after
-            for motion in (Motion.HANDOUT, Motion.SEMI_IMPLICIT)
+            for motion in (Motion.EULER, Motion.SEMI_IMPLICIT)
         )
     thrust = np.linalg.norm(np.array(semi.acc_w) + np.array([0.0, 0.0, GRAVITY]))
     axis = rotation(np.array(semi.quat))[:, 2]

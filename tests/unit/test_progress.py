@@ -1,0 +1,65 @@
+"""Lines of progress where there is no terminal."""
+
+import gc
+import io
+import re
+import time
+
+import pytest
+
+from flytrack_env import progress
+from flytrack_env.progress import LineBar, ProgressBar, waiting
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Lines come after 0.05 s, and then every 0.1 s."""
+    monkeypatch.setattr(progress, "FIRST_LINE_S", 0.05)
+    monkeypatch.setattr(progress, "LINE_EVERY_S", 0.1)
+
+
+def test_lines_come_while_the_work_says_nothing(quick, capsys):
+    with waiting("read 2 files"):
+        time.sleep(0.5)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) >= 3 and set(lines) == {"read 2 files: 00:00 so far"}
+
+
+def test_a_bar_that_is_dropped_writes_no_more(quick):
+    stream = io.StringIO()
+    bar = LineBar("steps", 100, stream=stream)
+    del bar
+    gc.collect()
+    time.sleep(0.3)
+    assert stream.getvalue() == ""
+
+
+def test_the_time_left_is_told_once_it_is_known_and_the_clock_does_not_jump(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    bar = LineBar("steps", 20_000_000, desc="compile", is_large=True, stream=io.StringIO())
+    now[0] = 20.0
+    assert bar.line() == "compile: 0.00 of 20.0M steps, 00:20 so far"
+    bar.set_description("train")
+    bar.unpause()
+    now[0] = 30.0
+    bar.update(5_000_000)
+    bar.set_postfix_str("return 1.0")
+    assert bar.line() == "train: 5.00M of 20.0M steps, 00:30 so far, 00:30 left, return 1.0"
+    bar.close()
+    few = LineBar("stages", 5, stream=io.StringIO())
+    few.update(2)
+    assert not re.search("left", few.line())
+    few.close()
+
+
+def test_a_callback_closes_its_bar_with_a_last_line(quick, capsys):
+    report = ProgressBar("flights")
+    assert report.bar.line() == "0 flights, 00:00 so far"  # nobody knows yet of how many
+    report(1, 48)
+    time.sleep(0.2)
+    report(48, 48)
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("48 of 48 flights, 00:00 so far")
+    time.sleep(0.2)
+    assert capsys.readouterr().err == ""
