@@ -21,7 +21,9 @@ from flytrack_sysid.log import FlightLog, usual_step
 LATE_S = 0.006  # smaller offsets are those of filters and of the log's step
 MAX_LATE_S, GRID_S = 0.1, 0.005
 BLOCK_S, LATE_ERRORS = 2.0, 5.0  # of the jackknife; standard errors
-CLOCK_ERRORS = 3.0  # standard errors
+# Clocks have to be apart by so many standard errors, and by this share of the move: a clean log of
+# the black box had a move of 13 ms, and clocks 3 ms apart.
+CLOCK_ERRORS, CLOCK_SHARE = 3.0, 0.5
 # Nats where clocks cannot be compared: a clean flight among 85 gained 11.6, sensors that are late
 # 11.3 in one flight and 13.6 to 232 in 13 others.
 ALONE = 13.0
@@ -97,7 +99,8 @@ def best_shift(
     # The comparison of clocks, by which an import corrects them, must not be against it.
     offset_s, sigma_s, _, unknown = offset_between(log, sums, rates(0.0)[:, :, 0])
     towards = np.sign(best.seconds) * (-offset_s if is_rate else offset_s)
-    is_late = best.nats > ALONE if unknown else towards > CLOCK_ERRORS * sigma_s
+    least_s = max(CLOCK_ERRORS * sigma_s, CLOCK_SHARE * abs(best.seconds))
+    is_late = best.nats > ALONE if unknown else towards > least_s
     return best if is_late else NOTHING
 
 

@@ -11,7 +11,9 @@ from benchmarks.check import is_same
 from benchmarks.seams.faults import FAULTS, Change, inject
 from benchmarks.seams.flight import make_flight
 from benchmarks.seams.simulators import SIMULATORS
+from flytrack_env import blackbox
 from flytrack_env.dynamics import nominal_parameters
+from flytrack_sysid import collect
 from flytrack_sysid.check import (
     check_environment,
     check_log,
@@ -551,3 +553,9 @@ def test_stuck_axis_is_said(flights):
     rates[:, 1] = 0.1
     check = check_log(with_channels(log, w=rates))
     assert check.explanations == () and any(one.startswith("w_y: ") for one in check.remarks)
+
+
+@pytest.mark.slow
+def test_the_log_of_the_readme_contradicts_nothing():
+    log = collect(blackbox.load(blackbox.SHIPPED), minutes=2.0, seed=0, noise=1.0)
+    assert not check_log(log).explanations
