@@ -201,8 +201,9 @@ def noticing_loss(resume: str) -> Iterator[None]:
     """
     try:
         yield
-    except jax.errors.JaxRuntimeError as error:
-        if jax.process_count() == 1:
+    except (jax.errors.JaxRuntimeError, ValueError) as error:
+        # JAX raises a plain ValueError where a failed result is read.
+        if jax.process_count() == 1 or type(error) not in (jax.errors.JaxRuntimeError, ValueError):
             raise
         raise LostProcessError(
             f"process {jax.process_index()} of {jax.process_count()} has lost another; continue "

@@ -115,7 +115,7 @@ def test_two_processes_and_two_devices_train_as_one(tmp_path, start):
     ends = [end_of(process) for process in pair]
     assert [end[0] for end in (alone, shared, *ends)] == [0] * 4, (alone, shared, ends)
     assert "final.safetensors" in ends[0][1]
-    assert not ends[1][1]
+    assert "safetensors" not in ends[1][1]
     names = sorted(path.name for path in (tmp_path / "alone").iterdir())
     assert names == sorted(path.name for path in (tmp_path / "pair").iterdir())
     for name in ("shared", "pair"):
@@ -149,7 +149,7 @@ def test_a_killed_process_ends_the_other_and_nothing_stored_is_lost(tmp_path, st
     begun_s = time.monotonic()
     status, _, errors = end_of(pair[1 - victim])
     assert time.monotonic() - begun_s < 30
-    assert status == 1
+    assert status == 1, errors
     assert f"process {1 - victim} of 2 has lost another; continue with --resume {out}" in errors
     assert "Traceback" not in errors
     # One device restores the state that both stored, to the bit, and goes on.
