@@ -7,7 +7,7 @@ cut off and resumed changes a bit of the result.
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -37,6 +37,7 @@ from flytrack_env.progress import progress_bar
 from flytrack_env.validation import convert
 
 Metrics = dict[str, np.ndarray]
+Report = Callable[[int, dict[str, float]], None]
 RECORD_EVERY = 131_072  # environment steps: metrics are recorded a few times a second
 # where all returns are the same there is no variance to explain
 MAY_BE_UNDEFINED = "explained_variance"
@@ -70,6 +71,8 @@ class Options(msgspec.Struct, frozen=True):
     """Noisy starts of an evaluation."""
     tracking_uri: str = ""
     """MLflow store; local: an SQLite file in OUT."""
+    parent_run: str = ""
+    """Id of the MLflow run that this one is below, as of a sweep."""
 
 
 DEFAULT_OPTIONS = Options(checkpoint_every=1_000_000, evaluate_every=4_000_000, tracking_uri=LOCAL)
@@ -199,6 +202,7 @@ class Trainer:
         seed: int,
         options: Options = Options(),  # noqa: B008, frozen
         resume: Path | Checkpoint | None = None,
+        report: Report = lambda steps, values: None,
     ) -> tuple[Checkpoint, Metrics]:
         """Train and write ``out``/final.safetensors. A run that is complete stays as it is.
 
@@ -207,6 +211,7 @@ class Trainer:
             seed: of the run.
             options: what is done beside training.
             resume: checkpoint, or its file or folder, to continue from.
+            report: called with environment steps and metrics a few times a second.
 
         Returns:
             The final checkpoint, and the metrics of every update made here.
@@ -234,7 +239,7 @@ class Trainer:
                     start.path.rename(stored)
                 start = start._replace(path=stored)
             with collect_signals() as signals, devices.noticing_loss(f"--resume {out}"):
-                return Run(self, out, options, description, start).train(signals)
+                return Run(self, out, options, description, start, report).train(signals)
 
     def _check(self, out: Path, start: Checkpoint | None, description: dict[str, Any]) -> None:
         """Raise ValueError unless a run can begin in a folder, or continue from a checkpoint."""
@@ -263,6 +268,7 @@ class Run:
         options: what is done beside training.
         description: as ``describe_run`` returns it.
         start: where it continues from; None: it begins.
+        report: called with environment steps and metrics.
     """
 
     def __init__(
@@ -272,7 +278,9 @@ class Run:
         options: Options,
         description: dict[str, Any],
         start: Checkpoint | None,
+        report: Report,
     ):
+        self.report = report
         self.trainer, self.config = trainer, trainer.config
         self.out, self.options, self.description = out, options, description
         self.update = 0  # number of updates so far
@@ -293,7 +301,7 @@ class Run:
             self._report_learning_rate(start.config)
         name = f"{trainer.env_id} {Path(trainer.track).stem} seed {description['seed']}"
         uri = options.tracking_uri if self.is_first else ""
-        self.tracker = Tracker(out, uri, name, description)
+        self.tracker = Tracker(out, uri, name, description, options.parent_run)
 
     @property
     def steps(self) -> int:
@@ -388,6 +396,7 @@ class Run:
             )
         if is_stored and not is_last:
             self._store(files.step_file(self.steps))
+        self.report(self.steps, values)
 
     def _store(self, name: str) -> None:
         """Write a checkpoint, once all that was recorded before it is sent."""
