@@ -9,13 +9,22 @@ docs/results/scaling.jsonl; ``page`` writes docs/results/scaling.md from the las
 
 import math
 import os
+import shutil
+import socket
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
 import numpy as np
+from jax.extend.backend import clear_backends
 
+from baselines.purejaxrl_ppo import Config, devices, load_checkpoint
+from baselines.purejaxrl_ppo.checkpoint import as_named_arrays
+from baselines.purejaxrl_ppo.training import Trainer
 from benchmarks import hidden
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden.draws import SUDDEN
@@ -30,6 +39,7 @@ SEED = 61  # no rule was made on it
 BEGINS_IN = 12  # flight
 WITH_CAUSE = 3  # craft
 LIMIT_S = 900.0
+DEVICES, COMPARED = (1, 2, 4), 20  # updates
 
 
 def draw_craft(rng: np.random.Generator, has_cause: bool) -> tuple[hidden.Truth, hidden.Truth]:
@@ -101,11 +111,73 @@ def run_fleet(craft: int, flights: int, seconds: float, seed: int) -> dict[str, 
     }
 
 
+def train_on(count: int | None, config: Config, seed: int, updates: int) -> tuple[Any, np.ndarray]:
+    """Return the network's arrays after ``COMPARED`` updates, and the mean return after each."""
+    trainer = Trainer(config, mesh=None if count is None else devices.make_mesh(count))
+    runner, returns, arrays = trainer.start(jax.random.key(seed)), [], None
+    for number in range(1, updates + 1):
+        runner, metrics = trainer.update(runner)
+        returns.append(float(metrics["last_return"]))
+        if number == COMPARED:
+            arrays = as_named_arrays(runner.train_state.params)
+    return arrays, np.array(returns)
+
+
+def train_in_processes(config: Config, seed: int, out: Path) -> Any:
+    """Return the network's arrays after ``COMPARED`` updates in two processes over loopback."""
+    shutil.rmtree(out, ignore_errors=True)
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{one.getsockname()[1]}"
+    flags = ["--coordinator", address, "--num-processes", "2", "--out", str(out), "--no-tracking"]
+    flags += ["--seed", str(seed), "--total-timesteps", str(config.total_timesteps)]
+    flags += ["--checkpoint-every", str(COMPARED * config.batch_size), "--evaluate-every", "0"]
+    command = [sys.executable, "-m", "flytrack", "train", *flags, "--process"]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    pair = [subprocess.Popen([*command, str(index)], env=environment) for index in (0, 1)]
+    path = out / f"step_{COMPARED * config.batch_size}.safetensors"
+    try:
+        while not path.exists():
+            assert [one.poll() for one in pair] == [None, None], "a process ended"
+            time.sleep(0.2)
+    finally:
+        for process in pair:
+            process.kill()
+            process.wait()
+    return as_named_arrays(load_checkpoint(path).params)
+
+
+def run_devices(updates: int, seed: int) -> dict[str, Any]:
+    """Return how trainings on several devices differ from that on one."""
+    clear_backends()
+    jax.config.update("jax_num_cpu_devices", max(DEVICES))
+    # The length decides the learning rate, so that all trainings have the same.
+    config = Config(total_timesteps=updates * Config().batch_size)
+    expected, curve = train_on(None, config, seed, updates)
+    record: dict[str, Any] = {"updates": updates, "compared": COMPARED, "seed": seed}
+    record["largest_parameter"] = max(float(np.abs(one).max()) for one in expected.values())
+    for count in DEVICES:
+        found, returns = train_on(count, config, seed, updates)
+        record[f"{count} devices"] = differences(found, expected)
+        # From the worst return on, so that the share of the rise is what is compared.
+        rise, rise_of_one = (one.mean() - curve.min() for one in (returns, curve))
+        record[f"{count} devices, curve"] = float(rise / rise_of_one)
+    found = train_in_processes(config, seed, RUNS / f"pair{seed}")
+    record["2 processes"] = differences(found, expected)
+    return record
+
+
+def differences(found: Any, expected: Any) -> float:
+    """Return the largest difference between named arrays."""
+    return max(float(np.abs(found[name] - array).max()) for name, array in expected.items())
+
+
 def main(
-    part: Literal["fleet"],
+    part: Literal["devices", "fleet"],
     craft: int = 8,
     flights: int = 15,
     seconds: float = 20.0,
+    updates: int = 60,
     seed: int = SEED,
 ) -> None:
     """Measure a part.
@@ -115,9 +187,13 @@ def main(
         craft: of the fleet.
         flights: of each.
         seconds: of each flight.
+        updates: of each training.
         seed: of plants, flights and trainings.
     """
-    record = run_fleet(craft, flights, seconds, seed)
+    if part == "devices":
+        record = run_devices(updates, seed)
+    else:
+        record = run_fleet(craft, flights, seconds, seed)
     append_line(LINES, {"part": part, **record, **provenance()})
     print(record)
 
