@@ -7,13 +7,18 @@ fleet. ``overhead`` compares Ray with a plain loop. Each appends its record to
 docs/results/scaling.jsonl; ``page`` writes docs/results/scaling.md from the last of each.
 """
 
+import csv
+import logging
 import math
 import os
 import shutil
 import socket
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -24,13 +29,15 @@ from jax.extend.backend import clear_backends
 
 from baselines.purejaxrl_ppo import Config, devices, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import as_named_arrays
+from baselines.purejaxrl_ppo.sweep import TABLE, Flags, run_sweep
+from baselines.purejaxrl_ppo.tracking import EXPERIMENT, local_uri
 from baselines.purejaxrl_ppo.training import Trainer
 from benchmarks import hidden
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden.draws import SUDDEN
 from benchmarks.report import RESULTS, append_line, command, progress, provenance
 from flytrack_env.model_file import save_model
-from flytrack_sysid.fleet import Change, diagnose_fleet, find_flights
+from flytrack_sysid.fleet import DIAGNOSED, Change, diagnose_fleet, find_flights
 from flytrack_sysid.fleet_page import write_fleet
 from flytrack_sysid.log_file import save_log
 
@@ -40,6 +47,15 @@ BEGINS_IN = 12  # flight
 WITH_CAUSE = 3  # craft
 LIMIT_S = 900.0
 DEVICES, COMPARED = (1, 2, 4), 20  # updates
+TRIALS, CLUSTER_CRAFT = 12, 4
+SETTINGS = """total_timesteps = 49152
+num_envs = 64
+num_steps = 16
+num_minibatches = 4
+hidden_sizes = [8]
+[learning_rate]
+loguniform = [1e-4, 1e-2]
+"""
 
 
 def draw_craft(rng: np.random.Generator, has_cause: bool) -> tuple[hidden.Truth, hidden.Truth]:
@@ -172,8 +188,89 @@ def differences(found: Any, expected: Any) -> float:
     return max(float(np.abs(found[name] - array).max()) for name, array in expected.items())
 
 
+@contextmanager
+def losing_a_node(has_begun: Callable[[], bool]) -> Iterator[list[float]]:
+    """Begin a Ray cluster of three nodes of a core each, and kill one once work is under way.
+
+    Yields a list, to which the time of the loss is added (s, of ``time.perf_counter``).
+    """
+    import ray
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    victim = [cluster.add_node(num_cpus=1) for _ in range(2)][0]
+    lost: list[float] = []
+    has_ended = threading.Event()
+
+    def lose() -> None:
+        while not has_ended.wait(0.5):
+            if has_begun():
+                cluster.remove_node(victim, allow_graceful=False)
+                lost.append(time.perf_counter())
+                return
+
+    thread = threading.Thread(target=lose)
+    try:
+        ray.init(address=cluster.address, log_to_driver=False, logging_level=logging.ERROR)
+        thread.start()
+        yield lost
+    finally:
+        has_ended.set()
+        thread.join()
+        ray.shutdown()
+        cluster.shutdown()
+
+
+def run_cluster_sweep(trials: int, seed: int) -> dict[str, Any]:
+    """Return what became of the trials of a sweep, a node of which was killed."""
+    out = RUNS / f"sweep{seed}"
+    shutil.rmtree(out, ignore_errors=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    settings = out.with_suffix(".toml")
+    settings.write_text(SETTINGS)
+    finals = out.glob
+    with losing_a_node(lambda: len(list(finals("trial*/final.safetensors"))) >= 2) as lost:
+        run_sweep(Flags(settings, trials=trials, out=out, seed=seed, address="auto"))
+    from mlflow import MlflowClient
+
+    client = MlflowClient(tracking_uri=local_uri(out))
+    runs = client.search_runs([client.get_experiment_by_name(EXPERIMENT).experiment_id])
+    with (out / TABLE).open() as file:
+        rows = list(csv.DictReader(file))
+    return {
+        "trials": trials,
+        "seed": seed,
+        "nodes_lost": len(lost),
+        "rows": len(rows),
+        "different_trials": len({row["trial_id"] for row in rows}),
+        "complete": len(list(finals("trial*/final.safetensors"))),
+        "runs_below": sum("mlflow.parentRunId" in run.data.tags for run in runs),
+        "runs_open": sum(run.info.status == "RUNNING" for run in runs),
+    }
+
+
+def run_cluster_fleet(flights: int, seconds: float, seed: int) -> dict[str, Any]:
+    """Return what became of the logs of a fleet, a node of which was killed."""
+    folder, out = RUNS / f"short{seed}", RUNS / f"cluster{seed}"
+    shutil.rmtree(out, ignore_errors=True)
+    fly_fleet(folder, CLUSTER_CRAFT, flights, seconds, seed)
+    found = find_flights([folder], None)
+    with losing_a_node(lambda: len(list(out.rglob("*.json"))) >= len(found) // 3) as lost:
+        results, _ = diagnose_fleet(found, out, LIMIT_S, 1, "auto")
+    states = [result["state"] for result in results.values()]
+    return {
+        "logs": len(found),
+        "seconds": seconds,
+        "seed": seed,
+        "nodes_lost": len(lost),
+        "results": len(results),
+        "files": len(list((out / "logs").rglob("*.npz.json"))),
+        "diagnosed": states.count(DIAGNOSED),
+    }
+
+
 def main(
-    part: Literal["devices", "fleet"],
+    part: Literal["devices", "fleet", "sweep_on_cluster", "fleet_on_cluster"],
     craft: int = 8,
     flights: int = 15,
     seconds: float = 20.0,
@@ -190,10 +287,13 @@ def main(
         updates: of each training.
         seed: of plants, flights and trainings.
     """
-    if part == "devices":
-        record = run_devices(updates, seed)
-    else:
-        record = run_fleet(craft, flights, seconds, seed)
+    runs: dict[str, Callable[[], dict[str, Any]]] = {
+        "devices": lambda: run_devices(updates, seed),
+        "fleet": lambda: run_fleet(craft, flights, seconds, seed),
+        "sweep_on_cluster": lambda: run_cluster_sweep(TRIALS, seed),
+        "fleet_on_cluster": lambda: run_cluster_fleet(flights, seconds, seed),
+    }
+    record = runs[part]()
     append_line(LINES, {"part": part, **record, **provenance()})
     print(record)
 

@@ -100,7 +100,7 @@ COMMANDS = {
         f"{PPO}.export:ExportSettings",
     ),
     "sweep": Command(
-        "Train with many settings by Ray Tune, here or on a cluster",
+        "Train with many settings by Ray Tune",
         "cluster",
         f"{PPO}.sweep:run_sweep",
         f"{PPO}.sweep:Flags",
