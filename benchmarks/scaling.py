@@ -198,7 +198,7 @@ def losing_a_node(has_begun: Callable[[], bool]) -> Iterator[list[float]]:
     from ray.cluster_utils import Cluster
 
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
-    victim = [cluster.add_node(num_cpus=1) for _ in range(2)][0]
+    victim, _ = (cluster.add_node(num_cpus=1) for _ in range(2))
     lost: list[float] = []
     has_ended = threading.Event()
 
@@ -234,7 +234,8 @@ def run_cluster_sweep(trials: int, seed: int) -> dict[str, Any]:
     from mlflow import MlflowClient
 
     client = MlflowClient(tracking_uri=local_uri(out))
-    runs = client.search_runs([client.get_experiment_by_name(EXPERIMENT).experiment_id])
+    experiment: Any = client.get_experiment_by_name(EXPERIMENT)
+    runs = client.search_runs([experiment.experiment_id])
     with (out / TABLE).open() as file:
         rows = list(csv.DictReader(file))
     return {
