@@ -1,9 +1,9 @@
-"""Beyond one machine: ``python -m benchmarks.scaling devices|fleet|cluster|overhead|page``.
+"""Beyond one machine: ``python -m benchmarks.scaling --part devices|fleet|...|page``.
 
 ``devices`` trains on one device, on several, and in two processes. ``fleet`` flies craft whose
 equations share nothing with the package (benchmarks.hidden), and lets the fleet's diagnosis say
-which cause began when. ``cluster`` kills a node of a simulated Ray cluster under a sweep and a
-fleet. ``overhead`` compares Ray with a plain loop. Each appends its record to
+which cause began when. ``sweep_on_cluster`` and ``fleet_on_cluster`` kill a node of a simulated Ray
+cluster. ``overhead`` compares Ray with a plain loop. Each appends its record to
 docs/results/scaling.jsonl; ``page`` writes docs/results/scaling.md from the last of each.
 """
 
@@ -29,13 +29,26 @@ from jax.extend.backend import clear_backends
 
 from baselines.purejaxrl_ppo import Config, devices, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import as_named_arrays
+from baselines.purejaxrl_ppo.config import RECIPES
 from baselines.purejaxrl_ppo.sweep import TABLE, Flags, run_sweep
 from baselines.purejaxrl_ppo.tracking import EXPERIMENT, local_uri
 from baselines.purejaxrl_ppo.training import Trainer
 from benchmarks import hidden
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden.draws import SUDDEN
-from benchmarks.report import RESULTS, append_line, command, progress, provenance
+from benchmarks.report import (
+    RESULTS,
+    Figure,
+    append_line,
+    command,
+    figures_table,
+    filled,
+    lines_in,
+    progress,
+    provenance,
+    write_page,
+)
+from flytrack_env.jobs import run_jobs
 from flytrack_env.model_file import save_model
 from flytrack_sysid.fleet import DIAGNOSED, Change, diagnose_fleet, find_flights
 from flytrack_sysid.fleet_page import write_fleet
@@ -46,6 +59,12 @@ SEED = 61  # no rule was made on it
 BEGINS_IN = 12  # flight
 WITH_CAUSE = 3  # craft
 LIMIT_S = 900.0
+PARTS = ("devices", "fleet", "sweep_on_cluster", "fleet_on_cluster", "overhead")
+JOB_S, JOBS = 10.0, 8
+# On paper: docs/results/gpu.md, recipe gpu on an H200; numbers of a row beside the observation; and
+# what is assumed, a network card of 400 Gbit/s for each GPU and 50 us for a message between them.
+PAPER_STEPS, PAPER_DEVICES, STEPS_PER_S = 1e10, 64, 9.07e6
+ROW_NUMBERS, NETWORK_BYTES_PER_S, MESSAGE_S = 8, 50e9, 50e-6
 DEVICES, COMPARED = (1, 2, 4), 20  # updates
 TRIALS, CLUSTER_CRAFT = 12, 4
 SETTINGS = """total_timesteps = 49152
@@ -270,8 +289,128 @@ def run_cluster_fleet(flights: int, seconds: float, seed: int) -> dict[str, Any]
     }
 
 
+def pause(seconds: float) -> float:
+    """Wait: a job whose own time does not depend on what else the machine does."""
+    time.sleep(seconds)
+    return seconds
+
+
+def run_overhead(jobs: int) -> dict[str, Any]:
+    """Return how much longer jobs of ten seconds take by Ray, one after the other, than alone."""
+    import ray
+
+    from benchmarks import scaling  # a name that a worker can import
+
+    started = time.perf_counter()
+    ray.init(num_cpus=1, log_to_driver=False, logging_level=logging.ERROR)
+    ready = time.perf_counter()
+    every = {str(number): (JOB_S,) for number in range(jobs)}
+    ends = [time.perf_counter() for _ in run_jobs(scaling.pause, every, LIMIT_S, "auto")]
+    ray.shutdown()
+    plain = JOB_S * jobs
+    return {
+        "jobs": jobs,
+        "job_s": JOB_S,
+        "start_of_ray_s": round(ready - started, 1),
+        "first_job_s": round(ends[0] - ready, 2),
+        "overhead": round((ends[-1] - ends[0]) / (plain - JOB_S) - 1.0, 5),
+        "overhead_with_first": round((ends[-1] - ready) / plain - 1.0, 4),
+    }
+
+
+def on_paper() -> dict[str, float]:
+    """Return what 10^10 steps on 8 nodes of 8 GPUs would take, from one GPU's figures and XLA's plan.
+
+    Each device has the recipe for a GPU, and all experience goes to all devices once an update.
+    """
+    gpu = RECIPES["gpu"]
+    arrays = as_named_arrays(load_checkpoint("champion").params)
+    numbers = sum(array.size for array in arrays.values())
+    row_bytes = 4 * (load_checkpoint("champion").observation_size + ROW_NUMBERS)
+    rows = gpu.batch_size * PAPER_DEVICES
+    updates = PAPER_STEPS / rows
+    compute_s = gpu.batch_size / STEPS_PER_S
+    gathered = rows * row_bytes
+    messages = gpu.gradients_per_update + gpu.num_steps
+    waiting_s = messages * MESSAGE_S
+    update_s = compute_s + gathered / NETWORK_BYTES_PER_S + waiting_s
+    return {
+        "updates": updates,
+        "gathered_mb": gathered / 1e6,
+        "gradient_mb": 4e-6 * numbers * gpu.gradients_per_update,
+        "compute_ms": 1e3 * compute_s,
+        "gather_ms": 1e3 * gathered / NETWORK_BYTES_PER_S,
+        "waiting_ms": 1e3 * waiting_s,
+        "total_s": updates * update_s,
+        "one_gpu_s": PAPER_STEPS / STEPS_PER_S,
+    }
+
+
+def last_of(part: str) -> dict[str, Any] | None:
+    """Return the last record of a part; None if there is none."""
+    records = [line for line in lines_in(LINES) if line["part"] == part]
+    return records[-1] if records else None
+
+
+def figures() -> Iterator[Figure]:
+    """Yield the figures of the page; those that were not measured say so."""
+    if one := last_of("devices"):
+        for name in (*(f"{count} devices" for count in DEVICES), "2 processes"):
+            title = f"{name}: largest difference of a parameter from one device after 20 updates"
+            yield Figure(title, "1e-5", f"{one[name]:.1e}", 1)
+        for count in DEVICES:
+            share = f"{100.0 * one[f'{count} devices, curve']:.1f} %"
+            title = f"{count} devices: rise of the mean return over {one['updates']} updates"
+            yield Figure(f"{title}, of that of one", "95 to 105 %", share, 1)
+    if one := last_of("fleet"):
+        title = f"fleet of {one['craft']} craft, {one['craft'] * one['flights']} logs: causes"
+        text = f"{one['right']} of {one['of']}"
+        yield Figure(
+            f"{title} that begin in flight {BEGINS_IN}, with it", "2 of 3", text, one["of"]
+        )
+        yield Figure(f"{title} told that are not there", "0", str(one["other"]), one["craft"])
+    if one := last_of("sweep_on_cluster"):
+        text = f"{one['different_trials']} of {one['trials']}, {one['runs_below']} MLflow runs"
+        yield Figure(
+            "sweep, a node of three killed: trials present once", "12", text, one["trials"]
+        )
+    if one := last_of("fleet_on_cluster"):
+        text = f"{one['files']} of {one['logs']}, {one['diagnosed']} diagnosed"
+        yield Figure("fleet, a node of three killed: logs present once", "all", text, one["logs"])
+    if one := last_of("overhead"):
+        title = f"overhead of Ray over a plain loop, jobs of {one['job_s']:g} s"
+        text = f"{100.0 * one['overhead']:.2f} %; {100.0 * one['overhead_with_first']:.1f} %"
+        yield Figure(f"{title}; with the first job's start", "5 %", text, one["jobs"])
+
+
+def write_results() -> None:
+    """Write the page from the last record of each part."""
+    source = last_of("fleet") or last_of("devices") or {}
+    told = [
+        f"{one['craft']}: {', '.join(one['causes'])} from flight {one['flight']} "
+        f"(true: {', '.join(one['truth']) or 'none'})"
+        for one in (last_of("fleet") or {"told": []})["told"]
+    ]
+    commits = ", ".join(
+        f"{part} {one['commit']}" for part in PARTS if (one := last_of(part)) is not None
+    )
+    values = {name: f"{value:,.3g}" for name, value in on_paper().items()}
+    fleet = last_of("fleet") or {}
+    text = filled(
+        "scaling",
+        figures=figures_table(figures()),
+        told="; ".join(told) or "nothing",
+        commits=commits,
+        machine=source.get("machine", ""),
+        seed=fleet.get("seed", ""),
+        seconds=fleet.get("seconds", ""),
+        **values,
+    )
+    write_page(RESULTS / "scaling.md", text)
+
+
 def main(
-    part: Literal["devices", "fleet", "sweep_on_cluster", "fleet_on_cluster"],
+    part: Literal["devices", "fleet", "sweep_on_cluster", "fleet_on_cluster", "overhead", "page"],
     craft: int = 8,
     flights: int = 15,
     seconds: float = 20.0,
@@ -293,7 +432,11 @@ def main(
         "fleet": lambda: run_fleet(craft, flights, seconds, seed),
         "sweep_on_cluster": lambda: run_cluster_sweep(TRIALS, seed),
         "fleet_on_cluster": lambda: run_cluster_fleet(flights, seconds, seed),
+        "overhead": lambda: run_overhead(JOBS),
     }
+    if part == "page":
+        write_results()
+        return
     record = runs[part]()
     append_line(LINES, {"part": part, **record, **provenance()})
     print(record)
