@@ -127,13 +127,13 @@ def grade(changes: list[Change], causes: dict[str, list[str]]) -> dict[str, Any]
     }
 
 
-def run_fleet(craft: int, flights: int, seconds: float, seed: int) -> dict[str, Any]:
+def run_fleet(craft: int, flights: int, seconds: float, seed: int, workers: int) -> dict[str, Any]:
     """Return how a simulated fleet was told."""
     folder, out = RUNS / f"fleet{seed}", RUNS / f"told{seed}"
     causes = fly_fleet(folder, craft, flights, seconds, seed)
     found = find_flights([folder], None)
     started, used = time.perf_counter(), sum(os.times()[:4])
-    results, changes = diagnose_fleet(found, out, LIMIT_S, 1)
+    results, changes = diagnose_fleet(found, out, LIMIT_S, workers)
     write_fleet(out, found, results, changes)
     return {
         "craft": craft,
@@ -319,7 +319,7 @@ def run_overhead(jobs: int) -> dict[str, Any]:
 
 
 def on_paper() -> dict[str, float]:
-    """Return what 10^10 steps on 8 nodes of 8 GPUs would take, from one GPU's figures and XLA's plan.
+    """Return what 10^10 steps on 8 nodes of 8 GPUs would take, from the figures of one GPU.
 
     Each device has the recipe for a GPU, and all experience goes to all devices once an update.
     """
@@ -415,6 +415,7 @@ def main(
     flights: int = 15,
     seconds: float = 20.0,
     updates: int = 60,
+    workers: int = 1,
     seed: int = SEED,
 ) -> None:
     """Measure a part.
@@ -425,11 +426,12 @@ def main(
         flights: of each.
         seconds: of each flight.
         updates: of each training.
+        workers: processes that diagnose.
         seed: of plants, flights and trainings.
     """
     runs: dict[str, Callable[[], dict[str, Any]]] = {
         "devices": lambda: run_devices(updates, seed),
-        "fleet": lambda: run_fleet(craft, flights, seconds, seed),
+        "fleet": lambda: run_fleet(craft, flights, seconds, seed, workers),
         "sweep_on_cluster": lambda: run_cluster_sweep(TRIALS, seed),
         "fleet_on_cluster": lambda: run_cluster_fleet(flights, seconds, seed),
         "overhead": lambda: run_overhead(JOBS),

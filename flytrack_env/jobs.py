@@ -35,7 +35,7 @@ class ClusterError(OSError):
 
 def serve(connection: Connection) -> None:
     """Answer calls until the other end is closed; the body of a worker's process."""
-    with contextlib.suppress(EOFError, KeyboardInterrupt):
+    with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # the caller is gone
         while True:
             function, arguments = connection.recv()
             try:

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from hashlib import sha256
+from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -247,17 +247,16 @@ def compare_flights(later: Sequence[Flight], earlier: Sequence[Flight]) -> dict[
 
 
 def key_of(function: Callable[..., Any], arguments: Any) -> str:
-    """Return what a stored result belongs to: files by name, size and time, and the package."""
+    """Return what a stored result belongs to: arguments, the files that they name, the package."""
     import flytrack_env
 
     flat = json.dumps(arguments, ensure_ascii=False)
-    files = {
-        path: [Path(path).stat().st_size, Path(path).stat().st_mtime_ns]
-        for path in re.findall(r'"(/[^"]+)"', flat)
-        if Path(path).is_file()
-    }
-    text = json.dumps([function.__name__, flat, files, flytrack_env.__version__])
-    return sha256(text.encode()).hexdigest()
+    digest = sha256(f"{function.__name__} {flat} {flytrack_env.__version__}".encode())
+    for name in re.findall(r'"(/[^"]+)"', flat):
+        if Path(name).is_file():
+            with Path(name).open("rb") as file:
+                digest.update(file_digest(file, "sha256").digest())
+    return digest.hexdigest()
 
 
 Runner = Callable[..., Iterable[tuple[str, Outcome]]]
