@@ -302,7 +302,7 @@ def run_overhead(jobs: int) -> dict[str, Any]:
     from benchmarks import scaling  # a name that a worker can import
 
     started = time.perf_counter()
-    ray.init(num_cpus=1, log_to_driver=False, logging_level=logging.ERROR)
+    ray.init("local", num_cpus=1, log_to_driver=False, logging_level=logging.ERROR)
     ready = time.perf_counter()
     every = {str(number): (JOB_S,) for number in range(jobs)}
     ends = [time.perf_counter() for _ in run_jobs(scaling.pause, every, LIMIT_S, "auto")]

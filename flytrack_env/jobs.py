@@ -173,7 +173,7 @@ def connected(address: str) -> Iterator[Any]:
             host, _, port = address.rpartition(":")
             socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
         ray.init(
-            address=None if address == "local" else address,
+            address=address,
             log_to_driver=False,
             logging_level=logging.ERROR,
         )
