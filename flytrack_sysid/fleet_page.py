@@ -28,7 +28,7 @@ COLOURS = {  # of the picture; causes have others
     CONTRADICTS: "#bdbdbd",
     UNREADABLE: "#4d4d4d",
 }
-MAX_CAUSES = 9  # with a colour of their own
+MAX_CAUSES = 7  # with a colour of their own; the eighth of matplotlib's is grey
 CELL_INCHES, MARGIN_INCHES = 0.32, 3.0
 Results = dict[str, dict[str, Any]]
 
@@ -72,8 +72,9 @@ def format_page(flights: Sequence[Flight], results: Results, changes: Sequence[C
     """Return the page in Markdown: changes, craft, and the logs that were not diagnosed."""
     crafts = list(dict.fromkeys(flight.craft for flight in flights))
     states = [results[flight.name]["state"] for flight in flights]
-    counts = ", ".join(
-        f"{states.count(state)} {state}" for state in (DIAGNOSED, CONTRADICTS, UNREADABLE)
+    counts = (
+        f"{states.count(DIAGNOSED)} diagnosed, {states.count(CONTRADICTS)} that contradict "
+        f"themselves, {states.count(UNREADABLE)} that cannot be read"
     )
     lines = [
         "# Fleet",

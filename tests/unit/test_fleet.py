@@ -9,7 +9,7 @@ import pytest
 from flytrack.flags import Diagnose
 from flytrack.identification import run_diagnose
 from flytrack_env.jobs import ClusterError, Outcome, run_jobs
-from flytrack_sysid import fleet
+from flytrack_sysid import collect, fleet, save_log
 from flytrack_sysid.fleet import (
     FleetError,
     Flight,
@@ -77,6 +77,15 @@ def test_logs_are_sorted_into_craft_in_the_order_of_their_numbers(tmp_path):
     assert flights[0].mapping.endswith("blue/mapping.toml")
     assert flights[0].model is None
     assert flights[1].model.endswith("red/model.json")
+
+
+def test_a_url_is_copied(tmp_path):
+    fsspec = pytest.importorskip("fsspec", reason="needs the extra cluster")
+    fsspec.filesystem("memory").pipe("/season/red/flight1.npz", b"1")
+    folders = expand([Path("memory://season")], tmp_path)
+    (flight,) = find_flights(folders, None)
+    assert flight.name == "red/flight1.npz"
+    assert Path(flight.path).read_bytes() == b"1"
 
 
 def test_folders_that_are_no_fleet_are_refused(tmp_path):
@@ -188,3 +197,19 @@ def test_results_are_kept_and_a_changed_log_is_done_again(tmp_path):
     failed = results(jobs, lambda done, total: None)
     assert failed["red/a.npz"]["reason"] == "no"
     assert not [one for one in Path(tmp_path / "out").rglob(".*") if one.is_file()]
+
+
+@pytest.mark.slow
+def test_a_folder_becomes_a_page_and_a_second_call_does_nothing_again(tmp_path, black_box, capsys):
+    season, out = tmp_path / "season", tmp_path / "out"
+    touched(season / "red" / "readme.txt", "hello")
+    save_log(season / "red" / "flight1.npz", collect(black_box, 1.0, seed=0))
+    run_diagnose(Diagnose((season,), out, fleet=True))
+    shown = capsys.readouterr().out
+    result = (out / "logs" / "red" / "flight1.npz.json").stat().st_mtime_ns
+    assert "2 logs of 1 craft: 1 diagnosed" in shown
+    assert "| red/readme.txt | unreadable | readme.txt: found text" in shown
+    assert (out / "fleet.md").read_text() in shown
+    assert (out / "fleet.png").read_bytes().startswith(b"\x89PNG")
+    run_diagnose(Diagnose((season,), out, fleet=True))
+    assert (out / "logs" / "red" / "flight1.npz.json").stat().st_mtime_ns == result
