@@ -59,13 +59,15 @@ SEED = 61  # no rule was made on it
 BEGINS_IN = 12  # flight
 WITH_CAUSE = 3  # craft
 LIMIT_S = 900.0
-PARTS = ("devices", "fleet", "sweep_on_cluster", "fleet_on_cluster", "overhead")
+PARTS = ("devices", "rounding", "fleet", "sweep_on_cluster", "fleet_on_cluster", "overhead")
 JOB_S, JOBS = 10.0, 8
 # On paper: docs/results/gpu.md, recipe gpu on an H200; numbers of a row beside the observation; and
 # what is assumed, a network card of 400 Gbit/s for each GPU and 50 us for a message between them.
 PAPER_STEPS, PAPER_DEVICES, STEPS_PER_S = 1e10, 64, 9.07e6
 ROW_NUMBERS, NETWORK_BYTES_PER_S, MESSAGE_S = 8, 50e9, 50e-6
 DEVICES, COMPARED = (1, 2, 4), 20  # updates
+CHANGES = (1e-7, 2e-7, -1e-7, -2e-7)  # one or two of a float32's last bits
+FEW = {"num_envs": 64, "num_steps": 32, "num_minibatches": 8}  # 160 gradient steps in 20 updates
 TRIALS, CLUSTER_CRAFT = 12, 4
 SETTINGS = """total_timesteps = 49152
 num_envs = 64
@@ -146,10 +148,24 @@ def run_fleet(craft: int, flights: int, seconds: float, seed: int, workers: int)
     }
 
 
-def train_on(count: int | None, config: Config, seed: int, updates: int) -> tuple[Any, np.ndarray]:
-    """Return the network's arrays after ``COMPARED`` updates, and the mean return after each."""
+def train_on(
+    count: int | None, config: Config, seed: int, updates: int, change: float = 0.0
+) -> tuple[Any, np.ndarray]:
+    """Return the network's arrays after ``COMPARED`` updates, and the mean return after each.
+
+    Args:
+        count: of devices; None: without a mesh.
+        config: hyperparameters.
+        seed: of the training.
+        updates: number of them.
+        change: relative, of the parameters at the start.
+    """
     trainer = Trainer(config, mesh=None if count is None else devices.make_mesh(count))
     runner, returns, arrays = trainer.start(jax.random.key(seed)), [], None
+    if change:
+        state = runner.train_state
+        params = jax.tree.map(lambda leaf: leaf * (1.0 + change), state.params)
+        runner = runner._replace(train_state=state.replace(params=params))
     for number in range(1, updates + 1):
         runner, metrics = trainer.update(runner)
         returns.append(float(metrics["last_return"]))
@@ -199,6 +215,30 @@ def run_devices(updates: int, seed: int) -> dict[str, Any]:
         record[f"{count} devices, curve"] = float(rise / rise_of_one)
     found = train_in_processes(config, seed, RUNS / f"pair{seed}")
     record["2 processes"] = differences(found, expected)
+    return record
+
+
+def run_rounding(updates: int, seed: int) -> dict[str, Any]:
+    """Return what a change of a parameter's last bits becomes on one device, and few gradient steps.
+
+    A training is chaotic: what sums in another order change, such a change of the start does, too.
+    """
+    config = Config(total_timesteps=updates * Config().batch_size)
+    expected, curve = train_on(None, config, seed, updates)
+    changed = [train_on(None, config, seed, updates, change) for change in CHANGES]
+    record: dict[str, Any] = {"updates": updates, "compared": COMPARED, "seed": seed}
+    record["differences"] = [differences(found, expected) for found, _ in changed]
+    record["curves"] = [
+        float((returns.mean() - curve.min()) / (curve.mean() - curve.min()))
+        for _, returns in changed
+    ]
+    clear_backends()
+    jax.config.update("jax_num_cpu_devices", max(DEVICES))
+    few = replace(config, **FEW, total_timesteps=COMPARED * FEW["num_envs"] * FEW["num_steps"])
+    expected, _ = train_on(None, few, seed, COMPARED)
+    for count in DEVICES:
+        found, _ = train_on(count, few, seed, COMPARED)
+        record[f"{count} devices"] = differences(found, expected)
     return record
 
 
@@ -410,7 +450,9 @@ def write_results() -> None:
 
 
 def main(
-    part: Literal["devices", "fleet", "sweep_on_cluster", "fleet_on_cluster", "overhead", "page"],
+    part: Literal[
+        "devices", "rounding", "fleet", "sweep_on_cluster", "fleet_on_cluster", "overhead", "page"
+    ],
     craft: int = 8,
     flights: int = 15,
     seconds: float = 20.0,
@@ -431,6 +473,7 @@ def main(
     """
     runs: dict[str, Callable[[], dict[str, Any]]] = {
         "devices": lambda: run_devices(updates, seed),
+        "rounding": lambda: run_rounding(updates, seed),
         "fleet": lambda: run_fleet(craft, flights, seconds, seed, workers),
         "sweep_on_cluster": lambda: run_cluster_sweep(TRIALS, seed),
         "fleet_on_cluster": lambda: run_cluster_fleet(flights, seconds, seed),
