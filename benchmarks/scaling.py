@@ -46,6 +46,7 @@ from benchmarks.report import (
     lines_in,
     progress,
     provenance,
+    spread,
     write_page,
 )
 from flytrack_env.jobs import run_jobs
@@ -67,7 +68,8 @@ PAPER_STEPS, PAPER_DEVICES, STEPS_PER_S = 1e10, 64, 9.07e6
 ROW_NUMBERS, NETWORK_BYTES_PER_S, MESSAGE_S = 8, 50e9, 50e-6
 DEVICES, COMPARED = (1, 2, 4), 20  # updates
 CHANGES = (1e-7, 2e-7, -1e-7, -2e-7)  # one or two of a float32's last bits
-FEW = {"num_envs": 64, "num_steps": 32, "num_minibatches": 8}  # 160 gradient steps in 20 updates
+# 160 gradient steps in 20 updates.
+FEW = Config(total_timesteps=COMPARED * 64 * 32, num_envs=64, num_steps=32, num_minibatches=8)
 TRIALS, CLUSTER_CRAFT = 12, 4
 SETTINGS = """total_timesteps = 49152
 num_envs = 64
@@ -219,7 +221,7 @@ def run_devices(updates: int, seed: int) -> dict[str, Any]:
 
 
 def run_rounding(updates: int, seed: int) -> dict[str, Any]:
-    """Return what a change of a parameter's last bits becomes on one device, and few gradient steps.
+    """Return what a change of the last bits becomes on one device, and after few gradient steps.
 
     A training is chaotic: what sums in another order change, such a change of the start does, too.
     """
@@ -234,10 +236,9 @@ def run_rounding(updates: int, seed: int) -> dict[str, Any]:
     ]
     clear_backends()
     jax.config.update("jax_num_cpu_devices", max(DEVICES))
-    few = replace(config, **FEW, total_timesteps=COMPARED * FEW["num_envs"] * FEW["num_steps"])
-    expected, _ = train_on(None, few, seed, COMPARED)
+    expected, _ = train_on(None, FEW, seed, COMPARED)
     for count in DEVICES:
-        found, _ = train_on(count, few, seed, COMPARED)
+        found, _ = train_on(count, FEW, seed, COMPARED)
         record[f"{count} devices"] = differences(found, expected)
     return record
 
@@ -396,12 +397,23 @@ def figures() -> Iterator[Figure]:
     """Yield the figures of the page; those that were not measured say so."""
     if one := last_of("devices"):
         for name in (*(f"{count} devices" for count in DEVICES), "2 processes"):
-            title = f"{name}: largest difference of a parameter from one device after 20 updates"
+            title = f"{name}, 1,280 gradient steps: largest difference of a parameter from one"
             yield Figure(title, "1e-5", f"{one[name]:.1e}", 1)
         for count in DEVICES:
             share = f"{100.0 * one[f'{count} devices, curve']:.1f} %"
             title = f"{count} devices: rise of the mean return over {one['updates']} updates"
             yield Figure(f"{title}, of that of one", "95 to 105 %", share, 1)
+    if one := last_of("rounding"):
+        for count in DEVICES:
+            title = (
+                f"{count} devices, 160 gradient steps: largest difference of a parameter from one"
+            )
+            yield Figure(title, "1e-5", f"{one[f'{count} devices']:.1e}", 1)
+        title = "one device, its start changed by 1e-7 or 2e-7, 1,280 gradient steps: the same"
+        yield Figure(title, "", spread(one["differences"], ".1e"), len(CHANGES))
+        title = f"one device, its start so changed: rise of the mean return over {one['updates']}"
+        shares = spread([100.0 * share for share in one["curves"]], ".1f")
+        yield Figure(f"{title} updates, of that unchanged", "", f"{shares} %", len(CHANGES))
     if one := last_of("fleet"):
         title = f"fleet of {one['craft']} craft, {one['craft'] * one['flights']} logs: causes"
         text = f"{one['right']} of {one['of']}"
