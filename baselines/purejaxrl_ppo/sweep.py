@@ -6,7 +6,6 @@ ends those that fall behind; one that is interrupted continues from its newest c
 
 import dataclasses
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -167,16 +166,27 @@ def prepare(flags: Flags) -> tuple[Base, Space]:
     return Base(out, config, flags.seed, flags.env_id, arguments, options), space
 
 
-def make_tuner(flags: Flags, base: Base, space: Space, on_end: Callable[[], None]) -> Any:
+def make_tuner(flags: Flags, base: Base, space: Space) -> Any:
     """Return Ray's tuner of a sweep, or of one that goes on."""
     from ray import tune
     from ray.tune.schedulers import ASHAScheduler
 
     class Progress(tune.Callback):
-        """Counts the trials that ended."""
+        """Shows how many trials ended, on one line."""
+
+        bar: Any = None
 
         def on_trial_complete(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
-            on_end()
+            if self.bar is None:
+                self.bar = progress_bar("trials")
+            self.bar.update(1)
+
+        def on_experiment_end(self, trials: Any, **info: Any) -> None:
+            if self.bar is not None:
+                self.bar.close()
+
+        def __getstate__(self) -> dict[str, Any]:
+            return {}  # Ray stores callbacks, and a bar cannot be
 
     resources = {"cpu": flags.cpus_per_trial, "gpu": flags.gpus_per_trial}
     trainable = tune.with_resources(tune.with_parameters(run_trial, base=base), resources)
@@ -227,14 +237,13 @@ def run_sweep(flags: Flags) -> int:
     )
     options = msgspec.structs.replace(base.options, parent_run=tracker.run_id)
     base = base._replace(options=options)
-    status, bar = "FAILED", progress_bar("trials")
+    status = "FAILED"
     try:
         with warnings.catch_warnings(), connected(flags.address or "local"):
             warnings.simplefilter("ignore")  # Ray's, of forks and of its own deprecations
-            results = make_tuner(flags, base, space, lambda: bar.update(1)).fit()
+            results = make_tuner(flags, base, space).fit()
         status = "FINISHED"
     finally:
-        bar.close()
         tracker.end(status)
     table = results.get_dataframe()
     path = base.out / TABLE
