@@ -17,7 +17,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +51,7 @@ from benchmarks.report import (
 )
 from flytrack_env.jobs import run_jobs
 from flytrack_env.model_file import save_model
-from flytrack_sysid.fleet import DIAGNOSED, Change, diagnose_fleet, find_flights
+from flytrack_sysid.fleet import DIAGNOSED, Change, Flight, diagnose_fleet, find_flights
 from flytrack_sysid.fleet_page import write_fleet
 from flytrack_sysid.log_file import save_log
 
@@ -131,6 +131,21 @@ def grade(changes: list[Change], causes: dict[str, list[str]]) -> dict[str, Any]
     }
 
 
+def grade_single(
+    flights: Sequence[Flight], results: dict[str, dict[str, Any]], causes: dict[str, list[str]]
+) -> dict[str, Any]:
+    """Return how many single diagnoses name what is there, and how many what is not."""
+    exact, of, wrong = 0, 0, 0
+    for flight in flights:
+        is_there = int(Path(flight.path).stem.removeprefix("flight")) >= BEGINS_IN
+        truth = set(causes[flight.craft]) if is_there else set()
+        named = {cause["effect"] for cause in results[flight.name]["diagnosis"]["causes"]}
+        of += bool(truth)
+        exact += bool(truth) and named == truth
+        wrong += bool(named - truth)
+    return {"single_exact": exact, "single_of": of, "single_wrong": wrong}
+
+
 def run_fleet(craft: int, flights: int, seconds: float, seed: int, workers: int) -> dict[str, Any]:
     """Return how a simulated fleet was told."""
     folder, out = RUNS / f"fleet{seed}", RUNS / f"told{seed}"
@@ -146,6 +161,7 @@ def run_fleet(craft: int, flights: int, seconds: float, seed: int, workers: int)
         "seed": seed,
         "wall_s": round(time.perf_counter() - started),
         "cpu_s": round(sum(os.times()[:4]) - used),
+        **grade_single(found, results, causes),
         **grade(changes, causes),
     }
 
@@ -421,6 +437,11 @@ def figures() -> Iterator[Figure]:
             f"{title} that begin in flight {BEGINS_IN}, with it", "2 of 3", text, one["of"]
         )
         yield Figure(f"{title} told that are not there", "0", str(one["other"]), one["craft"])
+        text = f"{one['single_exact']} of {one['single_of']}"
+        title = "its single diagnoses: exactly the cause, of flights with one"
+        yield Figure(title, "", text, one["single_of"])
+        title = "its single diagnoses that name what is not there"
+        yield Figure(title, "0", str(one["single_wrong"]), one["craft"] * one["flights"])
     if one := last_of("sweep_on_cluster"):
         text = f"{one['different_trials']} of {one['trials']}, {one['runs_below']} MLflow runs"
         yield Figure(
@@ -446,7 +467,10 @@ def write_results() -> None:
     commits = ", ".join(
         f"{part} {one['commit']}" for part in PARTS if (one := last_of(part)) is not None
     )
-    values = {name: f"{value:,.3g}" for name, value in on_paper().items()}
+    values = {
+        name: f"{value:,.0f}" if value >= 100.0 else f"{value:.3g}"
+        for name, value in on_paper().items()
+    }
     fleet = last_of("fleet") or {}
     text = filled(
         "scaling",
@@ -454,7 +478,8 @@ def write_results() -> None:
         told="; ".join(told) or "nothing",
         commits=commits,
         machine=source.get("machine", ""),
-        seed=fleet.get("seed", ""),
+        missing=", ".join(part for part in PARTS if last_of(part) is None) or "nothing",
+        seed=SEED,
         seconds=fleet.get("seconds", ""),
         **values,
     )
