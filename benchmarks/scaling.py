@@ -139,11 +139,14 @@ def grade_single(
     for flight in flights:
         is_there = int(Path(flight.path).stem.removeprefix("flight")) >= BEGINS_IN
         truth = set(causes[flight.craft]) if is_there else set()
-        named = {cause["effect"] for cause in results[flight.name]["diagnosis"]["causes"]}
+        diagnosis = results[flight.name].get("diagnosis", {"causes": []})
+        named = {cause["effect"] for cause in diagnosis["causes"]}
         of += bool(truth)
         exact += bool(truth) and named == truth
         wrong += bool(named - truth)
-    return {"single_exact": exact, "single_of": of, "single_wrong": wrong}
+    refused = sum(result["state"] != DIAGNOSED for result in results.values())
+    single = {"single_exact": exact, "single_of": of, "single_wrong": wrong}
+    return {**single, "single_refused": refused}
 
 
 def run_fleet(craft: int, flights: int, seconds: float, seed: int, workers: int) -> dict[str, Any]:
@@ -442,6 +445,8 @@ def figures() -> Iterator[Figure]:
         yield Figure(title, "", text, one["single_of"])
         title = "its single diagnoses that name what is not there"
         yield Figure(title, "0", str(one["single_wrong"]), one["craft"] * one["flights"])
+        title = "its logs that the check refuses, of logs that nothing is wrong with"
+        yield Figure(title, "0", str(one["single_refused"]), one["craft"] * one["flights"])
     if one := last_of("sweep_on_cluster"):
         text = f"{one['different_trials']} of {one['trials']}, {one['runs_below']} MLflow runs"
         yield Figure(
