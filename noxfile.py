@@ -125,6 +125,10 @@ USES = {
     "multi": (RACE_IN_OTHER_LIBRARIES,),
     "fly": (FLY_BY_HAND,),
     "export": ("flytrack export champion --onnx policy.onnx --c policy.h",),
+    "cluster": (
+        "flytrack collect --minutes 1 --out season/red/flight1.npz",
+        "flytrack diagnose season --fleet --address local --out fleet",
+    ),
     "optimal": ("python -m benchmarks.time_optimal --tracks speedway --kinds flying --out made",),
     "speed": ("from benchmarks.env_speed import l2f_contestant as l2f; l2f('l2f', 1024, 8).run()",),
 }

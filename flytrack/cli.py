@@ -99,6 +99,12 @@ COMMANDS = {
         f"{PPO}.export:run_export",
         f"{PPO}.export:ExportSettings",
     ),
+    "sweep": Command(
+        "Train with many settings by Ray Tune",
+        "cluster",
+        f"{PPO}.sweep:run_sweep",
+        f"{PPO}.sweep:Flags",
+    ),
     "bench": Command(
         "Fly a policy through a frozen suite of tasks",
         "bench",

@@ -181,6 +181,17 @@ class Diagnose:
     as drones do if the logs are measured, else what the logs show."""
     accept: bool = False
     """Diagnose logs although their channels contradict each other."""
+    fleet: bool = False
+    """Diagnose every log in folders apart, craft by craft (a subfolder each, docs/scaling.md), and
+    say which cause began with which flight. A second call goes on where the first one ended."""
+    address: Annotated[
+        str | None, arg(metavar="HOST:PORT|auto|local", help_behavior_hint=NO_HINT)
+    ] = None
+    """With --fleet: a Ray cluster; default: processes of this machine."""
+    workers: int = 1
+    """With --fleet: processes of this machine."""
+    limit: float = 900.0
+    """With --fleet: longest time of a log, s."""
 
 
 @dataclass(frozen=True)

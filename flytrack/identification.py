@@ -33,6 +33,8 @@ from flytrack_sysid.diagnosis import text_of as text_of_diagnosis
 from flytrack_sysid.diagnosis.identifiability import next_flight
 from flytrack_sysid.diagnosis.report import collect_traces
 from flytrack_sysid.fit import fit, what_is_fitted
+from flytrack_sysid.fleet import diagnose_fleet, expand, find_flights
+from flytrack_sysid.fleet_page import format_page, write_fleet
 from flytrack_sysid.flight_recording import write_flight_recording
 from flytrack_sysid.importing import import_log
 from flytrack_sysid.importing.mapping import SHIPPED
@@ -199,6 +201,9 @@ def run_diagnose(flags: Diagnose) -> None:
     """Diagnose the model; write the report, the extended model and a recording."""
     if not flags.logs:
         raise ValueError("LOG: found none, expected at least one flight log")
+    if flags.fleet:
+        run_fleet(flags)
+        return
     train, test = (
         [load_log(path) for path in flags.logs],
         [load_log(path) for path in flags.hold_out],
@@ -236,6 +241,32 @@ def run_diagnose(flags: Diagnose) -> None:
     print_written([*written, *[recording] * (not reason)])
     if reason:
         print(f"{recording}: left out: {reason}")
+
+
+def run_fleet(flags: Diagnose) -> None:
+    """Diagnose every log of a fleet that OUT has no result of, and write the fleet's page."""
+    if flags.out is None:
+        raise ValueError("--out: missing, expected a folder for results and page")
+    if flags.quick or flags.hold_out or flags.before or flags.accept or flags.motion != "auto":
+        raise ValueError("--fleet: found beside a flag of single logs, expected --model at most")
+    for name, value in (("--workers", flags.workers), ("--limit", flags.limit)):
+        if not value > 0:
+            raise ValueError(f"{name}: found {value:g}, expected more than 0")
+    flights = find_flights(expand(flags.logs, flags.out), flags.model)
+    bars: list[ProgressBar] = []
+
+    def report(done: int, total: int) -> None:
+        if total and (not bars or bars[-1].bar.total != total):
+            bars.append(ProgressBar("comparisons" if bars else "logs"))
+        if total:
+            bars[-1](done, total)
+
+    results, changes = diagnose_fleet(
+        flights, flags.out, flags.limit, flags.workers, flags.address, report
+    )
+    written = write_fleet(flags.out, flights, results, changes)
+    print(format_page(flights, results, changes))
+    print_written(written)
 
 
 def run_plan(flags: Plan) -> None:

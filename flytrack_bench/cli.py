@@ -2,22 +2,24 @@
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import arg
 
 from baselines.purejaxrl_ppo.config import OPTIONAL, OptionalPath
-from flytrack_bench.policies import PolicyError, load_policy
-from flytrack_bench.results import differences, run
+from flytrack_bench.policies import Policy, PolicyError, load_policy
+from flytrack_bench.results import differences, run, summarize
 from flytrack_bench.suite import Suite, SuiteError, load_suite
 from flytrack_env.extras import import_object
 from flytrack_env.files import read_at_most, write_atomically
+from flytrack_env.jobs import ClusterError, run_jobs
 from flytrack_env.messages import error_text
 from flytrack_env.progress import ProgressBar
 
 MAX_BYTES = 2**24
+MAX_JOB_S = 86_400.0  # of a task, with retraining
 VERIFIED = 3  # tasks of a result that are flown again
 
 
@@ -39,6 +41,11 @@ class Flags:
     `flytrack_bench:adapt_to_flight`, `flytrack_bench:diagnose_and_retrain`, or your own."""
     data_seconds: float = 30.0
     """Seconds of flight that --adapt may log of each plant."""
+    address: Annotated[
+        str | None, arg(metavar="HOST:PORT|auto|local", help_behavior_hint=OPTIONAL)
+    ] = None
+    """A Ray cluster, a task of the suite a job; its nodes must see policies and
+    suite. Default: this process."""
     verify: OptionalPath = None
     """A result to verify: some of its tasks are flown again with this policy."""
 
@@ -55,7 +62,36 @@ def fly(flags: Flags, suite: Suite, ids: tuple[str, ...]) -> dict[str, Any]:
     if flags.adapt is not None:
         adapt = import_object(flags.adapt, "--adapt", PolicyError)
         tasks = tasks if ids else tuple(task for task in tasks if task.craft is not None)
-    return run(suite, policies, tasks, flags.data_seconds, adapt, ProgressBar("flights"))
+    if flags.address is None:
+        return run(suite, policies, tasks, flags.data_seconds, adapt, ProgressBar("flights"))
+    return fly_on_cluster(flags, suite, policies, [task.id for task in tasks])
+
+
+def fly_on_cluster(
+    flags: Flags, suite: Suite, policies: list[Policy], ids: list[str]
+) -> dict[str, Any]:
+    """Return the result of the policies, each task of the suite flown as a job of a Ray cluster.
+
+    Raises:
+        ClusterError: no such cluster, or a task that failed on it.
+    """
+    of_job = replace(flags, address=None, verify=None)
+    jobs = {name: (of_job, name) for name in ids}
+    results: dict[str, dict[str, Any]] = {}
+    bar = ProgressBar("tasks")
+    for name, outcome in run_jobs(fly_job, jobs, MAX_JOB_S, flags.address):
+        if outcome.error:
+            raise ClusterError(f"task {name}: {outcome.error}")
+        results[name] = outcome.value
+        bar(len(results), len(ids))
+    flown = {name: results[name]["tasks"][name] for name in ids}
+    cpu_s = sum(result["cpu_s"] for result in results.values())
+    return summarize(suite, policies, flown, results[ids[0]]["regime"], cpu_s)
+
+
+def fly_job(flags: Flags, task: str) -> dict[str, Any]:
+    """Return the result of the policies on one task; called in processes of their own."""
+    return fly(flags, load_suite(flags.suite), (task,))
 
 
 def bench(flags: Flags) -> bool:

@@ -122,18 +122,30 @@ def run(
             own = policy if adapt is None else adapt(Data(task, suite, seconds), policy)
             flown[task.id].append(fly_task(task, suite, own))
             report(place * len(policies) + number + 1, total)
+    regime = "zero-shot" if adapt is None else f"{seconds:g} s of data"
+    return summarize(suite, policies, flown, regime, time.process_time() - started_s)
+
+
+def summarize(
+    suite: Suite,
+    policies: Sequence[Policy],
+    flown: dict[str, list[dict[str, Any]]],
+    regime: str,
+    cpu_s: float,
+) -> dict[str, Any]:
+    """Return the result of flown tasks as JSON values; cpu_s: that they took."""
     return {
         "schema": SCHEMA,
         "suite": suite.name,
         "digest": suite.digest,
-        "regime": "zero-shot" if adapt is None else f"{seconds:g} s of data",
+        "regime": regime,
         "policies": [
             {"name": one.name, "sha256": one.sha256, "training": one.training()} for one in policies
         ],
         "tasks": flown,
         "summary": {name: summary(flown, name) for name in ("success", "score")},
         "versions": {name: version(name) for name in ("flytrack", "jax", "jaxlib")},
-        "cpu_s": round(time.process_time() - started_s, 1),
+        "cpu_s": round(cpu_s, 1),
     }
 
 

@@ -211,8 +211,16 @@ def make_network_for(env: Any, env_params: Any, config: Config) -> ActorCritic:
     return make_network(config, sees_image=sees_image)
 
 
-def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
+def make_ppo(
+    env: Any, env_params: Any, config: Config, divide: Callable[[Any], Any] = lambda rows: rows
+) -> Algorithm:
     """Return PPO on a gymnax environment with its parameters.
+
+    Args:
+        env: the environment.
+        env_params: of it.
+        config: hyperparameters.
+        divide: shares out minibatches, (num_minibatches, rows, ...), among devices (devices.py).
 
     Raises:
         ValueError: a configuration that cannot be trained with.
@@ -288,7 +296,7 @@ def make_ppo(env: Any, env_params: Any, config: Config) -> Algorithm:
         minibatches = jax.tree.map(
             lambda leaf: leaf.reshape(config.num_minibatches, -1, *leaf.shape[1:]), shuffled
         )
-        return jax.lax.scan(update_minibatch, train_state, minibatches)
+        return jax.lax.scan(update_minibatch, train_state, divide(minibatches))
 
     def update(runner: Runner) -> tuple[Runner, Metrics]:
         runner, (batch, log) = jax.lax.scan(collect_step, runner, None, config.num_steps)

@@ -85,9 +85,13 @@ class Tracker:
         uri: of the store; "local" for an SQLite file in the folder, "" for none.
         name: of the MLflow run.
         description: of the run, as JSON values.
+        parent: id of the MLflow run that a new one is below; "" for none.
     """
 
-    def __init__(self, folder: Path, uri: str, name: str, description: dict[str, Any]):
+    def __init__(
+        self, folder: Path, uri: str, name: str, description: dict[str, Any], parent: str = ""
+    ):
+        self._parent = parent
         self._folder, self._name, self._description = folder, name, description
         path = folder / RUN_FILE
         known = json.loads(path.read_bytes()) if path.exists() else {"uri": LOCAL, "run_id": ""}
@@ -173,7 +177,9 @@ class Tracker:
                 (store.parent / LOCAL_ARTIFACTS).as_uri() if self._uri.startswith(SQLITE) else None
             )
             experiment_id = client.create_experiment(EXPERIMENT, artifact_location=location)
-        self.run_id = client.create_run(experiment_id, run_name=self._name).info.run_id
+        tags = {"mlflow.parentRunId": self._parent} if self._parent else {}
+        run = client.create_run(experiment_id, tags=tags, run_name=self._name)
+        self.run_id = run.info.run_id
         params = [Param(*pair) for pair in describe_params(self._description).items()]
         client.log_batch(self.run_id, params=params)
         content = json.dumps({"uri": self._asked, "run_id": self.run_id})
@@ -199,3 +205,15 @@ class Tracker:
                         self._client.log_image(
                             self.run_id, chart, key=DENSITY, step=step, timestamp=time_ms
                         )
+
+
+def end_unfinished(folder: Path, uri: str) -> None:
+    """Tell MLflow that the run of a folder was ended, if its process could not."""
+    path = folder / RUN_FILE
+    if not uri or not path.exists():
+        return
+    from mlflow import MlflowClient
+
+    client, run_id = MlflowClient(tracking_uri=uri), json.loads(path.read_bytes())["run_id"]
+    if client.get_run(run_id).info.status == "RUNNING":
+        client.set_terminated(run_id, "KILLED")

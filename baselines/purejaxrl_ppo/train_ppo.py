@@ -1,6 +1,7 @@
 """Train PPO on a FlyTrack environment: ``flytrack train`` (docs/baseline.md)."""
 
 import dataclasses
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -10,7 +11,10 @@ from typing import Annotated, Any, Literal, NoReturn
 import jax
 import msgspec
 import tyro
+from jax.extend.backend import clear_backends
+from jax.sharding import Mesh
 
+from baselines.purejaxrl_ppo import devices
 from baselines.purejaxrl_ppo.checkpoint import (
     FINAL,
     Checkpoint,
@@ -22,6 +26,8 @@ from baselines.purejaxrl_ppo.config import (
     OPTIONAL,
     RECIPES,
     Config,
+    OptionalInt,
+    OptionalName,
     OptionalPath,
     read_config_file,
 )
@@ -62,6 +68,18 @@ class Sources:
     ] = None
     """Train on it, and with the hyperparameters for it unless --resume has others; by default on
     what JAX prefers, with those for a CPU."""
+    devices: Annotated[str | None, tyro.conf.arg(metavar="N|all", help_behavior_hint=OPTIONAL)] = (
+        None
+    )
+    """Divide the environments among so many devices (of each process); by default one, and all
+    where there are several processes. On a CPU, N threads are the devices."""
+    coordinator: OptionalName = None
+    """Train together with other processes that are given the same command: HOST:PORT at which
+    process 0 listens, or auto in a job of SLURM, Open MPI or Kubernetes."""
+    num_processes: OptionalInt = None
+    """Number of processes, unless auto."""
+    process: OptionalInt = None
+    """Index of this one, from 0, unless auto."""
     config: OptionalPath = None
     """TOML file of hyperparameters; flags override it."""
     resume: OptionalPath = None
@@ -103,10 +121,34 @@ def choose_device(device: str | None) -> None:
         raise ValueError(f"--device: found JAX on the {backend}, expected {device}: {how}")
 
 
-def parse(words: Sequence[str]) -> tuple[Settings, Checkpoint | None]:
-    """Return the settings of a command line, and the checkpoint that it resumes."""
-    sources, _ = tyro.cli(Sources, args=words, prog=PROG, add_help=False, return_unknown_args=True)
+def choose_mesh(sources: Sources) -> Mesh | None:
+    """Join the other processes, and return the devices that share a training; None: the default.
+
+    Raises:
+        ValueError: no such devices, or other processes that cannot be reached.
+    """
+    count = sources.devices
+    if count not in (None, "all") and not (count.isdecimal() and int(count)):
+        raise ValueError(f"--devices: found {count!r}, expected a number from 1, or all")
+    if sources.coordinator is None and (sources.num_processes or sources.process) is not None:
+        raise ValueError("--num-processes and --process: found without --coordinator")
+    if count is None and sources.coordinator is None:
+        choose_device(sources.device)
+        return None
+    clear_backends()  # gymnax computes when it is imported; the devices are chosen anew
+    number = int(count) if count not in (None, "all") else None
+    if number is not None and "host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        jax.config.update("jax_num_cpu_devices", number)  # before JAX computes
+    if sources.coordinator is not None:
+        devices.join(sources.coordinator, sources.num_processes, sources.process)
     choose_device(sources.device)
+    return devices.make_mesh(number)
+
+
+def parse(words: Sequence[str]) -> tuple[Settings, Checkpoint | None, Mesh | None]:
+    """Return the settings of a command line, the checkpoint that it resumes, and its devices."""
+    sources, _ = tyro.cli(Sources, args=words, prog=PROG, add_help=False, return_unknown_args=True)
+    mesh = choose_mesh(sources)
     defaults, start = Settings(hyperparameters=RECIPES[sources.device or "cpu"]), None
     if sources.resume is not None:
         start = newest_intact(sources.resume)
@@ -124,16 +166,17 @@ def parse(words: Sequence[str]) -> tuple[Settings, Checkpoint | None]:
     )
     if not 0 <= settings.seed <= MAX_SEED:
         raise ValueError(f"--seed: found {settings.seed}, expected 0 to {MAX_SEED}")
-    return settings, start
+    return settings, start, mesh
 
 
-def make_trainer(settings: Settings, start: Checkpoint | None) -> Trainer:
+def make_trainer(settings: Settings, start: Checkpoint | None, mesh: Mesh | None = None) -> Trainer:
     """Return the trainer of a command line.
 
     Errors name the checkpoint from which some settings come.
     """
     reward = parse_rewards(settings.reward)
     arguments: dict[str, Any] = {"track": settings.track, "reward": reward, "model": settings.model}
+    arguments["mesh"] = mesh
     if start is None:
         return Trainer(settings.hyperparameters, settings.env_id, **arguments)
     try:
@@ -149,21 +192,27 @@ def make_trainer(settings: Settings, start: Checkpoint | None) -> Trainer:
 
 def train(words: Sequence[str]) -> None:
     """Train as a command line says; print where the run continues from, and its checkpoint."""
-    settings, start = parse(words)
-    trainer = make_trainer(settings, start)
+    settings, start, mesh = parse(words)
+    trainer = make_trainer(settings, start, mesh)
+    is_first = devices.is_first()
     options, out = settings.run, settings.out or DEFAULT_OUT
     if settings.no_tracking:
         options = msgspec.structs.replace(options, tracking_uri="")
     if start is not None:
         out = settings.out or start.path.parent
+    if start is not None and is_first:
         print(f"seed {settings.seed}: from step {start.steps}, {start.path}")
     final, _ = trainer.train(out, settings.seed, options, start)
-    print(f"seed {settings.seed}: {final.steps} steps in {final.meta['seconds']} s: {out / FINAL}")
+    if is_first:
+        print(
+            f"seed {settings.seed}: {final.steps} steps in {final.meta['seconds']} s: {out / FINAL}"
+        )
 
 
 def leave(status: int, text: object) -> NoReturn:
     """Exit with a message."""
-    print(text, file=sys.stderr)
+    print(text, file=sys.stderr, flush=True)
+    devices.leave_alone(status)
     raise SystemExit(status)
 
 

@@ -7,8 +7,8 @@ cut off and resumed changes a bit of the result.
 import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -18,15 +18,17 @@ import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
+from jax.sharding import Mesh
 
 import flytrack_env
 from baselines.purejaxrl_ppo import checkpoint as files
+from baselines.purejaxrl_ppo import devices
 from baselines.purejaxrl_ppo.checkpoint import Checkpoint, CheckpointError
 from baselines.purejaxrl_ppo.config import Config, Count, PositiveInt
 from baselines.purejaxrl_ppo.metrics import summarize_updates
 from baselines.purejaxrl_ppo.monitor import evaluate_policy
 from baselines.purejaxrl_ppo.networks import Policy
-from baselines.purejaxrl_ppo.ppo import make_network_for, make_ppo, make_schedule
+from baselines.purejaxrl_ppo.ppo import Algorithm, make_network_for, make_ppo, make_schedule
 from baselines.purejaxrl_ppo.tracking import LOCAL, RUN_FILE, Tracker
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.files import locked_folder
@@ -35,6 +37,7 @@ from flytrack_env.progress import LineBar, progress_bar
 from flytrack_env.validation import convert
 
 Metrics = dict[str, np.ndarray]
+Report = Callable[[int, dict[str, float]], None]
 RECORD_EVERY = 131_072  # environment steps: metrics are recorded a few times a second
 # where all returns are the same there is no variance to explain
 MAY_BE_UNDEFINED = "explained_variance"
@@ -68,6 +71,8 @@ class Options(msgspec.Struct, frozen=True):
     """Noisy starts of an evaluation."""
     tracking_uri: str = ""
     """MLflow store; local: an SQLite file in OUT."""
+    parent_run: str = ""
+    """Id of the MLflow run that this one is below, as of a sweep."""
 
 
 DEFAULT_OPTIONS = Options(checkpoint_every=1_000_000, evaluate_every=4_000_000, tracking_uri=LOCAL)
@@ -154,6 +159,7 @@ class Trainer:
     Args:
         config: checked here.
         env_id: of ``flytrack_env.make``.
+        mesh: devices that share the environments (devices.py); None: the default device.
         env_arguments: of ``flytrack_env.make``.
 
     Attributes:
@@ -164,20 +170,31 @@ class Trainer:
         ValueError: settings, id, track or model that cannot be used.
     """
 
-    def __init__(self, config: Config, env_id: str = "FlyTrack-v0", **env_arguments: Any):
-        self.config, self.env_id = config.check(), env_id
+    def __init__(
+        self,
+        config: Config,
+        env_id: str = "FlyTrack-v0",
+        mesh: Mesh | None = None,
+        **env_arguments: Any,
+    ):
+        self.config, self.env_id, self.mesh = config.check(), env_id, mesh
         self.track = track_reference(env_arguments.get("track", "flytrack"))
         self.env = flytrack_env.make(env_id, **env_arguments)
         self.env.check_params(self.env.default_params)
         params = training_params(self.env, self.config)
-        ppo = make_ppo(self.env, params, self.config)
+        if mesh is None:
+            ppo = make_ppo(self.env, params, self.config)
+        else:
+            devices.check_divides(self.config, mesh)
+            divide = partial(devices.divide_minibatches, mesh)
+            ppo = make_ppo(self.env, params, self.config, divide)
         self.network = make_network_for(self.env, params, self.config)
         # Weak types become strong ones, as they come from a file: one program for both.
         strong = partial(
             jax.tree.map, lambda leaf: jnp.asarray(leaf).astype(jnp.asarray(leaf).dtype)
         )
-        self.start = jax.jit(lambda key: strong(ppo.start(key)))
-        self.update = jax.jit(ppo.update)
+        strong_start = Algorithm(lambda key: strong(ppo.start(key)), ppo.update)
+        self.start, self.update = devices.compile_on(mesh, strong_start)
 
     def train(
         self,
@@ -185,6 +202,7 @@ class Trainer:
         seed: int,
         options: Options = Options(),  # noqa: B008, frozen
         resume: Path | Checkpoint | None = None,
+        report: Report = lambda steps, values: None,
     ) -> tuple[Checkpoint, Metrics]:
         """Train and write ``out``/final.safetensors. A run that is complete stays as it is.
 
@@ -193,6 +211,7 @@ class Trainer:
             seed: of the run.
             options: what is done beside training.
             resume: checkpoint, or its file or folder, to continue from.
+            report: called with environment steps and metrics a few times a second.
 
         Returns:
             The final checkpoint, and the metrics of every update made here.
@@ -206,15 +225,21 @@ class Trainer:
         options = convert("options", msgspec.to_builtins(options), Options)
         start = files.newest_intact(resume) if isinstance(resume, Path) else resume
         description = files.describe_run(self.env, self.env_id, self.track, self.config, seed)
-        with locked_folder(out):
-            self._check(out, start, description)
+        with locked_folder(out) if devices.is_first() else nullcontext():
+            if devices.is_first():
+                self._check(out, start, description)
+            begins_at = 0 if start is None else start.steps
+            devices.check_agree(out, {**description, "begins_at": begins_at})
             if start is not None and start.path == out / files.FINAL:
                 if start.steps == self.config.num_updates * self.config.batch_size:
                     return start, {}
                 # The run is extended, and final is what it will be at its new end.
-                start = start._replace(path=start.path.rename(out / files.step_file(start.steps)))
-            with collect_signals() as signals:
-                return Run(self, out, options, description, start).train(signals)
+                stored = out / files.step_file(start.steps)
+                if devices.is_first():
+                    start.path.rename(stored)
+                start = start._replace(path=stored)
+            with collect_signals() as signals, devices.noticing_loss(f"--resume {out}"):
+                return Run(self, out, options, description, start, report).train(signals)
 
     def _check(self, out: Path, start: Checkpoint | None, description: dict[str, Any]) -> None:
         """Raise ValueError unless a run can begin in a folder, or continue from a checkpoint."""
@@ -243,6 +268,7 @@ class Run:
         options: what is done beside training.
         description: as ``describe_run`` returns it.
         start: where it continues from; None: it begins.
+        report: called with environment steps and metrics.
     """
 
     def __init__(
@@ -252,7 +278,9 @@ class Run:
         options: Options,
         description: dict[str, Any],
         start: Checkpoint | None,
+        report: Report,
     ):
+        self.report = report
         self.trainer, self.config = trainer, trainer.config
         self.out, self.options, self.description = out, options, description
         self.update = 0  # number of updates so far
@@ -260,17 +288,20 @@ class Run:
         self.last_stored: Path | None = None
         self.history: list[Metrics] = []  # of the updates
         self.evaluation: dict[str, float] = {}  # metrics of the last one
-        key = jax.random.key(description["seed"])
+        key, self.is_first = jax.random.key(description["seed"]), devices.is_first()
         if start is None:
-            (out / RUN_FILE).unlink(missing_ok=True)
+            if self.is_first:
+                (out / RUN_FILE).unlink(missing_ok=True)
             self.runner = trainer.start(key)
         else:
-            self.runner = files.restore_runner(start, jax.eval_shape(trainer.start, key))
+            whole = files.restore_runner(start, jax.eval_shape(trainer.start, key))
+            self.runner = devices.spread(whole, trainer.mesh)
             self.update, self.last_stored = start.steps // self.config.batch_size, start.path
             self.begun_s -= start.meta["seconds"]
             self._report_learning_rate(start.config)
         name = f"{trainer.env_id} {Path(trainer.track).stem} seed {description['seed']}"
-        self.tracker = Tracker(out, options.tracking_uri, name, description)
+        uri = options.tracking_uri if self.is_first else ""
+        self.tracker = Tracker(out, uri, name, description, options.parent_run)
 
     @property
     def steps(self) -> int:
@@ -281,7 +312,7 @@ class Run:
         """Print how the learning rate jumps where a new run length changes its schedule."""
         count = self.update * self.config.gradients_per_update
         old, new = (float(make_schedule(config)(count)) for config in (before, self.config))
-        if old != new:
+        if old != new and self.is_first:
             print(
                 f"learning rate: {old:.3g} up to step {self.steps}, {new:.3g} from there: "
                 "it is annealed anew"
@@ -289,10 +320,15 @@ class Run:
 
     def train(self, signals: list[int]) -> tuple[Checkpoint, Metrics]:
         """Train to the end; once a signal has arrived, write a checkpoint and raise ``Stopped``."""
-        config, status = self.config, "FAILED"
+        config, status, is_stopped = self.config, "FAILED", False
         total = config.num_updates * config.batch_size
         bar = progress_bar(
-            "steps", total=total, initial=self.steps, unit_scale=True, desc="compile"
+            "steps",
+            total=total,
+            initial=self.steps,
+            unit_scale=True,
+            desc="compile",
+            disable=not self.is_first,
         )
         try:
             if self.options.checkpoint_every and self.update == 0:
@@ -301,8 +337,9 @@ class Run:
             bar.set_description("train")
             if isinstance(bar, LineBar):  # tqdm's clock would jump back
                 bar.unpause()
-            while self.update < config.num_updates and not signals:
+            while self.update < config.num_updates and not is_stopped:
                 self._advance()
+                is_stopped = devices.any_process(bool(signals))
                 bar.set_postfix_str(self._format_progress(), refresh=False)
                 bar.update(self.steps - bar.n)
             is_complete = self.update == config.num_updates
@@ -311,10 +348,11 @@ class Run:
         finally:
             bar.close()
             self.tracker.end(status)
-        if signals:
-            name = signal.Signals(signals[0]).name
+        if is_stopped:
+            number = signals[0] if signals else signal.SIGTERM  # another process received one
+            name = signal.Signals(number).name
             text = "the run is complete" if is_complete else f"continue with --resume {self.out}"
-            raise Stopped(f"stopped by {name} at {self.steps} steps; {text}", signals[0])
+            raise Stopped(f"stopped by {name} at {self.steps} steps; {text}", number)
         return files.load_checkpoint(self.out / files.FINAL), stack(self.history)
 
     def _advance(self) -> None:
@@ -340,9 +378,10 @@ class Run:
         rate = (self.steps - first) / (time.perf_counter() - started_s)
         rows = stack(updates)
         values, written = {**summarize_updates(rows), "steps_per_second": rate}, list[Path]()
-        params = self.runner.train_state.params
+        params = devices.gather(self.runner.train_state.params, self.trainer.mesh)
         not_finite = find_not_finite(rows, params)
-        if options.evaluate_every and (is_evaluated or is_last) and not not_finite:
+        is_evaluated = bool(options.evaluate_every) and (is_evaluated or is_last)
+        if is_evaluated and self.is_first and not not_finite:
             policy, folder = Policy(self.trainer.network, params), self.out / "evaluation"
             self.evaluation, written = evaluate_policy(
                 self.trainer.env, policy, options.evaluation_episodes, folder, self.steps, is_last
@@ -358,13 +397,17 @@ class Run:
             )
         if is_stored and not is_last:
             self._store(files.step_file(self.steps))
+        self.report(self.steps, values)
 
     def _store(self, name: str) -> None:
         """Write a checkpoint, once all that was recorded before it is sent."""
         self.tracker.flush()
         seconds = round(time.perf_counter() - self.begun_s, 1)
         description = {**self.description, "steps": self.steps, "seconds": seconds}
-        files.save_run(self.out / name, self.runner, self.config, description)
+        runner = devices.gather(self.runner, self.trainer.mesh)
+        if self.is_first:
+            files.save_run(self.out / name, runner, self.config, description)
+        devices.any_process(False)  # until the file is there
         self.last_stored = self.out / name
         self.tracker.record(self.steps, {}, [(self.last_stored, "checkpoints")])
 

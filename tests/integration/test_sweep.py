@@ -1,0 +1,83 @@
+"""Sweeps: which settings are accepted, and a sweep of which a part is interrupted."""
+
+import subprocess
+import sys
+
+import pytest
+
+from baselines.purejaxrl_ppo import load_checkpoint
+from baselines.purejaxrl_ppo.config import ConfigError
+from baselines.purejaxrl_ppo.sweep import Flags, prepare, read_settings
+
+BATCH = 16 * 24
+SMALL = f"total_timesteps = {64 * BATCH}\nnum_envs = 16\nnum_steps = 24\nhidden_sizes = [8]\n"
+GRID = SMALL + "num_minibatches = 4\n[learning_rate]\ngrid_search = [1e-3, 3e-3]\n"
+
+
+def written(folder, text):
+    path = folder / "settings.toml"
+    path.write_text(text)
+    return path
+
+
+def test_settings_are_fixed_or_drawn(tmp_path):
+    text = "num_envs = 64\n[hidden_sizes]\nchoice = [[8], [64, 64]]\n[gamma]\nuniform = [0.9, 1]\n"
+    config, space = read_settings(written(tmp_path, text))
+    assert config.num_envs == 64
+    assert space == {"hidden_sizes": ("choice", [(8,), (64, 64)]), "gamma": ("uniform", [0.9, 1.0])}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "found no setting that is drawn"),
+        ("learning_rate", "cannot be read"),
+        ("[speed]\nchoice = [1]", "speed: unknown; expected one of total_timesteps"),
+        ("[gamma]\nguess = [1]", "gamma: found .*, expected one of choice, grid_search"),
+        ("[gamma]\nuniform = [1]", "uniform: found .*, expected lowest and highest value"),
+        ("[gamma]\nchoice = ['a']", "gamma"),
+    ],
+)
+def test_settings_that_cannot_be_used_are_refused(tmp_path, text, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        read_settings(written(tmp_path, text))
+    assert "settings.toml" in str(error.value)
+
+
+def test_what_no_trial_could_use_is_refused_before_any(tmp_path):
+    path = written(tmp_path, GRID)
+    for flags, message in (
+        (Flags(path, trials=0, out=tmp_path), "--trials: found 0"),
+        (Flags(path, out=tmp_path, resume=True), "found none: leave --resume out"),
+        (Flags(path, out=tmp_path, track="nowhere"), "nowhere"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            prepare(flags)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")  # deprecations in MLflow's own dependencies
+def test_a_sweep_here(tmp_path):
+    pytest.importorskip("ray", reason="needs the extra cluster")
+    from mlflow import MlflowClient
+
+    out = tmp_path / "sweep"
+    command = [sys.executable, "-m", "flytrack", "sweep", str(written(tmp_path, GRID))]
+    command += ["--trials", "1", "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "best: " in done.stdout
+    folders = sorted(out.glob("trial*"))
+    paths = [next(iter(sorted(folder.glob("step_0*")))) for folder in folders]
+    assert sorted(load_checkpoint(path).config.learning_rate for path in paths) == [1e-3, 3e-3]
+    finals = [folder / "final.safetensors" for folder in folders]
+    assert any(path.exists() and load_checkpoint(path).steps == 64 * BATCH for path in finals)
+    client = MlflowClient(tracking_uri=f"sqlite:///{out / 'mlflow.db'}")
+    runs = client.search_runs([client.get_experiment_by_name("flytrack").experiment_id])
+    (sweep,) = [run for run in runs if "mlflow.parentRunId" not in run.data.tags]
+    trials = [run for run in runs if run.data.tags.get("mlflow.parentRunId") == sweep.info.run_id]
+    assert len(runs) == 3
+    assert sorted(run.data.params["config.learning_rate"] for run in trials) == ["0.001", "0.003"]
+    assert {run.info.status for run in runs} <= {"FINISHED", "KILLED"}
+    refused = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert "found a sweep: --resume goes on with it" in refused.stderr

@@ -1,0 +1,215 @@
+"""A fleet: how logs are sorted and stored, and when a change is told; jobs that crash or hang."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flytrack.flags import Diagnose
+from flytrack.identification import run_diagnose
+from flytrack_env.jobs import ClusterError, Outcome, run_jobs
+from flytrack_sysid import collect, fleet, save_log
+from flytrack_sysid.fleet import (
+    FleetError,
+    Flight,
+    Store,
+    diagnose_flight,
+    expand,
+    find_beginning,
+    find_changes,
+    find_flights,
+)
+from flytrack_sysid.fleet_page import format_page
+from tests.support.jobs import end_as
+
+
+def test_a_job_that_crashes_or_raises_costs_itself_only():
+    ends = list(run_jobs(end_as, {kind: (kind,) for kind in ("crash", "raise", "a")}, 300.0))
+    assert ends == [
+        ("crash", Outcome(None, "its process crashed, with exit status 3")),
+        ("raise", Outcome(None, "no such thing")),
+        ("a", Outcome("a")),
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("address", [None, "local"])
+def test_a_job_that_hangs_costs_itself_only(address):
+    if address is not None:
+        pytest.importorskip("ray", reason="needs the extra cluster")
+    ends = dict(run_jobs(end_as, {kind: (kind,) for kind in ("hang", "crash", "a")}, 60.0, address))
+    assert ends["a"] == Outcome("a")
+    assert "found no result after 60 s, the limit of a job" in ends["hang"].error
+    assert "its process crashed" in ends["crash"].error
+
+
+def test_a_cluster_that_is_none_is_refused():
+    pytest.importorskip("ray", reason="needs the extra cluster")
+    with pytest.raises(ClusterError, match=r"--address 127\.0\.0\.1:9: no Ray cluster"):
+        list(run_jobs(end_as, {"a": ("a",)}, 9.0, "127.0.0.1:9"))
+
+
+def touched(path, text=""):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def test_logs_are_sorted_into_craft_in_the_order_of_their_numbers(tmp_path):
+    for name in (
+        "red/flight10.npz",
+        "red/flight9.npz",
+        "blue/a.bbl",
+        "red/.hidden",
+        "red/model.json",
+    ):
+        touched(tmp_path / name)
+    touched(tmp_path / "red" / "notes.toml", '"flight10.npz" = "new motor"')
+    touched(tmp_path / "blue" / "mapping.toml")
+    flights = find_flights([tmp_path], None)
+    assert [flight.name for flight in flights] == [
+        "blue/a.bbl",
+        "red/flight9.npz",
+        "red/flight10.npz",
+    ]
+    assert [flight.note for flight in flights] == ["", "", "new motor"]
+    assert flights[0].mapping.endswith("blue/mapping.toml")
+    assert flights[0].model is None
+    assert flights[1].model.endswith("red/model.json")
+
+
+def test_a_url_is_copied(tmp_path):
+    fsspec = pytest.importorskip("fsspec", reason="needs the extra cluster")
+    fsspec.filesystem("memory").pipe("/season/red/flight1.npz", b"1")
+    folders = expand([Path("memory://season")], tmp_path)
+    (flight,) = find_flights(folders, None)
+    assert flight.name == "red/flight1.npz"
+    assert Path(flight.path).read_bytes() == b"1"
+
+
+def test_folders_that_are_no_fleet_are_refused(tmp_path):
+    with pytest.raises(FleetError, match="found no file, expected a folder for each craft"):
+        find_flights([tmp_path], None)
+    with pytest.raises(FleetError, match="found nothing there"):
+        expand([tmp_path / "nowhere" / "*.npz"], tmp_path)
+    touched(tmp_path / "red" / "a.npz")
+    touched(tmp_path / "red" / "notes.toml", "a = 3")
+    with pytest.raises(FleetError, match=r"notes\.toml: a: expected text"):
+        find_flights([tmp_path], None)
+    with pytest.raises(ValueError, match="--workers: found 0, expected more than 0"):
+        run_diagnose(Diagnose((tmp_path,), tmp_path, fleet=True, workers=0))
+
+
+def test_a_log_that_is_none_says_why(tmp_path):
+    text = diagnose_flight(Flight("red", str(touched(tmp_path / "readme.txt", "hello"))))
+    assert text["state"] == fleet.UNREADABLE
+    assert "readme.txt: found text, expected a flight log" in text["reason"]
+    cut = diagnose_flight(Flight("red", str(touched(tmp_path / "cut.npz", "PK"))))
+    assert "cut.npz" in cut["reason"]
+
+
+@pytest.mark.parametrize(
+    ("named", "first"),
+    [
+        ("0000011111", 5),
+        ("0000010111", 5),  # one diagnosis misses it
+        ("0000000111", 7),
+        ("0100000000111111", 10),  # one early name does not hide the change
+        ("0000000011", None),  # too few flights after
+        ("0011111111", None),  # too few before
+        ("0101010101", None),
+        ("1111111111", None),
+        ("0000000000", None),
+        ("0000010100", None),
+    ],
+)
+def test_a_beginning_is_told_only_where_flights_before_and_after_agree(named, first):
+    assert find_beginning([flag == "1" for flag in named]) == first
+
+
+def test_no_beginning_is_told_of_names_by_chance():
+    rng = np.random.default_rng(5)
+    told = [find_beginning(list(rng.random(16) < 0.1)) for _ in range(2000)]
+    assert sum(first is not None for first in told) <= 20
+
+
+def result_of(*effects):
+    causes = [{"effect": name, "equivalent": [], "parameters": {}} for name in effects]
+    diagnosis = {"causes": causes, "unexplained": {"flagged": False}}
+    return {"state": fleet.DIAGNOSED, "settings": {}, "diagnosis": diagnosis}
+
+
+def test_single_diagnoses_and_the_comparison_must_agree(tmp_path):
+    flights = [Flight("red", str(tmp_path / f"flight{number}.npz")) for number in range(1, 11)]
+    flights[8] = flights[8]._replace(note="new battery")
+    results = {
+        flight.name: result_of(*["wind"] * (number >= 5), *["rotor_drag"] * (number < 6))
+        for number, flight in enumerate(flights)
+    }
+    asked = []
+
+    def run(function, jobs):
+        for name, (later, earlier) in jobs.items():
+            asked.append((name, len(later), len(earlier)))
+            effects = ("wind", "gyro_bias") if "begun at flight6" in name else ()
+            yield name, Outcome({"causes": result_of(*effects)["diagnosis"]["causes"]})
+
+    store = Store(tmp_path / "out", run)
+    changes = find_changes(flights, results, store, lambda done, total: None)
+    assert asked == [
+        ("red/begun at flight6.npz", 4, 4),
+        ("red/begun at flight9.npz", 2, 4),
+        ("red/ended at flight7.npz", 4, 4),
+    ]
+    wind, battery = changes
+    assert (wind.flight, wind.since, list(wind.causes)) == (6, "flight6.npz", ["wind"])
+    assert (battery.flight, battery.note, battery.causes) == (9, "new battery", {})
+    page = format_page(flights, results, changes)
+    assert "- **red**: wind () begins with flight 6, flight6.npz (before: flight5.npz)" in page
+    assert "no cause begins with flight 9" in page
+    assert "gyro_bias" not in page
+    # A second call asks nothing again.
+    find_changes(flights, results, store, lambda done, total: None)
+    assert len(asked) == 3
+
+
+def test_results_are_kept_and_a_changed_log_is_done_again(tmp_path):
+    path, calls = touched(tmp_path / "a.npz", "1"), []
+
+    def run(function, jobs):
+        for name in jobs:
+            calls.append(name)
+            yield (
+                name,
+                Outcome({"state": fleet.DIAGNOSED}) if len(calls) < 3 else Outcome(None, "no"),
+            )
+
+    results = partial(Store(tmp_path / "out", run).results, diagnose_flight)
+    jobs = {"red/a.npz": (Flight("red", str(path)),)}
+    results(jobs, lambda done, total: None)
+    results(jobs, lambda done, total: None)
+    assert calls == ["red/a.npz"]
+    touched(path, "22")
+    results(jobs, lambda done, total: None)
+    assert len(calls) == 2
+    touched(path, "333")
+    failed = results(jobs, lambda done, total: None)
+    assert failed["red/a.npz"]["reason"] == "no"
+    assert not [one for one in Path(tmp_path / "out").rglob(".*") if one.is_file()]
+
+
+@pytest.mark.slow
+def test_a_folder_becomes_a_page_and_a_second_call_does_nothing_again(tmp_path, black_box, capsys):
+    season, out = tmp_path / "season", tmp_path / "out"
+    touched(season / "red" / "readme.txt", "hello")
+    save_log(season / "red" / "flight1.npz", collect(black_box, 1.0, seed=0))
+    run_diagnose(Diagnose((season,), out, fleet=True))
+    shown = capsys.readouterr().out
+    result = (out / "logs" / "red" / "flight1.npz.json").stat().st_mtime_ns
+    assert "2 logs of 1 craft: 1 diagnosed" in shown
+    assert "| red/readme.txt | unreadable | readme.txt: found text" in shown
+    assert (out / "fleet.md").read_text() in shown
+    assert (out / "fleet.png").read_bytes().startswith(b"\x89PNG")
+    run_diagnose(Diagnose((season,), out, fleet=True))
+    assert (out / "logs" / "red" / "flight1.npz.json").stat().st_mtime_ns == result
