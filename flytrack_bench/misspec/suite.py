@@ -93,6 +93,7 @@ class Plant:
         id: of its log.
         drawn: what was drawn first.
         truth: what is hidden.
+        clean: the flight as it was, of which no method is told.
         log: the flight that a method is shown.
         model: the nominal model that a method is shown.
         flights: beginnings of unseen flights.
@@ -103,6 +104,7 @@ class Plant:
     id: str
     drawn: Drawn
     truth: Truth
+    clean: FlightLog
     log: FlightLog
     model: ModelParameters
     flights: Flights
@@ -145,7 +147,8 @@ class LogSuite:
             rng = np.random.default_rng([self.seed, drawn.number, attempt])
             truth = draw_truth(drawn, self.seconds, rng)
             try:
-                log = measured(fly(truth, self.seconds, rng), drawn.noise, rng)
+                clean = fly(truth, self.seconds, rng)
+                log = measured(clean, drawn.noise, rng)
                 # Gusts cannot be predicted, and what began in flight has begun.
                 unseen = fly(replace(truth, gust=None, onset_s=None), self.unseen_seconds, rng)
             except RuntimeError:  # this plant leaves the envelope
@@ -154,7 +157,7 @@ class LogSuite:
             flights, ends_w = cut_flights(unseen)
             is_frozen = log.sha256 == self.sha256.get(log_id)
             model = nominal_model(truth)
-            return Plant(log_id, drawn, truth, log, model, flights, ends_w, is_frozen)
+            return Plant(log_id, drawn, truth, clean, log, model, flights, ends_w, is_frozen)
         raise SuiteError(f"{self.name}: log {log_id}: none of {TRIES} plants can be flown")
 
 
