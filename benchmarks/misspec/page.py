@@ -1,7 +1,7 @@
 """docs/results/misspec.md, from the results of all methods in docs/results/misspec.
 
-``python -m benchmarks.misspec.page`` reads what ``flytrack bench --suite misspec-v1`` wrote. Of each
-plant whose names the diagnosis missed, it computes what the log could show at all
+``python -m benchmarks.misspec.page`` reads what ``flytrack bench --suite misspec-v1`` wrote. Of
+each plant whose names the diagnosis missed, it computes what the log could show at all
 (benchmarks.hidden.oracle), and keeps that in docs/results/misspec/misses.jsonl.
 """
 
