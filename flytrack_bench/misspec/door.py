@@ -1,5 +1,6 @@
 """The door: show a method each log of a suite, in a process of its own, and score what it says."""
 
+import contextlib
 import json
 import os
 import selectors
@@ -68,9 +69,9 @@ class Worker:
         if self._process is None:
             self.start()
         assert self._process is not None and self._process.stdin is not None
-        self._process.stdin.write(f"{folder}\n".encode())
-        self._process.stdin.flush()
         try:
+            self._process.stdin.write(f"{folder}\n".encode())
+            self._process.stdin.flush()
             self._reply(self._limit_s)
             return read_answer(read_at_most(folder / ANSWER, MAX_BYTES).decode())
         except (Silent, AnswerError, OSError) as error:
@@ -91,7 +92,8 @@ class Worker:
     def stop(self) -> None:
         """End the process and what it has started."""
         if self._process is not None:
-            os.killpg(self._process.pid, signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError):  # it has ended, and left nothing behind
+                os.killpg(self._process.pid, signal.SIGKILL)
             self._process.communicate()
             self._process = None
 

@@ -9,13 +9,12 @@ import pytest
 
 from benchmarks.misspec.replay import fly
 from benchmarks.misspec.rivals import forward, random_distortion
-from flytrack.cli import main
 from flytrack_bench.hidden.draws import NAMES
 from flytrack_bench.misspec import Answer, AnswerError, Flights, load_log_suite, run_method, scores
 from flytrack_bench.misspec.answer import diagnose_log, fly_model, log_of
 from flytrack_bench.misspec.door import show
 from flytrack_bench.misspec.suite import LogSuite, draw_all
-from flytrack_bench.suite import SuiteError
+from flytrack_bench.suite import FOLDER, SuiteError
 from flytrack_env.motion import Motion
 from flytrack_sysid import load_log
 from tests.support.refusals import refused
@@ -117,28 +116,33 @@ def test_ours_and_two_rivals_name_drag(drag):
     assert sparse(drag.log, drag.model).names == ("linear_drag",)
 
 
-def test_a_method_that_crashes_invents_or_hangs_scores_zero_and_the_result_goes_on(tmp_path):
-    out = tmp_path / "result.json"
-    found = run_method(SHORT, ["00", "01", "02"], MOODY, out, 60.0)
-    reasons = [found["logs"][name].get("reason", "") for name in ("00", "01", "02")]
+def test_a_method_that_crashes_invents_or_ends_scores_zero_and_the_result_goes_on(tmp_path):
+    out, ids = tmp_path / "result.json", ["00", "01", "02", "03"]
+    found = run_method(SHORT, ids, MOODY, out, 60.0)
+    reasons = [found["logs"][name].get("reason", "") for name in ids]
     assert reasons[0] == "" and "ZeroDivisionError: by design" in reasons[1]
     assert "found 'gremlins', expected some of" in reasons[2]
-    # It begins again with what is left, and with a new process whose fourth call would hang.
-    hung = dict(json.loads(out.read_text()))
-    assert [*hung["logs"]] == ["00", "01", "02"] and hung["summary"]["no_answer"] == 2
+    assert reasons[3] == "ended with status 3"
+    assert found["summary"]["no_answer"] == 3 and json.loads(out.read_text()) == found
     shares = ("silent", "no_false_name", "exact", "in_class", "detected", "left_open")
-    assert not any(hung["logs"]["01"][name] for name in shares)
-    assert hung["logs"]["00"]["names"] == ["linear_drag"] and hung["logs"]["00"]["cpu_s"] >= 0.0
-    again = run_method(SHORT, ["00", "01"], MOODY, out, 60.0)
-    assert again == found  # nothing was left to ask, and no process was begun
+    assert not any(found["logs"]["01"][name] for name in shares)
+    assert found["logs"]["00"]["names"] == ["linear_drag"] and found["logs"]["00"]["cpu_s"] >= 0.0
+    again = run_method(SHORT, ids[:2], MOODY, out, 60.0)
+    assert again == found  # nothing was left to ask
     with pytest.raises(AnswerError, match="method: found tests"):
-        run_method(SHORT, ["00"], "benchmarks.misspec.rivals:nominal", out, 60.0)
+        run_method(SHORT, ids, "benchmarks.misspec.rivals:nominal", out, 60.0)
 
 
 @pytest.mark.slow
-def test_a_method_that_hangs_is_ended(tmp_path):
-    found = run_method(SHORT, ["00", "01", "02", "03"], MOODY, None, 10.0)
-    assert found["logs"]["03"]["reason"] == "took more than 10 s"
+def test_a_method_that_hangs_is_ended_and_begun_again():
+    found = run_method(SHORT, ["00", "01"], MOODY.replace("moody", "hang"), None, 3.0)
+    assert [line["reason"] for line in found["logs"].values()] == ["took more than 3 s"] * 2
+
+
+@pytest.mark.slow
+def test_a_method_that_is_not_there_is_refused():
+    with pytest.raises(AnswerError, match="cannot be imported"):
+        run_method(SHORT, ["00"], MOODY.replace("moody", "absent"), None, 3.0)
 
 
 def line_of(row, effects, answer, **more):
@@ -193,8 +197,6 @@ def test_flags_that_do_not_belong_together_are_refused(capsys, tmp_path):
     refused(capsys, "bench", "--suite", "misspec-v1", "--method", MOODY, "--policy", "champion")
     with pytest.raises(SuiteError, match="found '60', expected some of 00 to 59"):
         SUITE.chosen(("60",))
-    content = json.loads(json.dumps({"unseen_seconds": 1.0}))
     path = tmp_path / "changed.json"
-    path.write_text(json.dumps(content))
-    refused(capsys, "bench", "--suite", path, "--method", MOODY)
-    assert callable(main)
+    path.write_text((FOLDER / "misspec-v1.json").read_text().replace("60.0", "61.0"))
+    assert "digest" in refused(capsys, "bench", "--suite", path, "--method", MOODY)

@@ -1,5 +1,6 @@
-"""Methods for the door of misspec-v1 that answer, crash, invent a name, and hang, in this order."""
+"""Methods for the door of misspec-v1 that misbehave."""
 
+import os
 import time
 
 from flytrack_bench.misspec import Answer
@@ -8,6 +9,7 @@ calls = 0
 
 
 def moody(log, model):
+    """Answer, crash, invent a name, and end the process, in this order."""
     global calls
     calls += 1
     print("a method may print")
@@ -16,5 +18,9 @@ def moody(log, model):
     if calls == 3:
         return Answer(names=("gremlins",))
     if calls == 4:
-        time.sleep(1e6)
-    return Answer(names=("linear_drag",), flagged=True, model=None)
+        os._exit(3)
+    return Answer(names=("linear_drag",), flagged=True)
+
+
+def hang(log, model):
+    time.sleep(1e6)
