@@ -48,7 +48,7 @@ from flytrack_sysid.inference.search import (
 FORWARD_P = 1e-3  # of a step, over all candidates tried in it (Bonferroni)
 MAX_EFFECTS, NUM_REFITTED = 6, 3
 THRESHOLDS = np.geomspace(1.0, 300.0, 25)  # of columns scaled to length 1, in units of the noise
-GP_ROWS, LAYERS, NUM_INPUTS = 10, (32, 32), 11
+GP_ROWS, LAYERS, NUM_INPUTS = 15, (32, 32), 11
 TOLERATED, DISTORTION_P, RDT_ROWS = 0.1, 0.01, 10  # of a sensor's noise; global p-value; 0.1 s
 Values = dict[str, tuple[float, float, float]]
 
