@@ -118,7 +118,7 @@ def column(found: Replay, feature: Feature, scales: np.ndarray) -> np.ndarray:
     rates = nothing if feature.rates_b is None else feature.rates_b
     gyro = rates + (nothing if feature.gyro is None else feature.gyro)
     felt = force + (nothing if feature.accelerometer is None else feature.accelerometer)
-    parts = [gyro, felt, found.over_windows(rates), found.pushed(force)]
+    parts = [gyro, felt, found.turned(rates), found.pushed(force)]
     return np.concatenate(
         [(part / scale).ravel() for part, scale in zip(parts, scales, strict=True)]
     )

@@ -14,6 +14,7 @@ from flytrack_sysid import FlightLog
 
 SECONDS_PER_MINUTE = 60.0
 SKIPPED_S = 0.5  # of the log's beginning: lags depend on commands from before it
+CERTAIN = 1e-3  # of a stick
 WINDOW = 10  # rows over which attitude and velocity are differenced
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -106,6 +107,19 @@ class Replay(NamedTuple):
     turning: np.ndarray
     pushing: np.ndarray
 
+    def turning_at(self, rows: np.ndarray) -> np.ndarray:
+        """Return the model's rates in the steps that end in rows (rad/s), (rows, 3)."""
+        rates_b = self.state.rates_b
+        if self.motion is Motion.CONTINUOUS:
+            return np.asarray(0.5 * (rates_b[rows - 1] + rates_b[rows]))
+        return np.asarray(rates_b[rows])
+
+    def turned(self, rates_b: np.ndarray) -> np.ndarray:
+        """Return the mean of rates over each window, in its first body frame, (windows, 3)."""
+        attitude = self.state.attitude
+        mean_w = self.over_windows(attitude.apply(rates_b))
+        return np.asarray(attitude[self.first].inv().apply(mean_w))
+
     def over_windows(self, rates_b: np.ndarray) -> np.ndarray:
         """Return the mean of rates over each window, (windows, 3).
 
@@ -146,14 +160,18 @@ def lagged(model: ModelParameters, commands: np.ndarray, step_s: float) -> np.nd
 
 
 def replay(log: FlightLog, model: ModelParameters) -> Replay:
-    """Return the nominal model along a log, whose lost rows hold the command before them."""
+    """Return the nominal model along a log, where it is certain what was commanded."""
     step_s = float(np.median(np.diff(log.time)))
     index = np.round((log.time - log.time[0]) / step_s).astype(int)
-    held = np.zeros(index[-1] + 1, int)
-    held[index] = np.arange(len(index))
-    applied = lagged(model, log["u"][np.maximum.accumulate(held)], step_s)
+    grid = np.arange(index[-1] + 1)
+    before = np.searchsorted(index, grid, side="right") - 1
+    applied, otherwise = (
+        lagged(model, log["u"][row], step_s) for row in (before, np.searchsorted(index, grid))
+    )
+    # A lost row's command is unknown: rows count where the one before or after it do the same.
+    is_certain = np.abs(applied - otherwise).max(axis=1) < CERTAIN
     slope = np.gradient(applied, step_s, axis=0)
-    is_used = log.time >= log.time[0] + SKIPPED_S
+    is_used = (log.time >= log.time[0] + SKIPPED_S) & is_certain[index]
     rows, on_grid = log.select(is_used), index[is_used]
     attitude = Rotation.from_quat(rows["q"], scalar_first=True)
     volt = rows["v_bat"][:, 0]
@@ -167,10 +185,13 @@ def replay(log: FlightLog, model: ModelParameters) -> Replay:
         state, model.motion, rows["w"] - state.rates_b, rows["f"] - thrust_b, first, last, UP, UP
     )
     duration = WINDOW * step_s
-    turned = (attitude[first].inv() * attitude[last]).as_rotvec() / duration
+    # What is left of the turn after the model's, in the first body frame.
+    turned = attitude[first].inv() * attitude[last]
+    for row in range(1, WINDOW + 1)[::-1]:
+        turned = turned * Rotation.from_rotvec(-step_s * found.turning_at(first + row))
     gained_w = (rows["v"][last] - rows["v"][first]) / duration + float(model.g) * UP
     return found._replace(
-        turning=turned - found.over_windows(state.rates_b),
+        turning=turned.as_rotvec() / duration,
         pushing=attitude[first].inv().apply(gained_w) - found.pushed(thrust_b),
     )
 
