@@ -45,7 +45,8 @@ def main(method_name: str, replies: TextIO) -> None:
         try:
             answer = answer_of(method, folder)
         except Exception as error:  # whatever a method raises
-            answer = {"reason": f"{type(error).__name__}: {error}"}
+            reason = f"{type(error).__name__}: {error}"
+            answer = {"reason": reason.replace(f"{folder}/", "")}  # it is a temporary one
         write_atomically(folder / ANSWER, json.dumps(answer).encode())
         print(DONE, file=replies, flush=True)
 
