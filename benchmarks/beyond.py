@@ -2,11 +2,11 @@
 
 Usage: ``python -m benchmarks.beyond [--laws 4] [--clean 20] [--listed 10] [--page]``.
 
-Flies plants with laws outside the package's list (benchmarks.hidden.outside, equations of their
-own), clean ones, and ones with listed effects only, a minute each, and grades what the diagnosis
-learns of each: is the variable right, and the form; how much of the explainable error goes on a new
-flight. It appends a line a plant to docs/results/beyond.jsonl and skips plants that have a line of
-the same commit; --page writes docs/results/beyond.md, of the last line of each plant.
+Flies plants with laws outside the package's list (equations of their own), clean ones, and ones
+with listed effects only, a minute each, and grades what the diagnosis learns of each: is the
+variable right, and the form; how much of the explainable error goes on a new flight. It appends a
+line a plant to docs/results/beyond.jsonl and skips plants that have a line of the same commit;
+--page writes docs/results/beyond.md, of the last line of each plant.
 """
 
 import json

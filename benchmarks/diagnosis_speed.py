@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks import report
 from benchmarks.hidden import draw_base, fly, measure
-from benchmarks.hidden.draws import with_effects
+from flytrack_bench.hidden.draws import with_effects
 from flytrack_env.compile_cache import keep_compiled_programs
 from flytrack_sysid import FlightLog, diagnose
 

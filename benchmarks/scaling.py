@@ -35,7 +35,6 @@ from baselines.purejaxrl_ppo.tracking import EXPERIMENT, local_uri
 from baselines.purejaxrl_ppo.training import Trainer
 from benchmarks import hidden
 from benchmarks.diagnosis import model_of
-from benchmarks.hidden.draws import SUDDEN
 from benchmarks.report import (
     RESULTS,
     Figure,
@@ -49,6 +48,7 @@ from benchmarks.report import (
     spread,
     write_page,
 )
+from flytrack_bench.hidden.draws import SUDDEN
 from flytrack_env.jobs import run_jobs
 from flytrack_env.model_file import save_model
 from flytrack_sysid.fleet import DIAGNOSED, Change, Flight, diagnose_fleet, find_flights

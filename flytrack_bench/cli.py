@@ -1,4 +1,4 @@
-"""Fly a policy through a frozen suite of tasks, and write a result that others can verify."""
+"""Take a policy, or a method that names errors, through a frozen suite, and write the result."""
 
 import hashlib
 import json
@@ -9,6 +9,8 @@ import numpy as np
 from tyro.conf import arg
 
 from baselines.purejaxrl_ppo.config import OPTIONAL, OptionalPath
+from flytrack_bench.misspec import SHARES, is_log_suite, load_log_suite, run_method
+from flytrack_bench.misspec.door import LIMIT_S
 from flytrack_bench.policies import Policy, PolicyError, load_policy
 from flytrack_bench.results import differences, run, summarize
 from flytrack_bench.suite import Suite, SuiteError, load_suite
@@ -27,15 +29,21 @@ VERIFIED = 3  # tasks of a result that are flown again
 class Flags:
     """What is flown."""
 
-    policy: Annotated[tuple[str, ...], arg(metavar="CHECKPOINT|MODULE:NAME [...]")]
+    policy: Annotated[tuple[str, ...], arg(metavar="CHECKPOINT|MODULE:NAME [...]")] = ()
     """The policy, one for each training seed: checkpoints, or functions of the observation that
     return four sticks."""
+    method: Annotated[str | None, arg(metavar="MODULE:FUNCTION", help_behavior_hint=OPTIONAL)] = (
+        None
+    )
+    """What names the errors of a model, for a suite of logs (misspec-v1): a function of log and
+    model that returns a `flytrack_bench.misspec.Answer`."""
     out: OptionalPath = None
-    """The result, .json; default: it is printed only."""
+    """The result, .json; default: it is printed only. With --method, a result that has begun goes
+    on."""
     suite: str = "v1"
-    """Name of a shipped suite, or a suite's file."""
+    """Name of a shipped suite, or a suite's file: v1 for policies, misspec-v1 for methods."""
     tasks: tuple[str, ...] = ()
-    """Ids of the tasks to fly; default: all, or with --adapt all hidden plants."""
+    """Ids of the tasks or logs; default: all, or with --adapt all hidden plants."""
     adapt: Annotated[str | None, arg(metavar="MODULE:NAME", help_behavior_hint=OPTIONAL)] = None
     """A function that makes a policy for each plant, given `flytrack_bench.Data` and --policy:
     `flytrack_bench:adapt_to_flight`, `flytrack_bench:diagnose_and_retrain`, or your own."""
@@ -48,11 +56,58 @@ class Flags:
     suite. Default: this process."""
     verify: OptionalPath = None
     """A result to verify: some of its tasks are flown again with this policy."""
+    limit_s: float = LIMIT_S
+    """Seconds (wall clock) after which --method has failed on a log."""
 
 
 def run_bench(flags: Flags) -> int:
     """Fly as the flags say; return the exit status, 1 where a result is not confirmed."""
+    if is_log_suite(flags.suite):
+        name_errors(flags)
+        return 0
+    if flags.method is not None:
+        raise ValueError(f"--suite: found {flags.suite}, expected one of logs for --method")
+    if not flags.policy:
+        raise ValueError(f"--policy: missing, expected a policy for the suite {flags.suite}")
     return 0 if (bench(flags) if flags.verify is None else verify(flags)) else 1
+
+
+def name_errors(flags: Flags) -> None:
+    """Show a method the logs, print and write the result."""
+    if flags.method is None:
+        raise ValueError(f"--method: missing, expected one for the suite of logs {flags.suite}")
+    for name in ("policy", "adapt", "verify"):
+        if getattr(flags, name):
+            raise ValueError(f"--{name}: found with {flags.suite}, expected --method alone")
+    suite = load_log_suite(flags.suite)
+    ids, report = suite.chosen(flags.tasks), ProgressBar("logs")
+    found = run_method(suite, ids, flags.method, flags.out, flags.limit_s, report)
+    print(summary_text(found))
+    if flags.out is not None:
+        print(f"written: {flags.out}")
+
+
+def summary_text(found: dict[str, Any]) -> str:
+    """Return the summary of a method's result as a table."""
+    summary, lines = found["summary"], []
+    for name, (meaning, _) in SHARES.items():
+        one = summary[name]
+        interval = "" if one["ci95"] is None else " ({:.2f} to {:.2f})".format(*one["ci95"])
+        lines.append(f"{meaning:58} {one['k']:3} of {one['n']:3}{interval}")
+    covered = summary["coverage"]
+    lines.append(f"{'95 % intervals that cover the truth':58} {covered['k']:3} of {covered['n']:3}")
+    for row, error in summary["error_m"].items():
+        value = "-" if error is None or error["median"] is None else f"{error['median']:.4g} m"
+        lines.append(f"{f'error after 0.5 s of unseen flight, {row}: median':58} {value:>10}")
+    if summary["cpu_s"] is not None:
+        lines.append(f"{'CPU seconds a log: median':58} {summary['cpu_s']['median']!s:>8} s")
+    for log_id, line in found["logs"].items():
+        if "reason" in line:
+            lines.append(f"log {log_id}: no answer: {line['reason']}")
+    others = [log_id for log_id, line in found["logs"].items() if not line["is_frozen"]]
+    if others:
+        lines.append(f"logs that differ from the frozen ones on this machine: {', '.join(others)}")
+    return "\n".join(lines)
 
 
 def fly(flags: Flags, suite: Suite, ids: tuple[str, ...]) -> dict[str, Any]:

@@ -5,7 +5,8 @@
 ``fly`` flies it; ``measure`` turns the clean log into what sensors would have logged.
 """
 
-from benchmarks.hidden.draws import (
+from flytrack_bench.hidden import MOTIONS, Gust, Outside, Truth
+from flytrack_bench.hidden.draws import (
     EFFECTS,
     NAMES,
     draw_base,
@@ -17,7 +18,6 @@ from benchmarks.hidden.draws import (
     log_uniform,
     with_effects,
 )
-from benchmarks.hidden.flights import fly
-from benchmarks.hidden.noise import measure
-from benchmarks.hidden.outside import draw_outside
-from flytrack_bench.hidden import MOTIONS, Gust, Outside, Truth
+from flytrack_bench.hidden.flights import fly
+from flytrack_bench.hidden.noise import measure
+from flytrack_bench.hidden.outside import draw_outside

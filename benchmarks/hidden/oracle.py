@@ -13,9 +13,9 @@ import jax
 import numpy as np
 from scipy import optimize, signal
 
-from benchmarks.hidden.noise import DIGIT, STD
 from flytrack_bench.hidden import Truth
 from flytrack_bench.hidden.drone import SECONDS_PER_MINUTE
+from flytrack_bench.hidden.noise import DIGIT, STD
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid.diagnosis.model_selection import MAX_RIVALS, ablate_all
 from flytrack_sysid.inference.chunks import NUM_AXES, cut_chunks
@@ -46,7 +46,7 @@ class Known(NamedTuple):
 
 
 def true_noise(step_s: float) -> np.ndarray:
-    """Return the noise of ``benchmarks.hidden.noise`` as the diagnosis has it, (6, NUM_AXES)."""
+    """Return the sensors' true noise as the diagnosis has it, (6, NUM_AXES)."""
     # Attitude noise turns the thrust that is fed in: m/s of velocity in a second, as a random walk.
     wandered = STD["q"] * TURNED_MS2 * np.sqrt(step_s)
     direct = np.repeat([STD["w"], STD["f"], 1.0], [3, 3, 1])
@@ -191,7 +191,7 @@ def signal_to_noise(truth: Truth, log: FlightLog) -> float:
 
     The sensors are accelerometer, gyro and voltage.
 
-    The root of the sum of squared differences, each over the noise of ``benchmarks.hidden.noise``
+    The root of the sum of squared differences, each over the sensors' noise
     (voltage: over its resolution): by about how many standard deviations the effects are visible to
     an observer who knows their shape. Position, velocity and attitude are not used and would show
     more of some effects. Only what other lags and another thrust curve cannot explain counts. log:

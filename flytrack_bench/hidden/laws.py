@@ -1,4 +1,4 @@
-"""Laws outside the package's list (kinds: ``benchmarks.hidden.outside``), and random processes."""
+"""Laws outside the package's list (drawn in ``outside.py``), and random processes."""
 
 import math
 from collections.abc import Callable

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from benchmarks.diagnosis import Trial, model_of, plant
-from benchmarks.hidden import Truth, draw_base, draw_effect, draw_outside, fly, measure, pilot
+from benchmarks.hidden import Truth, draw_base, draw_effect, draw_outside, fly, measure
+from flytrack_bench.hidden import pilot
 from flytrack_env import load_model
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.effects import BY_NAME, LinearDrag

@@ -14,10 +14,10 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from benchmarks import hidden
-from benchmarks.hidden.noise import COLOURS, LOST_ROWS, STD
 from benchmarks.loop.plants import EFFECTS, draw_plant_with_law
 from flytrack_bench.hidden import HiddenDrone, HiddenPlant, Start, drone
 from flytrack_bench.hidden.laws import STATELESS_KINDS
+from flytrack_bench.hidden.noise import COLOURS, LOST_ROWS, STD
 from flytrack_env import nominal_parameters
 from tests.support.hidden_flights import LOW_START, flown_in_floats, random_sticks, state_of
 from tests.support.simulated_flights import flown_by

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import hidden
 from benchmarks.diagnosis import model_of
-from benchmarks.hidden.flights import imu_readings
 from flytrack_bench.hidden import HiddenDrone
+from flytrack_bench.hidden.flights import imu_readings
 from flytrack_env import effects
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects.command_delay import STEPS_PER_DELAY

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from benchmarks.hidden.draws import log_uniform
 from flytrack_bench.hidden import DT_S, STICKS, HiddenDrone, Truth
+from flytrack_bench.hidden.draws import log_uniform
 from flytrack_bench.hidden.drone import Sticks
 from flytrack_bench.hidden.laws import FirstOrderNoise
 from flytrack_bench.hidden.vectors import Vector, norm, rotation, to_body, wrap_angle

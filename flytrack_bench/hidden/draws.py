@@ -1,7 +1,7 @@
 """How plants with hidden effects are drawn.
 
 Each effect is drawn by its **size**, log-uniform between what a flight of a minute barely shows
-under the noise of ``benchmarks.hidden.noise`` and what cannot be missed. ``EFFECTS`` gives the
+under the noise of ``flytrack_bench.hidden.noise`` and what cannot be missed. ``EFFECTS`` gives the
 sizes with their units.
 """
 

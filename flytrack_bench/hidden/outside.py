@@ -25,8 +25,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.hidden.draws import direction, log_uniform
 from flytrack_bench.hidden import Outside
+from flytrack_bench.hidden.draws import direction, log_uniform
 from flytrack_bench.hidden.laws import HEADING_ORDERS, heading_waves
 
 SMALLEST, LARGEST = 0.3, 3.0  # amplitudes that are drawn

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from benchmarks.hidden.pilot import Pilot, plan
 from flytrack_bench.hidden import DT_S, HiddenDrone, Start, Truth
 from flytrack_bench.hidden.drone import SAME_S
+from flytrack_bench.hidden.pilot import Pilot, plan
 from flytrack_sysid.log import FlightLog
 
 FLOOR_M, FASTEST = 0.1, 20.0  # m, m/s: the envelope of a flight
