@@ -11,6 +11,7 @@ from benchmarks.check import is_same
 from benchmarks.seams.faults import FAULTS, Change, inject
 from benchmarks.seams.flight import make_flight
 from benchmarks.seams.simulators import SIMULATORS
+from flytrack_bench.misspec import load_log_suite
 from flytrack_env import blackbox
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid import collect
@@ -559,3 +560,9 @@ def test_stuck_axis_is_said(flights):
 def test_the_log_of_the_readme_contradicts_nothing():
     log = collect(blackbox.load(blackbox.SHIPPED), minutes=2.0, seed=0, noise=1.0)
     assert not check_log(log).explanations
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("log_id", ["14", "22"])  # coloured and heavy-tailed noise
+def test_a_right_log_in_other_noise_contradicts_nothing(log_id):
+    assert not check_log(load_log_suite("misspec-v1").plant(log_id).log).explanations
