@@ -192,13 +192,6 @@ def compare(lines: Sequence[Line]) -> list[Any]:
     """Return a row of the page: how alike the flights of a craft are."""
     pairs = pairs_of(lines)
     values = [is_alike for _, is_alike in compare_values(pairs)]
-    halves = [
-        1e3 * float(np.median([0.5 * (one[2] - one[1]) for one in of_stick])) if of_stick else None
-        for of_stick in (
-            [line["half_responses_s"][stick] for line in lines if stick in line["half_responses_s"]]
-            for stick in STICKS
-        )
-    ]
     same = [set(one["causes"]) == set(other["causes"]) for one, other in pairs]
     same_class = [is_same_class(one, other) for one, other in pairs]
     no_contradiction = [agree(one, other) for one, other in pairs]
@@ -208,8 +201,23 @@ def compare(lines: Sequence[Line]) -> list[Any]:
         f"{sum(same_class)} of {len(pairs)}",
         f"{sum(no_contradiction)} of {len(pairs)}",
         f"{sum(values)} of {len(values)}",
-        *("none" if half is None else f"± {half:.1f}" for half in halves),
+        *(half_responses(lines, stick) for stick in STICKS),
     ]
+
+
+def half_responses(lines: Sequence[Line], stick: str) -> str:
+    """Return the median half-width of a stick's times to half response, and pairs that overlap."""
+    known = [line for line in lines if stick in line["half_responses_s"]]
+    intervals = [line["half_responses_s"][stick] for line in known]
+    if not intervals:
+        return "none"
+    half_ms = 1e3 * float(np.median([0.5 * (one[2] - one[1]) for one in intervals]))
+    pairs = pairs_of(known)
+    alike = sum(
+        overlaps(one["half_responses_s"][stick], other["half_responses_s"][stick])
+        for one, other in pairs
+    )
+    return f"± {half_ms:.1f}; {alike} of {len(pairs)}"
 
 
 def is_in_class(line: Line) -> bool:

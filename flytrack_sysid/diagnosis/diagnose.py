@@ -313,7 +313,11 @@ def judged_by_flights(
     judge effects again that held-out single steps contradict.
     """
     held_out = (CONTRADICTED, EXPLAINED_BY_CHANGE)
-    doubted = [name for name, veto in rejected.items() if veto in held_out]
+    doubted = [
+        name
+        for name, veto in rejected.items()
+        if veto in held_out and name not in selection.model.effects
+    ]
     if doubted and selection.unexplained.flagged:
         tried = with_effects(selection, doubted)
         refined = refined_by_prediction(tried, parts, doubted)

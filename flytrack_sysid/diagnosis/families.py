@@ -1,8 +1,9 @@
 """Families of laws that give the same response to the sticks.
 
 A response that a model lacks only in part can be put together from several laws. While something in
-it is unexplained, the laws of a family trade places: flights of one craft had other names and the
-same times to half response (``benchmarks.repeatability``). A name then stands for its family.
+it is unexplained, the laws of a family trade places: flights of one craft had other names, while
+times to half response mostly agreed (``benchmarks.repeatability``). A name then stands for its
+family.
 """
 
 from collections.abc import Iterable

@@ -383,7 +383,7 @@ def reduced(selection: Selection, refined: Refined) -> Selection:
     """Return the selection with only the effects that a refinement kept; the base if it kept none.
 
     If no kept effect was fitted to flights, as with effects of sensors that flights do not contain,
-    single steps decide. The base alone stands where it predicts flights better.
+    single steps decide.
     """
     model = selection.model
     if refined.fit is not None:

@@ -133,7 +133,7 @@ def _families(diagnosis: Diagnosis) -> str:
         return ""
     others = [name for cause in diagnosis.causes for name in cause.family if name not in names]
     listed = list_words(list(dict.fromkeys(others)))
-    times = " The times to half of it hold." if diagnosis.half_response_s else ""
+    times = " Times to half of it repeat better." if diagnosis.half_response_s else ""
     return (
         f"While something in the response to the commands is unexplained, {list_words(names)} may "
         f"stand for other laws of it ({listed}), which another flight may show.{times}"
