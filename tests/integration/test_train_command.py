@@ -29,14 +29,14 @@ def call(*arguments):
 def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
     path = tmp_path / "run.toml"
     path.write_text("total_timesteps = 2e7\nlearning_rate = 1e-3\nhidden_sizes = [32, 32]\n")
-    settings, _ = read(
+    settings, *_ = read(
         "--config", path, "--learning-rate", 2e-3, "--no-affine-shuffle", "--num-envs", 512
     )
     expected = Config(
         20_000_000, 512, learning_rate=2e-3, hidden_sizes=(32, 32), affine_shuffle=False
     )
     assert settings.hyperparameters == expected
-    settings, _ = read("--total-timesteps", "4e6", "--hidden-sizes", 8, 8, "--reward", "progress=2")
+    settings, *_ = read("--total-timesteps", "4e6", "--hidden-sizes", 8, 8, "--reward", "progress=2")
     assert settings.hyperparameters == Config(4_000_000, hidden_sizes=(8, 8))
     assert train_ppo.parse_rewards(settings.reward) == {"progress": 2.0}
 
@@ -46,7 +46,7 @@ def test_a_device_chooses_the_recipe_and_must_be_there(monkeypatch, whole, capsy
     assert call("--device", "gpu") == 2
     assert "--device: found JAX on the cpu, expected gpu" in capsys.readouterr().err
     monkeypatch.setattr(train_ppo.jax, "default_backend", lambda: "gpu")
-    settings, _ = read("--device", "gpu", "--num-minibatches", 64)
+    settings, *_ = read("--device", "gpu", "--num-minibatches", 64)
     assert settings.hyperparameters == replace(RECIPES["gpu"], num_minibatches=64)
     assert read("--device", "gpu", "--resume", whole[0])[0].hyperparameters == CONFIG
 
@@ -65,7 +65,7 @@ def test_what_does_not_fit_a_run_is_refused(
 
 
 def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole):
-    settings, start = read("--resume", whole[0], "--evaluate-every", 5)
+    settings, start, _ = read("--resume", whole[0], "--evaluate-every", 5)
     assert settings.hyperparameters == CONFIG and settings.env_id == ENV_ID
     assert (settings.seed, start.path) == (SEED, whole[0] / "final.safetensors")
     assert settings.run.evaluate_every == 5
