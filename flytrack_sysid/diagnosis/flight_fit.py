@@ -110,6 +110,19 @@ class Target(NamedTuple):
         losses = self.losses(vector) + 2.0 * (by_block * moved).sum(axis=1)
         return Fit(vector, tuple(indices), covariance, np.sqrt(variances), losses)
 
+    def nearer_nominal(self, fit: Fit, field: str) -> Fit:
+        """Return a fit with a parameter as near to nominal as changes no flight.
+
+        At a bound, a parameter may have gone on without effect: a delay of yaw that is shorter than
+        the others' by more than these are long, say.
+        """
+        vectors = np.repeat(fit.vector[None], BATCH, axis=0)
+        index = self.problem.names.index(field)
+        vectors[:, index] = np.linspace(self.problem.start[index], fit.vector[index], BATCH)
+        residuals = self.residuals(vectors)
+        changes = np.abs(residuals - residuals[-1]).max(axis=(1, 2)) > 0.0
+        return fit._replace(vector=vectors[np.flatnonzero(changes).max(initial=-1) + 1])
+
     def losses(self, vector: np.ndarray) -> np.ndarray:
         """Return the cost of each block of windows, (blocks,)."""
         return self.windows.sums_by_block(huber_loss(self.residuals(vector[None])[0]))

@@ -311,6 +311,8 @@ class _Refinement(NamedTuple):
                 if sureness(self._losses(target, held) - self._losses(target, fit)) >= SURE:
                     break
                 fit, kept = held, others
+            for field in at_bounds(target.problem, fit.vector, kept[number].fields):
+                fit = target.nearer_nominal(fit, field)
         return fit, kept
 
     def _losses(self, target: Target, fit: Fit) -> np.ndarray:

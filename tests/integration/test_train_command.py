@@ -36,7 +36,9 @@ def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
         20_000_000, 512, learning_rate=2e-3, hidden_sizes=(32, 32), affine_shuffle=False
     )
     assert settings.hyperparameters == expected
-    settings, *_ = read("--total-timesteps", "4e6", "--hidden-sizes", 8, 8, "--reward", "progress=2")
+    settings, *_ = read(
+        "--total-timesteps", "4e6", "--hidden-sizes", 8, 8, "--reward", "progress=2"
+    )
     assert settings.hyperparameters == Config(4_000_000, hidden_sizes=(8, 8))
     assert train_ppo.parse_rewards(settings.reward) == {"progress": 2.0}
 

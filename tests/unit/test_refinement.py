@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
 from flytrack_sysid.diagnosis.flight_errors import FlightTest, errors_at, sample_windows
-from flytrack_sysid.diagnosis.flight_fit import Fit
+from flytrack_sysid.diagnosis.flight_fit import Fit, Target
 from flytrack_sysid.diagnosis.refinement import refine, superfluous
 from flytrack_sysid.inference.chunks import cut_chunks
 from flytrack_sysid.inference.free_flight import QUANTITIES
@@ -94,6 +94,20 @@ def test_doubted_effects_stay_only_where_flights_show_them(dragged):
         found = refine(SearchState(problem), base, model, log, rows, False, doubted)
     assert [one.effect for one in found.kept] == ["linear_drag"]
     assert found.removed == ("accelerometer_bias",)
+
+
+def test_what_changes_no_flight_at_a_bound_goes_back(dragged):
+    problem, flight_test = dragged[2], dragged[3].flight_test
+    fields = ("command_delay.delay_s", "command_delay.yaw_extra_s", "linear_drag.d_x")
+    vector = dragged[3].fit.vector.copy()
+    indices = problem.parameter_indices(fields)
+    vector[indices] = 0.01, problem.low[indices[1]], problem.high[indices[2]]
+    fit = dragged[3].fit._replace(vector=vector)
+    is_fitted = np.ones(flight_test.scale.shape, bool)
+    target = Target(problem, flight_test.windows, flight_test.scale, is_fitted)
+    with jax.enable_x64(True):
+        moved = [target.nearer_nominal(fit, field).vector for field in fields[1:]]
+    assert -0.02 < moved[0][indices[1]] <= -0.01 and moved[1][indices[2]] == vector[indices[2]]
 
 
 @pytest.mark.parametrize(
