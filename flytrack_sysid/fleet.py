@@ -35,6 +35,7 @@ MIN_FLIGHTS = 3
 MIN_NAMED, MAX_NAMED_ELSEWHERE = 0.75, 0.125  # shares of the flights with the cause, and without
 FLIGHTS_COMPARED = 4  # on either side: more cost more and tell little more
 DIAGNOSED, CONTRADICTS, UNREADABLE = "diagnosed", "contradicts", "unreadable"
+FAILED = "failed"  # a job without a result, which the next call runs again
 
 
 class FleetError(ValueError):
@@ -76,6 +77,7 @@ class Change:
         note: what ``notes.toml`` or the logs' settings say of the time between.
         has_ended: whether the causes end here instead of begin.
         causes: effects with their parameters; none where only a note is known.
+        failure: why flights after and before could not be compared; empty where they were.
     """
 
     craft: str
@@ -85,6 +87,7 @@ class Change:
     note: str
     has_ended: bool
     causes: dict[str, dict[str, Any]]
+    failure: str = ""
 
 
 class Place(NamedTuple):
@@ -277,17 +280,20 @@ class Store:
     def results(
         self, function: Callable[..., Any], jobs: dict[str, tuple[Any, ...]], report: Report
     ) -> dict[str, dict[str, Any]]:
-        """Return the result of each job by name; one that failed has a state and a reason."""
+        """Return the result of each job by name; one that failed has a state and a reason.
+
+        A result is what JSON makes of it, whether it is new or read.
+        """
         keys = {name: key_of(function, arguments) for name, arguments in jobs.items()}
         loaded = {name: self._load(name, key) for name, key in keys.items()}
         results = {name: result for name, result in loaded.items() if result is not None}
         missing = {name: arguments for name, arguments in jobs.items() if name not in results}
         report(len(results), len(jobs))
         for name, outcome in self.run(function, missing):
-            result = outcome.value or {"state": UNREADABLE, "reason": outcome.error}
-            content = {"key": keys[name], "name": name, **result}
-            write_atomically(self._path(name), (json.dumps(content) + "\n").encode())
-            results[name] = content
+            result = outcome.value or {"state": FAILED, "reason": outcome.error}
+            content = json.dumps({"key": keys[name], "name": name, **result})
+            write_atomically(self._path(name), f"{content}\n".encode())
+            results[name] = json.loads(content)
             report(len(results), len(jobs))
         return {name: results[name] for name in jobs}
 
@@ -299,7 +305,8 @@ class Store:
             content = json.loads(read_at_most(self._path(name), MAX_RESULT_BYTES))
         except (OSError, ValueError):
             return None
-        return content if isinstance(content, dict) and content.get("key") == key else None
+        is_it = isinstance(content, dict) and content.get("key") == key
+        return content if is_it and content.get("state") != FAILED else None
 
 
 def names_of(result: dict[str, Any]) -> set[str]:
@@ -390,12 +397,13 @@ def find_changes(
         own, first = place.flights, place.first
         diagnoses = [results[flight.name] for flight in own]
         causes = settle(place, list(map(names_of, diagnoses)), compared.get("causes", []))
+        failure = compared.get("reason", "")
         settings = describe_settings(*(one["settings"] for one in diagnoses[first - 1 : first + 1]))
         note = "; ".join(filter(None, (own[first].note, settings)))
-        if causes or (note and not place.has_ended):
+        if causes or failure or (note and not place.has_ended):
             before, since = (Path(own[index].path).name for index in (first - 1, first))
-            craft = own[0].craft
-            changes.append(Change(craft, first + 1, before, since, note, place.has_ended, causes))
+            place_of = (own[0].craft, first + 1, before, since, note, place.has_ended)
+            changes.append(Change(*place_of, causes, failure))
     return sorted(changes, key=lambda change: (natural(change.craft), change.flight))
 
 

@@ -156,7 +156,7 @@ def test_single_diagnoses_and_the_comparison_must_agree(tmp_path):
             yield name, Outcome({"causes": result_of(*effects)["diagnosis"]["causes"]})
 
     store = Store(tmp_path / "out", run)
-    changes = find_changes(flights, results, store, lambda done, total: None)
+    changes = find_changes(flights, results, store, silent)
     assert asked == [
         ("red/begun at flight6.npz", 4, 4),
         ("red/begun at flight9.npz", 2, 4),
@@ -170,8 +170,12 @@ def test_single_diagnoses_and_the_comparison_must_agree(tmp_path):
     assert "no cause begins with flight 9" in page
     assert "gyro_bias" not in page
     # A second call asks nothing again.
-    find_changes(flights, results, store, lambda done, total: None)
+    find_changes(flights, results, store, silent)
     assert len(asked) == 3
+
+
+def silent(done, total):
+    """Report nothing."""
 
 
 def test_results_are_kept_and_a_changed_log_is_done_again(tmp_path):
@@ -180,23 +184,37 @@ def test_results_are_kept_and_a_changed_log_is_done_again(tmp_path):
     def run(function, jobs):
         for name in jobs:
             calls.append(name)
-            yield (
-                name,
-                Outcome({"state": fleet.DIAGNOSED}) if len(calls) < 3 else Outcome(None, "no"),
-            )
+            yield name, Outcome({"state": fleet.DIAGNOSED, "settings": {"rates": (1, 2)}})
 
     results = partial(Store(tmp_path / "out", run).results, diagnose_flight)
     jobs = {"red/a.npz": (Flight("red", str(path)),)}
-    results(jobs, lambda done, total: None)
-    results(jobs, lambda done, total: None)
+    new = results(jobs, silent)
+    assert results(jobs, silent) == new  # lists in place of tuples in both
     assert calls == ["red/a.npz"]
     touched(path, "22")
-    results(jobs, lambda done, total: None)
+    results(jobs, silent)
     assert len(calls) == 2
-    touched(path, "333")
-    failed = results(jobs, lambda done, total: None)
-    assert failed["red/a.npz"]["reason"] == "no"
     assert not [one for one in Path(tmp_path / "out").rglob(".*") if one.is_file()]
+
+
+def test_a_failure_is_told_and_run_again_by_the_next_call(tmp_path):
+    flights = [Flight("red", str(tmp_path / f"{number}.npz")) for number in (1, 2, 3)]
+    flights[1] = flights[1]._replace(note="new motor")
+    outcomes = [Outcome(None, "it hung"), Outcome({"causes": []})]
+
+    def run(function, jobs):
+        for name in jobs:
+            yield name, outcomes.pop(0)
+
+    results = {flight.name: result_of() for flight in flights}
+    told = []
+    for _ in range(2):
+        told += find_changes(flights, results, Store(tmp_path / "out", run), silent)
+    assert [one.failure for one in told] == ["it hung", ""]
+    results["red/3.npz"] = {"state": fleet.FAILED, "reason": "it crashed"}
+    page = format_page(flights, results, told)
+    assert "unknown what begins with flight 2, 2.npz (before: 1.npz); the comparison failed" in page
+    assert "1 whose diagnosis failed" in page and "| red/3.npz | failed | it crashed |" in page
 
 
 @pytest.mark.slow
