@@ -7,6 +7,7 @@ with flights before (``diagnose_change``), and only what both say is told.
 
 import glob
 import json
+import os
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -18,7 +19,7 @@ from typing import Any, NamedTuple
 from flytrack_env import load_model
 from flytrack_env.files import open_file, read_at_most, write_atomically
 from flytrack_env.jobs import Outcome, run_jobs
-from flytrack_env.messages import error_text
+from flytrack_env.messages import error_text, quote_name
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
 from flytrack_sysid.diagnosis import diagnose, diagnose_change
 from flytrack_sysid.importing import import_log
@@ -29,6 +30,7 @@ from flytrack_sysid.plausibility import check_plausible
 
 MODEL, MAPPING, NOTES = "model.json", "mapping.toml", "notes.toml"
 OWN_FILES = (MODEL, MAPPING, NOTES)
+COPIED = "copied"  # below OUT: what URLs name
 MAX_RESULT_BYTES = 2**24
 # A change needs flights on both sides, as single diagnoses name what is not there now and then.
 MIN_FLIGHTS = 3
@@ -46,7 +48,7 @@ class Flight(NamedTuple):
     """A log of a fleet.
 
     Attributes:
-        craft: its name, which is that of the folder that holds the log.
+        craft: name of the folder that holds the log, with those above it where others are so called.
         path: of the log.
         model: path of the craft's model; None: the nominal one.
         mapping: path of the craft's mapping; None: none.
@@ -121,6 +123,7 @@ def fetch(url: str, cache: Path) -> Path:
     """Copy the folder of a URL, such as s3://bucket/logs, and return the copy.
 
     Raises:
+        FleetError: a name that leads out of the copy.
         ImportError, OSError: fsspec, or what it needs for the URL, is not installed or fails.
     """
     from flytrack_env.extras import check_installed
@@ -131,9 +134,13 @@ def fetch(url: str, cache: Path) -> Path:
     system, root = fsspec.core.url_to_fs(url)
     for remote in system.find(root):
         local = cache / str(remote).removeprefix(root.rstrip("/")).lstrip("/")
+        if not local.resolve().is_relative_to(cache.resolve()):
+            raise FleetError(f"{url}: {quote_name(str(remote))}: found a name that leads out of it")
         if not (local.exists() and local.stat().st_size == system.size(remote)):
             local.parent.mkdir(parents=True, exist_ok=True)
-            system.get(remote, str(local))
+            partly = local.with_name(f".{local.name}.part")
+            system.get(remote, str(partly))
+            os.replace(partly, local)
     return cache
 
 
@@ -149,8 +156,10 @@ def expand(paths: Iterable[Path], out: Path) -> list[Path]:
     """
     expanded: list[Path] = []
     for path in paths:
-        if url := re.fullmatch(r"(\w{2,}):/+(.+)", str(path)):  # a path has one of its two slashes
-            expanded.append(fetch(f"{url[1]}://{url[2]}", out / "copied" / Path(url[2]).name))
+        if parts := re.fullmatch(r"(\w{2,}):/+(.+)", str(path)):  # a path has one of its slashes
+            url = f"{parts[1]}://{'/' * (parts[1] == 'file')}{parts[2]}"
+            copy = out / COPIED / sha256(url.encode()).hexdigest()[:12] / path.name
+            expanded.append(fetch(url, copy))
             continue
         names = [path] if path.exists() else sorted(glob.glob(str(path), recursive=True))
         found = [Path(name) for name in names]
@@ -160,45 +169,56 @@ def expand(paths: Iterable[Path], out: Path) -> list[Path]:
     return expanded
 
 
-def find_flights(paths: Iterable[Path], model: Path | None) -> list[Flight]:
+def find_flights(
+    paths: Sequence[Path], model: Path | None, out: Path | None = None
+) -> list[Flight]:
     """Return the flights in folders and files, by craft and in the order of their names.
 
     Args:
         paths: folders, which are searched with their subfolders, and files.
         model: of craft whose folder has no ``model.json``; None: the nominal one.
+        out: folder of the fleet, whose own files are no logs.
 
     Raises:
         FleetError: no file, or notes that cannot be read.
     """
-    files: set[Path] = set()
+    by_folder: dict[Path, set[str]] = {}
     for path in paths:
-        files |= {path} if path.is_file() else {one for one in path.rglob("*") if one.is_file()}
-    by_folder: dict[Path, list[Path]] = {}
-    for file in files:
-        if file.name not in OWN_FILES and not file.name.startswith("."):
-            by_folder.setdefault(file.parent, []).append(file)
+        for file in [path] if path.is_file() else path.rglob("*"):
+            folder = file.parent.resolve()  # the file itself may be a link, as of git-annex
+            is_own = out is not None and folder.is_relative_to(out.resolve())
+            is_own &= not (out and folder.is_relative_to(out.resolve() / COPIED))
+            is_log = file.name not in OWN_FILES and not file.name.startswith(".")
+            if is_log and not is_own and file.is_file():
+                by_folder.setdefault(folder, set()).add(file.name)
     if not by_folder:
         found = ", ".join(map(str, paths))
         raise FleetError(f"{found}: found no file, expected a folder for each craft, with its logs")
-    names = {folder: folder.resolve().name for folder in by_folder}
     flights = []
     for folder in sorted(by_folder):
-        is_unique = list(names.values()).count(names[folder]) == 1
-        craft = names[folder] if is_unique else "/".join(folder.resolve().parts[-2:])
         own, mapping = folder / MODEL, folder / MAPPING
         model_path = own if own.exists() else model
         notes = _read_notes(folder / NOTES)
-        for file in sorted(by_folder[folder], key=lambda one: natural(one.name)):
+        for name in sorted(by_folder[folder], key=natural):
             flights.append(
                 Flight(
-                    craft,
-                    str(file.resolve()),
+                    _craft_of(folder, by_folder),
+                    str(folder / name),
                     None if model_path is None else str(model_path.resolve()),
-                    str(mapping.resolve()) if mapping.exists() else None,
-                    notes.get(file.name, ""),
+                    str(mapping) if mapping.exists() else None,
+                    notes.get(name, ""),
                 )
             )
     return flights
+
+
+def _craft_of(folder: Path, folders: Iterable[Path]) -> str:
+    """Return as many of the last parts of a folder's path as no other one has."""
+    for count in range(1, len(folder.parts) + 1):
+        parts = folder.parts[-count:]
+        if sum(other.parts[-count:] == parts for other in folders) == 1:
+            break
+    return "/".join(parts).lstrip("/")
 
 
 def _read_notes(path: Path) -> dict[str, str]:

@@ -79,13 +79,42 @@ def test_logs_are_sorted_into_craft_in_the_order_of_their_numbers(tmp_path):
     assert flights[1].model.endswith("red/model.json")
 
 
-def test_a_url_is_copied(tmp_path):
-    fsspec = pytest.importorskip("fsspec", reason="needs the extra cluster")
-    fsspec.filesystem("memory").pipe("/season/red/flight1.npz", b"1")
-    folders = expand([Path("memory://season")], tmp_path)
-    (flight,) = find_flights(folders, None)
-    assert flight.name == "red/flight1.npz"
-    assert Path(flight.path).read_bytes() == b"1"
+def test_every_log_has_a_name_of_its_own_and_results_are_no_logs(tmp_path):
+    for name in ("red/2026/logs/a.npz", "blue/2026/logs/a.npz", "green/a.npz", "out/logs/a.json"):
+        touched(tmp_path / name)
+    flights = find_flights([tmp_path, tmp_path / "red" / ".." / "red"], None, tmp_path / "out")
+    assert [flight.name for flight in flights] == [
+        "blue/2026/logs/a.npz",
+        "green/a.npz",
+        "red/2026/logs/a.npz",
+    ]
+
+
+@pytest.fixture
+def memory():
+    """A file system of fsspec in the memory, empty."""
+    system = pytest.importorskip("fsspec", reason="needs the extra cluster").filesystem("memory")
+    yield system
+    system.store.clear()
+
+
+def test_urls_are_copied_each_into_a_folder_of_its_own(tmp_path, memory):
+    for team in ("a", "b"):
+        memory.pipe(f"/{team}/season/red/flight1.npz", team.encode())
+    touched(tmp_path / "here" / "blue" / "flight1.npz", "c")
+    urls = ["memory://a/season", "memory://b/season", f"file://{tmp_path / 'here'}"]
+    out = tmp_path / "out"
+    flights = find_flights(expand(map(Path, urls), out), None, out)
+    assert sorted(Path(flight.path).read_bytes() for flight in flights) == [b"a", b"b", b"c"]
+    assert len({flight.name for flight in flights}) == 3
+    assert "blue/flight1.npz" in {flight.name for flight in flights}
+
+
+def test_a_name_that_leads_out_of_the_copy_is_refused(tmp_path, memory):
+    memory.pipe("/season/../../../../evil.txt", b"1")
+    with pytest.raises(FleetError, match=r"evil\.txt: found a name that leads out"):
+        expand([Path("memory://season")], tmp_path / "out")
+    assert not list(tmp_path.rglob("evil*"))
 
 
 def test_folders_that_are_no_fleet_are_refused(tmp_path):
