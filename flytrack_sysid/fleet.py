@@ -9,6 +9,7 @@ import glob
 import json
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -48,7 +49,7 @@ class Flight(NamedTuple):
     """A log of a fleet.
 
     Attributes:
-        craft: name of the folder that holds the log, with those above it where others are so called.
+        craft: name of the folder that holds the log, with those above where others have its name.
         path: of the log.
         model: path of the craft's model; None: the nominal one.
         mapping: path of the craft's mapping; None: none.
@@ -73,8 +74,8 @@ class Change:
 
     Attributes:
         craft: name.
-        flight: number of the first flight after the change, of the diagnosed ones, from 1.
-        before: file of the last flight before it.
+        flight: number of the first flight after the change, of all the craft's, from 1.
+        before: file of the last flight before it; empty for a note on the first.
         since: file of the first flight after it.
         note: what ``notes.toml`` or the logs' settings say of the time between.
         has_ended: whether the causes end here instead of begin.
@@ -180,7 +181,7 @@ def find_flights(
         out: folder of the fleet, whose own files are no logs.
 
     Raises:
-        FleetError: no file, or notes that cannot be read.
+        FleetError: no file, or notes that cannot be read or are on no file.
     """
     by_folder: dict[Path, set[str]] = {}
     for path in paths:
@@ -231,6 +232,8 @@ def _read_notes(path: Path) -> dict[str, str]:
     for name, text in notes.items():
         if not isinstance(text, str):
             raise FleetError(f'{path}: {name}: expected text, as in "flight12.bbl" = "new motor"')
+        if not (path.parent / name).is_file():
+            raise FleetError(f"{path}: {quote_name(name)}: found no such file beside it")
     return notes
 
 
@@ -404,14 +407,25 @@ def find_changes(
 ) -> list[Change]:
     """Return what changed on each craft, as comparisons and single diagnoses say alike."""
     by_craft: dict[str, list[Flight]] = {}
+    numbers, counts = {}, Counter[str]()
+    notes: dict[str, str] = {}  # by craft, of logs since the last one that was diagnosed
     for flight in flights:
+        counts[flight.craft] += 1
+        numbers[flight.name] = counts[flight.craft]
+        note = "; ".join(filter(None, (notes.pop(flight.craft, ""), flight.note)))
         if results[flight.name]["state"] == DIAGNOSED:
-            by_craft.setdefault(flight.craft, []).append(flight)
+            by_craft.setdefault(flight.craft, []).append(flight._replace(note=note))
+        else:
+            notes[flight.craft] = note
     places: dict[str, Place] = {}
     for own in by_craft.values():
         places |= {one.name: one for one in find_places(own, [results[f.name] for f in own])}
     jobs = {name: place.compared for name, place in places.items()}
-    changes = []
+    changes = [
+        Change(one.craft, numbers[one.name], "", Path(one.path).name, one.note, False, {})
+        for one, *_ in by_craft.values()
+        if one.note
+    ]
     for name, compared in store.results(compare_flights, jobs, report).items():
         place = places[name]
         own, first = place.flights, place.first
@@ -422,8 +436,9 @@ def find_changes(
         note = "; ".join(filter(None, (own[first].note, settings)))
         if causes or failure or (note and not place.has_ended):
             before, since = (Path(own[index].path).name for index in (first - 1, first))
-            place_of = (own[0].craft, first + 1, before, since, note, place.has_ended)
-            changes.append(Change(*place_of, causes, failure))
+            number = numbers[own[first].name]
+            where = (own[first].craft, number, before, since)
+            changes.append(Change(*where, note, place.has_ended, causes, failure))
     return sorted(changes, key=lambda change: (natural(change.craft), change.flight))
 
 

@@ -56,7 +56,8 @@ def describe_change(change: Change) -> str:
     ]
     what = "unknown what" if change.failure else " and ".join(values) or "no cause"
     verb = "ends" if change.has_ended else "begins"
-    text = f"{what} {verb} with flight {change.flight}, {change.since} (before: {change.before})"
+    before = change.before or "no diagnosed flight"
+    text = f"{what} {verb} with flight {change.flight}, {change.since} (before: {before})"
     text += f"; the comparison failed: {change.failure}" if change.failure else ""
     return f"{text}; noted: {change.note}" if change.note else text
 

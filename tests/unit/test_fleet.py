@@ -126,6 +126,9 @@ def test_folders_that_are_no_fleet_are_refused(tmp_path):
     touched(tmp_path / "red" / "notes.toml", "a = 3")
     with pytest.raises(FleetError, match=r"notes\.toml: a: expected text"):
         find_flights([tmp_path], None)
+    touched(tmp_path / "red" / "notes.toml", '"b.npz" = "new motor"')
+    with pytest.raises(FleetError, match=r"notes\.toml: b\.npz: found no such file"):
+        find_flights([tmp_path], None)
     with pytest.raises(ValueError, match="--workers: found 0, expected more than 0"):
         run_diagnose(Diagnose((tmp_path,), tmp_path, fleet=True, workers=0))
 
@@ -224,6 +227,26 @@ def test_results_are_kept_and_a_changed_log_is_done_again(tmp_path):
     results(jobs, silent)
     assert len(calls) == 2
     assert not [one for one in Path(tmp_path / "out").rglob(".*") if one.is_file()]
+
+
+def test_notes_move_to_the_next_diagnosed_flight_and_all_flights_count(tmp_path):
+    notes = {1: "new frame", 3: "new motor", 4: "new props"}
+    flights = [Flight("red", f"{n}.npz", note=notes.get(n, "")) for n in range(1, 6)]
+    results = {flight.name: result_of() for flight in flights}
+    results |= {f"red/{n}.npz": {"state": fleet.CONTRADICTS, "reason": "no"} for n in (1, 3)}
+
+    def run(function, jobs):
+        for name in jobs:
+            yield name, Outcome({"causes": []})
+
+    told = find_changes(flights, results, Store(tmp_path / "out", run), silent)
+    assert [(one.flight, one.before, one.note) for one in told] == [
+        (2, "", "new frame"),
+        (4, "2.npz", "new motor; new props"),
+    ]
+    assert "with flight 2, 2.npz (before: no diagnosed flight); noted: new frame" in format_page(
+        flights, results, told
+    )
 
 
 def test_a_failure_is_told_and_run_again_by_the_next_call(tmp_path):
