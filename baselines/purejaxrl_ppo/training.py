@@ -33,7 +33,7 @@ from baselines.purejaxrl_ppo.tracking import LOCAL, RUN_FILE, Tracker
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.files import locked_folder
 from flytrack_env.params import EnvParams
-from flytrack_env.progress import LineBar, progress_bar
+from flytrack_env.progress import progress_bar
 from flytrack_env.validation import convert
 
 Metrics = dict[str, np.ndarray]
@@ -335,8 +335,6 @@ class Run:
                 self._store(files.step_file(0))
             jax.block_until_ready(self.trainer.update(self.runner))  # compiles
             bar.set_description("train")
-            if isinstance(bar, LineBar):  # tqdm's clock would jump back
-                bar.unpause()
             while self.update < config.num_updates and not is_stopped:
                 self._advance()
                 is_stopped = devices.any_process(bool(signals))
