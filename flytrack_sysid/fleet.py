@@ -21,6 +21,7 @@ from flytrack_env import load_model
 from flytrack_env.files import open_file, read_at_most, write_atomically
 from flytrack_env.jobs import Outcome, run_jobs
 from flytrack_env.messages import error_text, quote_name
+from flytrack_env.sources import digest_of_sources
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
 from flytrack_sysid.diagnosis import diagnose, diagnose_change
 from flytrack_sysid.importing import import_log
@@ -273,11 +274,10 @@ def compare_flights(later: Sequence[Flight], earlier: Sequence[Flight]) -> dict[
 
 
 def key_of(function: Callable[..., Any], arguments: Any) -> str:
-    """Return what a stored result belongs to: arguments, the files that they name, the package."""
-    import flytrack_env
-
+    """Return what a stored result belongs to: arguments, the files that they name, the code."""
     flat = json.dumps(arguments, ensure_ascii=False)
-    digest = sha256(f"{function.__name__} {flat} {flytrack_env.__version__}".encode())
+    code = digest_of_sources("flytrack_env", "flytrack_sysid")
+    digest = sha256(f"{function.__name__} {flat} {code}".encode())
     for name in re.findall(r'"(/[^"]+)"', flat):
         if Path(name).is_file():
             with Path(name).open("rb") as file:

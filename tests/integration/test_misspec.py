@@ -131,6 +131,9 @@ def test_a_method_that_crashes_invents_or_ends_scores_zero_and_the_result_goes_o
     assert again == found  # nothing was left to ask
     with pytest.raises(AnswerError, match="method: found tests"):
         run_method(SHORT, ids, "benchmarks.misspec.rivals:nominal", out, 60.0)
+    out.write_text(json.dumps(found | {"code": "other"}))
+    with pytest.raises(AnswerError, match="code: found other"):
+        run_method(SHORT, ids, MOODY, out, 60.0)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 
 from flytrack.flags import Diagnose
 from flytrack.identification import run_diagnose
-from flytrack_env.jobs import ClusterError, Outcome, run_jobs
+from flytrack_env.jobs import ClusterError, Outcome, run_as_task, run_jobs
 from flytrack_sysid import collect, fleet, save_log
 from flytrack_sysid.fleet import (
     FleetError,
@@ -48,6 +48,11 @@ def test_a_cluster_that_is_none_is_refused():
     pytest.importorskip("ray", reason="needs the extra cluster")
     with pytest.raises(ClusterError, match=r"--address 127\.0\.0\.1:9: no Ray cluster"):
         list(run_jobs(end_as, {"a": ("a",)}, 9.0, "127.0.0.1:9"))
+
+
+def test_a_node_of_other_code_is_told():
+    outcome = run_as_task(end_as, ("a",), 9.0, "another")
+    assert outcome.value is None and outcome.error.endswith(", expected another")
 
 
 def touched(path, text=""):
