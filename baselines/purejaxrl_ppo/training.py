@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
+import tyro
 from jax.sharding import Mesh
 
 import flytrack_env
@@ -71,7 +72,7 @@ class Options(msgspec.Struct, frozen=True):
     """Noisy starts of an evaluation."""
     tracking_uri: str = ""
     """MLflow store; local: an SQLite file in OUT."""
-    parent_run: str = ""
+    parent_run: Annotated[str, tyro.conf.Suppress] = ""
     """Id of the MLflow run that this one is below, as of a sweep."""
 
 
