@@ -197,6 +197,8 @@ def test_flags_that_do_not_belong_together_are_refused(capsys, tmp_path):
     refused(capsys, "bench", "--suite", "v1", "--method", MOODY)
     refused(capsys, "bench", "--suite", "misspec-v1")
     refused(capsys, "bench")
+    refused(capsys, "bench", "--policy", "champion", "--limit-s", "9")
+    refused(capsys, "bench", "--suite", "misspec-v1", "--method", MOODY, "--address", "local")
     refused(capsys, "bench", "--suite", "misspec-v1", "--method", MOODY, "--policy", "champion")
     with pytest.raises(SuiteError, match="found '60', expected some of 00 to 59"):
         SUITE.chosen(("60",))
