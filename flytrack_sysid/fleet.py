@@ -252,7 +252,12 @@ def read_flight(flight: Flight) -> tuple[FlightLog, dict[str, Any]]:
 
 
 def diagnose_flight(flight: Flight) -> dict[str, Any]:
-    """Return the state of a log, and its check or diagnosis, as JSON values."""
+    """Return the state of a log, and its check or diagnosis, as JSON values.
+
+    Raises:
+        OSError: no such file, as on a node that does not see it; it may see it in the next call.
+    """
+    Path(flight.path).stat()
     try:
         log, settings = read_flight(flight)
     except (LogError, OSError) as error:

@@ -144,6 +144,8 @@ def test_a_log_that_is_none_says_why(tmp_path):
     assert "readme.txt: found text, expected a flight log" in text["reason"]
     cut = diagnose_flight(Flight("red", str(touched(tmp_path / "cut.npz", "PK"))))
     assert "cut.npz" in cut["reason"]
+    with pytest.raises(FileNotFoundError):  # not a result that is kept
+        diagnose_flight(Flight("red", str(tmp_path / "gone.npz")))
 
 
 @pytest.mark.parametrize(
