@@ -1,13 +1,12 @@
 """Beyond one machine: ``python -m benchmarks.scaling --part devices|fleet|...|page``.
 
 ``devices`` trains on one device, on several, and in two processes. ``fleet`` flies craft whose
-equations share nothing with the package (benchmarks.hidden), and lets the fleet's diagnosis say
-which cause began when. ``sweep_on_cluster`` and ``fleet_on_cluster`` kill a node of a simulated Ray
-cluster. ``overhead`` compares Ray with a plain loop. Each appends its record to
-docs/results/scaling.jsonl; ``page`` writes docs/results/scaling.md from the last of each.
+equations share no code with the package (benchmarks.hidden), and lets the fleet's diagnosis say
+which cause began when. ``fleet_on_cluster`` kills a node of a simulated Ray cluster. ``overhead``
+compares Ray with a plain loop. Each appends its record to docs/results/scaling.jsonl; ``page``
+writes docs/results/scaling.md from the last of each.
 """
 
-import csv
 import logging
 import math
 import os
@@ -30,8 +29,6 @@ from jax.extend.backend import clear_backends
 from baselines.purejaxrl_ppo import Config, devices, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import as_named_arrays
 from baselines.purejaxrl_ppo.config import RECIPES
-from baselines.purejaxrl_ppo.sweep import TABLE, Flags, run_sweep
-from baselines.purejaxrl_ppo.tracking import EXPERIMENT, local_uri
 from baselines.purejaxrl_ppo.training import Trainer
 from benchmarks import hidden
 from benchmarks.diagnosis import model_of
@@ -60,7 +57,7 @@ SEED = 61  # no rule was made on it
 BEGINS_IN = 12  # flight
 WITH_CAUSE = 3  # craft
 LIMIT_S = 900.0
-PARTS = ("devices", "rounding", "fleet", "sweep_on_cluster", "fleet_on_cluster", "overhead")
+PARTS = ("devices", "rounding", "fleet", "fleet_on_cluster", "overhead")
 JOB_S, JOBS = 10.0, 8
 # On paper: docs/results/gpu.md, recipe gpu on an H200; numbers of a row beside the observation; and
 # what is assumed, a network card of 400 Gbit/s for each GPU and 50 us for a message between them.
@@ -70,15 +67,7 @@ DEVICES, COMPARED = (1, 2, 4), 20  # updates
 CHANGES = (1e-7, 2e-7, -1e-7, -2e-7)  # one or two of a float32's last bits
 # 160 gradient steps in 20 updates.
 FEW = Config(total_timesteps=COMPARED * 64 * 32, num_envs=64, num_steps=32, num_minibatches=8)
-TRIALS, CLUSTER_CRAFT = 12, 4
-SETTINGS = """total_timesteps = 49152
-num_envs = 64
-num_steps = 16
-num_minibatches = 4
-hidden_sizes = [8]
-[learning_rate]
-loguniform = [1e-4, 1e-2]
-"""
+CLUSTER_CRAFT = 4
 
 
 def draw_craft(rng: np.random.Generator, has_cause: bool) -> tuple[hidden.Truth, hidden.Truth]:
@@ -300,35 +289,6 @@ def losing_a_node(has_begun: Callable[[], bool]) -> Iterator[list[float]]:
         cluster.shutdown()
 
 
-def run_cluster_sweep(trials: int, seed: int) -> dict[str, Any]:
-    """Return what became of the trials of a sweep, a node of which was killed."""
-    out = RUNS / f"sweep{seed}"
-    shutil.rmtree(out, ignore_errors=True)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    settings = out.with_suffix(".toml")
-    settings.write_text(SETTINGS)
-    finals = out.glob
-    with losing_a_node(lambda: len(list(finals("trial*/final.safetensors"))) >= 2) as lost:
-        run_sweep(Flags(settings, trials=trials, out=out, seed=seed, address="auto"))
-    from mlflow import MlflowClient
-
-    client = MlflowClient(tracking_uri=local_uri(out))
-    experiment: Any = client.get_experiment_by_name(EXPERIMENT)
-    runs = client.search_runs([experiment.experiment_id])
-    with (out / TABLE).open() as file:
-        rows = list(csv.DictReader(file))
-    return {
-        "trials": trials,
-        "seed": seed,
-        "nodes_lost": len(lost),
-        "rows": len(rows),
-        "different_trials": len({row["trial_id"] for row in rows}),
-        "complete": len(list(finals("trial*/final.safetensors"))),
-        "runs_below": sum("mlflow.parentRunId" in run.data.tags for run in runs),
-        "runs_open": sum(run.info.status == "RUNNING" for run in runs),
-    }
-
-
 def run_cluster_fleet(flights: int, seconds: float, seed: int) -> dict[str, Any]:
     """Return what became of the logs of a fleet, a node of which was killed."""
     folder, out = RUNS / f"short{seed}", RUNS / f"cluster{seed}"
@@ -447,11 +407,6 @@ def figures() -> Iterator[Figure]:
         yield Figure(title, "0", str(one["single_wrong"]), one["craft"] * one["flights"])
         title = "its logs that the check refuses, of logs that nothing is wrong with"
         yield Figure(title, "0", str(one["single_refused"]), one["craft"] * one["flights"])
-    if one := last_of("sweep_on_cluster"):
-        text = f"{one['different_trials']} of {one['trials']}, {one['runs_below']} MLflow runs"
-        yield Figure(
-            "sweep, a node of three killed: trials present once", "12", text, one["trials"]
-        )
     if one := last_of("fleet_on_cluster"):
         text = f"{one['files']} of {one['logs']}, {one['diagnosed']} diagnosed"
         yield Figure("fleet, a node of three killed: logs present once", "all", text, one["logs"])
@@ -483,7 +438,6 @@ def write_results() -> None:
         told="; ".join(told) or "nothing",
         commits=commits,
         machine=source.get("machine", ""),
-        missing=", ".join(part for part in PARTS if last_of(part) is None) or "nothing",
         seed=SEED,
         seconds=fleet.get("seconds", ""),
         **values,
@@ -492,9 +446,7 @@ def write_results() -> None:
 
 
 def main(
-    part: Literal[
-        "devices", "rounding", "fleet", "sweep_on_cluster", "fleet_on_cluster", "overhead", "page"
-    ],
+    part: Literal["devices", "rounding", "fleet", "fleet_on_cluster", "overhead", "page"],
     craft: int = 8,
     flights: int = 15,
     seconds: float = 20.0,
@@ -517,7 +469,6 @@ def main(
         "devices": lambda: run_devices(updates, seed),
         "rounding": lambda: run_rounding(updates, seed),
         "fleet": lambda: run_fleet(craft, flights, seconds, seed, workers),
-        "sweep_on_cluster": lambda: run_cluster_sweep(TRIALS, seed),
         "fleet_on_cluster": lambda: run_cluster_fleet(flights, seconds, seed),
         "overhead": lambda: run_overhead(JOBS),
     }

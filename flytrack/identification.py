@@ -252,7 +252,7 @@ def run_fleet(flags: Diagnose) -> None:
     for name, value in (("--workers", flags.workers), ("--limit", flags.limit)):
         if not value > 0:
             raise ValueError(f"{name}: found {value:g}, expected more than 0")
-    flights = find_flights(expand(flags.logs, flags.out), flags.model)
+    flights = find_flights(expand(flags.logs, flags.out), flags.model, flags.out)
     bars: list[ProgressBar] = []
 
     def report(done: int, total: int) -> None:

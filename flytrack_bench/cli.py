@@ -3,6 +3,7 @@
 import hashlib
 import json
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -69,6 +70,8 @@ def run_bench(flags: Flags) -> int:
         raise ValueError(f"--suite: found {flags.suite}, expected one of logs for --method")
     if not flags.policy:
         raise ValueError(f"--policy: missing, expected a policy for the suite {flags.suite}")
+    if flags.limit_s != LIMIT_S:
+        raise ValueError(f"--limit-s: found with {flags.suite}, expected --method beside it")
     return 0 if (bench(flags) if flags.verify is None else verify(flags)) else 1
 
 
@@ -76,7 +79,7 @@ def name_errors(flags: Flags) -> None:
     """Show a method the logs, print and write the result."""
     if flags.method is None:
         raise ValueError(f"--method: missing, expected one for the suite of logs {flags.suite}")
-    for name in ("policy", "adapt", "verify"):
+    for name in ("policy", "adapt", "verify", "address"):
         if getattr(flags, name):
             raise ValueError(f"--{name}: found with {flags.suite}, expected --method alone")
     suite = load_log_suite(flags.suite)
@@ -130,7 +133,13 @@ def fly_on_cluster(
     Raises:
         ClusterError: no such cluster, or a task that failed on it.
     """
-    of_job = replace(flags, address=None, verify=None)
+    of_job = replace(
+        flags,
+        address=None,
+        verify=None,
+        policy=tuple(map(absolute, flags.policy)),  # a job has a folder of its own
+        suite=absolute(flags.suite) if flags.suite.endswith(".json") else flags.suite,
+    )
     jobs = {name: (of_job, name) for name in ids}
     results: dict[str, dict[str, Any]] = {}
     bar = ProgressBar("tasks")
@@ -142,6 +151,11 @@ def fly_on_cluster(
     flown = {name: results[name]["tasks"][name] for name in ids}
     cpu_s = sum(result["cpu_s"] for result in results.values())
     return summarize(suite, policies, flown, results[ids[0]]["regime"], cpu_s)
+
+
+def absolute(where: str) -> str:
+    """Return the whole path of a file, and any other name as it is."""
+    return str(Path(where).resolve()) if Path(where).is_file() else where
 
 
 def fly_job(flags: Flags, task: str) -> dict[str, Any]:

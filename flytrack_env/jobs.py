@@ -10,12 +10,12 @@ import queue
 import socket
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from importlib.metadata import version
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
 from flytrack_env.extras import check_installed
 from flytrack_env.messages import error_text
+from flytrack_env.sources import digest_of_sources
 
 Function = Callable[..., Any]
 KILL_AFTER_S, CONNECT_S = 5.0, 10.0
@@ -144,9 +144,9 @@ def run_as_task(
     function: Function, arguments: tuple[Any, ...], limit_s: float, expected: str
 ) -> Outcome:
     """Return the outcome of a job in a process below a Ray worker's, which a crash spares."""
-    if expected != (found := version("flytrack")):
+    if expected != (found := digest_of_sources()):
         node = socket.gethostname()
-        return Outcome(None, f"node {node}: found FlyTrack {found}, expected {expected}")
+        return Outcome(None, f"node {node}: found FlyTrack of code {found}, expected {expected}")
     if not _workers:
         _workers.append(Worker())
     return _workers[0].call(function, arguments, limit_s)
@@ -193,7 +193,7 @@ def _run_on_cluster(
         # A lost node costs a retry; a crash of the job itself does not reach Ray.
         task = ray.remote(num_cpus=1, max_retries=-1)(run_as_task)
         names = {
-            task.options(name=name).remote(function, arguments, limit_s, version("flytrack")): name
+            task.options(name=name).remote(function, arguments, limit_s, digest_of_sources()): name
             for name, arguments in jobs.items()
         }
         waiting = list(names)

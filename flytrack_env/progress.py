@@ -28,8 +28,9 @@ class LineBar:
         total: how much is to be done; None if nothing is counted.
         initial: how much was done before.
         desc: what is done.
-        is_large: numbers are written with k and M.
+        unit_scale: numbers are written with k and M.
         stream: of the lines.
+        disable: nothing is written, but what ``write`` is given.
     """
 
     def __init__(
@@ -38,13 +39,16 @@ class LineBar:
         total: int | None = None,
         initial: int = 0,
         desc: str = "",
-        is_large: bool = False,
+        unit_scale: bool = False,
         stream: TextIO | None = None,
+        disable: bool = False,
     ):
         self.unit, self.total, self.n, self.desc = unit, total, initial, desc
-        self._is_large, self._stream, self._postfix = is_large, stream or sys.stderr, ""
+        self._is_large, self._stream, self._postfix = unit_scale, stream or sys.stderr, ""
         self._began_s = self._counted_from_s = time.monotonic()
         self._initial, self._written, self._is_closed = initial, "", threading.Event()
+        if disable:
+            self._is_closed.set()
         # A bar that is dropped without an end, as by an error, must not go on writing.
         beat = threading.Thread(
             target=_write_lines, args=(weakref.ref(self), self._is_closed), daemon=True
@@ -55,13 +59,10 @@ class LineBar:
         """Count what was done."""
         self.n += count
 
-    def unpause(self) -> None:
-        """Leave what has passed out of the time left: it was no work of the kind that counts."""
-        self._counted_from_s = time.monotonic()
-
     def set_description(self, desc: str) -> None:
-        """Change what is done."""
+        """Change what is done; what has passed is left out of the time left."""
         self.desc = desc
+        self._counted_from_s = time.monotonic()
 
     def set_postfix_str(self, text: str, refresh: bool = True) -> None:
         """Change what stands behind the numbers."""
@@ -123,12 +124,12 @@ def progress_bar(unit: str, total: int | None = None, **options: Any) -> Any:
     Args:
         unit: what is counted.
         total: how much is to be done.
-        options: of tqdm: ``initial``, ``desc``, ``leave`` and ``unit_scale``.
+        options: of tqdm: ``initial``, ``desc``, ``leave``, ``unit_scale`` and ``disable``.
     """
     if sys.stderr.isatty():
         return tqdm(unit=f" {unit}", total=total, **options)
-    initial, desc = options.get("initial", 0), options.get("desc", "")
-    return LineBar(unit, total, initial, desc, options.get("unit_scale", False))
+    options.pop("leave", None)  # lines stay
+    return LineBar(unit, total, **options)
 
 
 @contextmanager

@@ -7,7 +7,9 @@ with flights before (``diagnose_change``), and only what both say is told.
 
 import glob
 import json
+import os
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -18,7 +20,8 @@ from typing import Any, NamedTuple
 from flytrack_env import load_model
 from flytrack_env.files import open_file, read_at_most, write_atomically
 from flytrack_env.jobs import Outcome, run_jobs
-from flytrack_env.messages import error_text
+from flytrack_env.messages import error_text, quote_name
+from flytrack_env.sources import digest_of_sources
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
 from flytrack_sysid.diagnosis import diagnose, diagnose_change
 from flytrack_sysid.importing import import_log
@@ -29,12 +32,14 @@ from flytrack_sysid.plausibility import check_plausible
 
 MODEL, MAPPING, NOTES = "model.json", "mapping.toml", "notes.toml"
 OWN_FILES = (MODEL, MAPPING, NOTES)
+COPIED = "copied"  # below OUT: what URLs name
 MAX_RESULT_BYTES = 2**24
 # A change needs flights on both sides, as single diagnoses name what is not there now and then.
 MIN_FLIGHTS = 3
 MIN_NAMED, MAX_NAMED_ELSEWHERE = 0.75, 0.125  # shares of the flights with the cause, and without
 FLIGHTS_COMPARED = 4  # on either side: more cost more and tell little more
 DIAGNOSED, CONTRADICTS, UNREADABLE = "diagnosed", "contradicts", "unreadable"
+FAILED = "failed"  # a job without a result, which the next call runs again
 
 
 class FleetError(ValueError):
@@ -45,7 +50,7 @@ class Flight(NamedTuple):
     """A log of a fleet.
 
     Attributes:
-        craft: its name, which is that of the folder that holds the log.
+        craft: name of the folder that holds the log, with those above where others have its name.
         path: of the log.
         model: path of the craft's model; None: the nominal one.
         mapping: path of the craft's mapping; None: none.
@@ -70,12 +75,13 @@ class Change:
 
     Attributes:
         craft: name.
-        flight: number of the first flight after the change, of the diagnosed ones, from 1.
-        before: file of the last flight before it.
+        flight: number of the first flight after the change, of all the craft's, from 1.
+        before: file of the last flight before it; empty for a note on the first.
         since: file of the first flight after it.
         note: what ``notes.toml`` or the logs' settings say of the time between.
         has_ended: whether the causes end here instead of begin.
         causes: effects with their parameters; none where only a note is known.
+        failure: why flights after and before could not be compared; empty where they were.
     """
 
     craft: str
@@ -85,6 +91,7 @@ class Change:
     note: str
     has_ended: bool
     causes: dict[str, dict[str, Any]]
+    failure: str = ""
 
 
 class Place(NamedTuple):
@@ -118,6 +125,7 @@ def fetch(url: str, cache: Path) -> Path:
     """Copy the folder of a URL, such as s3://bucket/logs, and return the copy.
 
     Raises:
+        FleetError: a name that leads out of the copy.
         ImportError, OSError: fsspec, or what it needs for the URL, is not installed or fails.
     """
     from flytrack_env.extras import check_installed
@@ -128,9 +136,13 @@ def fetch(url: str, cache: Path) -> Path:
     system, root = fsspec.core.url_to_fs(url)
     for remote in system.find(root):
         local = cache / str(remote).removeprefix(root.rstrip("/")).lstrip("/")
+        if not local.resolve().is_relative_to(cache.resolve()):
+            raise FleetError(f"{url}: {quote_name(str(remote))}: found a name that leads out of it")
         if not (local.exists() and local.stat().st_size == system.size(remote)):
             local.parent.mkdir(parents=True, exist_ok=True)
-            system.get(remote, str(local))
+            partly = local.with_name(f".{local.name}.part")
+            system.get(remote, str(partly))
+            os.replace(partly, local)
     return cache
 
 
@@ -146,8 +158,10 @@ def expand(paths: Iterable[Path], out: Path) -> list[Path]:
     """
     expanded: list[Path] = []
     for path in paths:
-        if url := re.fullmatch(r"(\w{2,}):/+(.+)", str(path)):  # a path has one of its two slashes
-            expanded.append(fetch(f"{url[1]}://{url[2]}", out / "copied" / Path(url[2]).name))
+        if parts := re.fullmatch(r"(\w{2,}):/+(.+)", str(path)):  # a path has one of its slashes
+            url = f"{parts[1]}://{'/' * (parts[1] == 'file')}{parts[2]}"
+            copy = out / COPIED / sha256(url.encode()).hexdigest()[:12] / path.name
+            expanded.append(fetch(url, copy))
             continue
         names = [path] if path.exists() else sorted(glob.glob(str(path), recursive=True))
         found = [Path(name) for name in names]
@@ -157,45 +171,56 @@ def expand(paths: Iterable[Path], out: Path) -> list[Path]:
     return expanded
 
 
-def find_flights(paths: Iterable[Path], model: Path | None) -> list[Flight]:
+def find_flights(
+    paths: Sequence[Path], model: Path | None, out: Path | None = None
+) -> list[Flight]:
     """Return the flights in folders and files, by craft and in the order of their names.
 
     Args:
         paths: folders, which are searched with their subfolders, and files.
         model: of craft whose folder has no ``model.json``; None: the nominal one.
+        out: folder of the fleet, whose own files are no logs.
 
     Raises:
-        FleetError: no file, or notes that cannot be read.
+        FleetError: no file, or notes that cannot be read or are on no file.
     """
-    files: set[Path] = set()
+    by_folder: dict[Path, set[str]] = {}
     for path in paths:
-        files |= {path} if path.is_file() else {one for one in path.rglob("*") if one.is_file()}
-    by_folder: dict[Path, list[Path]] = {}
-    for file in files:
-        if file.name not in OWN_FILES and not file.name.startswith("."):
-            by_folder.setdefault(file.parent, []).append(file)
+        for file in [path] if path.is_file() else path.rglob("*"):
+            folder = file.parent.resolve()  # the file itself may be a link, as of git-annex
+            is_own = out is not None and folder.is_relative_to(out.resolve())
+            is_own &= not (out and folder.is_relative_to(out.resolve() / COPIED))
+            is_log = file.name not in OWN_FILES and not file.name.startswith(".")
+            if is_log and not is_own and file.is_file():
+                by_folder.setdefault(folder, set()).add(file.name)
     if not by_folder:
         found = ", ".join(map(str, paths))
         raise FleetError(f"{found}: found no file, expected a folder for each craft, with its logs")
-    names = {folder: folder.resolve().name for folder in by_folder}
     flights = []
     for folder in sorted(by_folder):
-        is_unique = list(names.values()).count(names[folder]) == 1
-        craft = names[folder] if is_unique else "/".join(folder.resolve().parts[-2:])
         own, mapping = folder / MODEL, folder / MAPPING
         model_path = own if own.exists() else model
         notes = _read_notes(folder / NOTES)
-        for file in sorted(by_folder[folder], key=lambda one: natural(one.name)):
+        for name in sorted(by_folder[folder], key=natural):
             flights.append(
                 Flight(
-                    craft,
-                    str(file.resolve()),
+                    _craft_of(folder, by_folder),
+                    str(folder / name),
                     None if model_path is None else str(model_path.resolve()),
-                    str(mapping.resolve()) if mapping.exists() else None,
-                    notes.get(file.name, ""),
+                    str(mapping) if mapping.exists() else None,
+                    notes.get(name, ""),
                 )
             )
     return flights
+
+
+def _craft_of(folder: Path, folders: Iterable[Path]) -> str:
+    """Return as many of the last parts of a folder's path as no other one has."""
+    for count in range(1, len(folder.parts) + 1):
+        parts = folder.parts[-count:]
+        if sum(other.parts[-count:] == parts for other in folders) == 1:
+            break
+    return "/".join(parts).lstrip("/")
 
 
 def _read_notes(path: Path) -> dict[str, str]:
@@ -208,6 +233,8 @@ def _read_notes(path: Path) -> dict[str, str]:
     for name, text in notes.items():
         if not isinstance(text, str):
             raise FleetError(f'{path}: {name}: expected text, as in "flight12.bbl" = "new motor"')
+        if not (path.parent / name).is_file():
+            raise FleetError(f"{path}: {quote_name(name)}: found no such file beside it")
     return notes
 
 
@@ -225,7 +252,12 @@ def read_flight(flight: Flight) -> tuple[FlightLog, dict[str, Any]]:
 
 
 def diagnose_flight(flight: Flight) -> dict[str, Any]:
-    """Return the state of a log, and its check or diagnosis, as JSON values."""
+    """Return the state of a log, and its check or diagnosis, as JSON values.
+
+    Raises:
+        OSError: no such file, as on a node that does not see it; it may see it in the next call.
+    """
+    Path(flight.path).stat()
     try:
         log, settings = read_flight(flight)
     except (LogError, OSError) as error:
@@ -247,11 +279,10 @@ def compare_flights(later: Sequence[Flight], earlier: Sequence[Flight]) -> dict[
 
 
 def key_of(function: Callable[..., Any], arguments: Any) -> str:
-    """Return what a stored result belongs to: arguments, the files that they name, the package."""
-    import flytrack_env
-
+    """Return what a stored result belongs to: arguments, the files that they name, the code."""
     flat = json.dumps(arguments, ensure_ascii=False)
-    digest = sha256(f"{function.__name__} {flat} {flytrack_env.__version__}".encode())
+    code = digest_of_sources("flytrack_env", "flytrack_sysid")
+    digest = sha256(f"{function.__name__} {flat} {code}".encode())
     for name in re.findall(r'"(/[^"]+)"', flat):
         if Path(name).is_file():
             with Path(name).open("rb") as file:
@@ -277,17 +308,20 @@ class Store:
     def results(
         self, function: Callable[..., Any], jobs: dict[str, tuple[Any, ...]], report: Report
     ) -> dict[str, dict[str, Any]]:
-        """Return the result of each job by name; one that failed has a state and a reason."""
+        """Return the result of each job by name; one that failed has a state and a reason.
+
+        A result is what JSON makes of it, whether it is new or read.
+        """
         keys = {name: key_of(function, arguments) for name, arguments in jobs.items()}
         loaded = {name: self._load(name, key) for name, key in keys.items()}
         results = {name: result for name, result in loaded.items() if result is not None}
         missing = {name: arguments for name, arguments in jobs.items() if name not in results}
         report(len(results), len(jobs))
         for name, outcome in self.run(function, missing):
-            result = outcome.value or {"state": UNREADABLE, "reason": outcome.error}
-            content = {"key": keys[name], "name": name, **result}
-            write_atomically(self._path(name), (json.dumps(content) + "\n").encode())
-            results[name] = content
+            result = outcome.value or {"state": FAILED, "reason": outcome.error}
+            content = json.dumps({"key": keys[name], "name": name, **result})
+            write_atomically(self._path(name), f"{content}\n".encode())
+            results[name] = json.loads(content)
             report(len(results), len(jobs))
         return {name: results[name] for name in jobs}
 
@@ -299,7 +333,8 @@ class Store:
             content = json.loads(read_at_most(self._path(name), MAX_RESULT_BYTES))
         except (OSError, ValueError):
             return None
-        return content if isinstance(content, dict) and content.get("key") == key else None
+        is_it = isinstance(content, dict) and content.get("key") == key
+        return content if is_it and content.get("state") != FAILED else None
 
 
 def names_of(result: dict[str, Any]) -> set[str]:
@@ -377,25 +412,38 @@ def find_changes(
 ) -> list[Change]:
     """Return what changed on each craft, as comparisons and single diagnoses say alike."""
     by_craft: dict[str, list[Flight]] = {}
+    numbers, counts = {}, Counter[str]()
+    notes: dict[str, str] = {}  # by craft, of logs since the last one that was diagnosed
     for flight in flights:
+        counts[flight.craft] += 1
+        numbers[flight.name] = counts[flight.craft]
+        note = "; ".join(filter(None, (notes.pop(flight.craft, ""), flight.note)))
         if results[flight.name]["state"] == DIAGNOSED:
-            by_craft.setdefault(flight.craft, []).append(flight)
+            by_craft.setdefault(flight.craft, []).append(flight._replace(note=note))
+        else:
+            notes[flight.craft] = note
     places: dict[str, Place] = {}
     for own in by_craft.values():
         places |= {one.name: one for one in find_places(own, [results[f.name] for f in own])}
     jobs = {name: place.compared for name, place in places.items()}
-    changes = []
+    changes = [
+        Change(one.craft, numbers[one.name], "", Path(one.path).name, one.note, False, {})
+        for one, *_ in by_craft.values()
+        if one.note
+    ]
     for name, compared in store.results(compare_flights, jobs, report).items():
         place = places[name]
         own, first = place.flights, place.first
         diagnoses = [results[flight.name] for flight in own]
         causes = settle(place, list(map(names_of, diagnoses)), compared.get("causes", []))
+        failure = compared.get("reason", "")
         settings = describe_settings(*(one["settings"] for one in diagnoses[first - 1 : first + 1]))
         note = "; ".join(filter(None, (own[first].note, settings)))
-        if causes or (note and not place.has_ended):
+        if causes or failure or (note and not place.has_ended):
             before, since = (Path(own[index].path).name for index in (first - 1, first))
-            craft = own[0].craft
-            changes.append(Change(craft, first + 1, before, since, note, place.has_ended, causes))
+            number = numbers[own[first].name]
+            where = (own[first].craft, number, before, since)
+            changes.append(Change(*where, note, place.has_ended, causes, failure))
     return sorted(changes, key=lambda change: (natural(change.craft), change.flight))
 
 

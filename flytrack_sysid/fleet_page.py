@@ -14,6 +14,7 @@ from flytrack_env.pictures.drawing import png_of
 from flytrack_sysid.fleet import (
     CONTRADICTS,
     DIAGNOSED,
+    FAILED,
     MIN_NAMED,
     UNREADABLE,
     Change,
@@ -27,6 +28,7 @@ COLOURS = {  # of the picture; causes have others
     "unexplained": "#fff2b3",
     CONTRADICTS: "#bdbdbd",
     UNREADABLE: "#4d4d4d",
+    FAILED: "#000000",
 }
 MAX_CAUSES = 7  # with a colour of their own; the eighth of matplotlib's is grey
 CELL_INCHES, MARGIN_INCHES = 0.32, 3.0
@@ -52,9 +54,11 @@ def describe_change(change: Change) -> str:
         f"{effect} ({', '.join(f'{name} {_value(value)}' for name, value in parameters.items())})"
         for effect, parameters in change.causes.items()
     ]
-    what = " and ".join(values) or "no cause"
+    what = "unknown what" if change.failure else " and ".join(values) or "no cause"
     verb = "ends" if change.has_ended else "begins"
-    text = f"{what} {verb} with flight {change.flight}, {change.since} (before: {change.before})"
+    before = change.before or "no diagnosed flight"
+    text = f"{what} {verb} with flight {change.flight}, {change.since} (before: {before})"
+    text += f"; the comparison failed: {change.failure}" if change.failure else ""
     return f"{text}; noted: {change.note}" if change.note else text
 
 
@@ -74,7 +78,8 @@ def format_page(flights: Sequence[Flight], results: Results, changes: Sequence[C
     states = [results[flight.name]["state"] for flight in flights]
     counts = (
         f"{states.count(DIAGNOSED)} diagnosed, {states.count(CONTRADICTS)} that contradict "
-        f"themselves, {states.count(UNREADABLE)} that cannot be read"
+        f"themselves, {states.count(UNREADABLE)} that cannot be read, {states.count(FAILED)} whose "
+        "diagnosis failed: the next call tries again"
     )
     lines = [
         "# Fleet",

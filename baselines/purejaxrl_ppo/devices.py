@@ -8,6 +8,7 @@ from those of one device by rounding.
 
 import json
 import os
+import re
 import socket
 import time
 from collections.abc import Iterator
@@ -28,6 +29,8 @@ AXIS = "environments"
 JOIN_TIMEOUT_S = 60  # how long processes wait for each other at the start
 HEARTBEAT_TIMEOUT_S = 15  # a process silent for longer is lost; JAX notices within twice that
 AUTOMATIC = "auto"
+# What the errors say by which gloo, NCCL and JAX's coordination service report a lost process.
+LOSS = re.compile("gloo|nccl|heartbeat|coordination.?service|connection (closed|reset)", re.I)
 
 Tree = TypeVar("Tree")
 
@@ -203,7 +206,8 @@ def noticing_loss(resume: str) -> Iterator[None]:
         yield
     except (jax.errors.JaxRuntimeError, ValueError) as error:
         # JAX raises a plain ValueError where a failed result is read.
-        if jax.process_count() == 1 or type(error) not in (jax.errors.JaxRuntimeError, ValueError):
+        is_of_jax = type(error) in (jax.errors.JaxRuntimeError, ValueError)
+        if jax.process_count() == 1 or not (is_of_jax and LOSS.search(str(error))):
             raise
         raise LostProcessError(
             f"process {jax.process_index()} of {jax.process_count()} has lost another; continue "

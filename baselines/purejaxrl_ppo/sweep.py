@@ -103,15 +103,36 @@ def read_settings(path: Path) -> tuple[Config, Space]:
             found, kinds = quote_value(entry), ", ".join(KINDS)
             raise ConfigError(f"{where}: found {found}, expected one of {kinds}")
         ((kind, values),) = entry.items()
-        if not isinstance(values, list) or not values or (kind not in LISTS and len(values) < 2):
-            what = "a list of values" if kind in LISTS else "lowest and highest value"
-            raise ConfigError(f"{where}: {kind}: found {quote_value(values)}, expected {what}")
-        space[name] = kind, [read_config(str(path), {name: one}) for one in values]
-        space[name] = kind, [getattr(config, name) for config in space[name][1]]
+        space[name] = kind, read_draw(path, name, kind, values)
     if not space:
         raise ConfigError(f"{path}: found no setting that is drawn, expected one, as a table")
     fixed = {name: value for name, value in content.items() if name not in space}
     return read_config(str(path), fixed), space
+
+
+def read_draw(path: Path, name: str, kind: str, values: Any) -> list[Any]:
+    """Return the values of a draw; raises ConfigError where the setting cannot have them."""
+
+    def checked(value: Any) -> Any:
+        return getattr(read_config(str(path), {name: value}), name)
+
+    where = f"{path}: {quote_name(name)}: {kind}: found {quote_value(values)}"
+    if kind in LISTS:
+        if not isinstance(values, list) or not values:
+            raise ConfigError(f"{where}, expected a list of values")
+        return [checked(value) for value in values]
+    has_step, is_whole = kind.startswith("q"), kind.endswith("randint")
+    is_range = isinstance(values, list) and len(values) == 2 + has_step
+    if not is_range or not all(type(one) in (int, float) for one in values):
+        step = ", and a step" * has_step
+        raise ConfigError(f"{where}, expected lowest and highest value{step}, as numbers")
+    low, high = checked(values[0]), checked(values[1] - is_whole)  # randint leaves the highest out
+    if (type(low) is int) != is_whole:
+        expected = "uniform or the like" if is_whole else "randint or lograndint"
+        raise ConfigError(f"{where}, expected {expected} for this setting")
+    if values[0] >= values[1] or ("log" in kind and low <= 0) or (has_step and values[2] <= 0):
+        raise ConfigError(f"{where}, expected lowest < highest, above 0 for logs and steps")
+    return [low, high + is_whole, *values[2:]]
 
 
 def draws_of(space: Space) -> dict[str, Any]:

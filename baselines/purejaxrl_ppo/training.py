@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
+import tyro
 from jax.sharding import Mesh
 
 import flytrack_env
@@ -33,7 +34,7 @@ from baselines.purejaxrl_ppo.tracking import LOCAL, RUN_FILE, Tracker
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.files import locked_folder
 from flytrack_env.params import EnvParams
-from flytrack_env.progress import LineBar, progress_bar
+from flytrack_env.progress import progress_bar
 from flytrack_env.validation import convert
 
 Metrics = dict[str, np.ndarray]
@@ -71,7 +72,7 @@ class Options(msgspec.Struct, frozen=True):
     """Noisy starts of an evaluation."""
     tracking_uri: str = ""
     """MLflow store; local: an SQLite file in OUT."""
-    parent_run: str = ""
+    parent_run: Annotated[str, tyro.conf.Suppress] = ""
     """Id of the MLflow run that this one is below, as of a sweep."""
 
 
@@ -335,8 +336,6 @@ class Run:
                 self._store(files.step_file(0))
             jax.block_until_ready(self.trainer.update(self.runner))  # compiles
             bar.set_description("train")
-            if isinstance(bar, LineBar):  # tqdm's clock would jump back
-                bar.unpause()
             while self.update < config.num_updates and not is_stopped:
                 self._advance()
                 is_stopped = devices.any_process(bool(signals))

@@ -1,6 +1,6 @@
 """Hidden drones: the truth that models and policies are judged on.
 
-Their equations share nothing with the simulator of ``flytrack_env``. ``HiddenDrone`` flies in plain
+Their equations share no code with the simulator of ``flytrack_env``. ``HiddenDrone`` flies in plain
 floats and has every effect, law and motion; ``HiddenPlant`` flies the same equations in an
 environment, but those that remember or change with the time.
 """

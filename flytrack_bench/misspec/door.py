@@ -30,6 +30,7 @@ from flytrack_bench.misspec.suite import LogSuite, Plant
 from flytrack_env.files import read_at_most, write_atomically
 from flytrack_env.model_file import save_model
 from flytrack_env.npz_file import npz_of
+from flytrack_env.sources import digest_of_sources
 from flytrack_sysid.log_file import save_log
 
 SCHEMA = 1
@@ -150,9 +151,10 @@ def begun(suite: LogSuite, method: str, out: Path | None) -> dict[str, Any]:
     """Return the result so far, from its file where there is one.
 
     Raises:
-        AnswerError: the file is of another suite or method, or no result.
+        AnswerError: the file is of another suite, method or code, or no result.
     """
     head = {"schema": SCHEMA, "suite": suite.name, "digest": suite.digest, "method": method}
+    head["code"] = digest_of_sources()
     head["versions"] = {name: version(name) for name in ("flytrack", "jax", "numpy", "scipy")}
     if out is None or not out.exists():
         return {**head, "logs": {}, "summary": {}}

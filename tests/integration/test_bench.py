@@ -12,9 +12,10 @@ from baselines.purejaxrl_ppo import load_checkpoint
 from benchmarks import suite as drawn
 from benchmarks.champion import CHAMPION
 from flytrack.cli import main
-from flytrack_bench import Data, DataError, load_policy, load_suite, results, retrain
+from flytrack_bench import Data, DataError, cli, load_policy, load_suite, results, retrain
 from flytrack_bench.policies import Function, Policy, PolicyError
 from flytrack_bench.suite import FOLDER, digest_of
+from flytrack_env.jobs import ClusterError, Outcome
 from flytrack_env.tracks import TrackError, load_track
 from flytrack_loop.adapt import Adapted
 from tests.support.refusals import refused
@@ -72,6 +73,23 @@ def test_a_result_repeats_and_is_verified_and_a_forged_one_is_not(small, tmp_pat
         main([*command, "--verify", str(out)])
     assert "flytrack, policy 0" in capsys.readouterr().out
     refused(capsys, *command, "--out", out)  # never overwritten
+
+
+def test_a_cluster_is_given_whole_paths(small, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.safetensors").touch()
+    sent = []
+
+    def run_jobs(function, jobs, limit_s, address):
+        sent.extend(flags for flags, _ in jobs.values())
+        yield "flytrack", Outcome(None, "no")
+
+    monkeypatch.setattr(cli, "run_jobs", run_jobs)
+    flags = cli.Flags(("own.safetensors", "champion", CENTRED), suite="small.json", address="auto")
+    with pytest.raises(ClusterError, match="task flytrack: no"):
+        cli.fly_on_cluster(flags, load_suite(small), [], ["flytrack"])
+    assert sent[0].policy == (str(tmp_path / "own.safetensors"), "champion", CENTRED)
+    assert sent[0].suite == str(tmp_path / "small.json")
 
 
 def test_a_changed_suite_is_refused(small, monkeypatch):

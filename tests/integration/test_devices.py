@@ -53,6 +53,22 @@ def test_a_coordinator_that_is_none_is_refused(monkeypatch):
         devices.join("here", 2, 1)
 
 
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (jax.errors.JaxRuntimeError("INTERNAL: NCCL operation failed"), devices.LostProcessError),
+        (ValueError("Gloo all-reduce: Connection closed by peer"), devices.LostProcessError),
+        (jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory"), RuntimeError),
+        (ValueError("gate_margin: found 9"), ValueError),
+    ],
+)
+def test_only_what_tells_of_another_process_is_a_loss(error, expected, monkeypatch):
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    with pytest.raises(expected) as found, devices.noticing_loss("--resume runs"):
+        raise error
+    assert (found.value is error) == (expected is not devices.LostProcessError)
+
+
 # Whole processes.
 
 

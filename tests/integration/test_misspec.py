@@ -131,6 +131,9 @@ def test_a_method_that_crashes_invents_or_ends_scores_zero_and_the_result_goes_o
     assert again == found  # nothing was left to ask
     with pytest.raises(AnswerError, match="method: found tests"):
         run_method(SHORT, ids, "benchmarks.misspec.rivals:nominal", out, 60.0)
+    out.write_text(json.dumps(found | {"code": "other"}))
+    with pytest.raises(AnswerError, match="code: found other"):
+        run_method(SHORT, ids, MOODY, out, 60.0)
 
 
 @pytest.mark.slow
@@ -194,6 +197,8 @@ def test_flags_that_do_not_belong_together_are_refused(capsys, tmp_path):
     refused(capsys, "bench", "--suite", "v1", "--method", MOODY)
     refused(capsys, "bench", "--suite", "misspec-v1")
     refused(capsys, "bench")
+    refused(capsys, "bench", "--policy", "champion", "--limit-s", "9")
+    refused(capsys, "bench", "--suite", "misspec-v1", "--method", MOODY, "--address", "local")
     refused(capsys, "bench", "--suite", "misspec-v1", "--method", MOODY, "--policy", "champion")
     with pytest.raises(SuiteError, match="found '60', expected some of 00 to 59"):
         SUITE.chosen(("60",))

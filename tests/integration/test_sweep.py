@@ -1,4 +1,4 @@
-"""Sweeps: which settings are accepted, and a sweep of which a part is interrupted."""
+"""Sweeps: which settings are accepted, and a whole sweep on this machine."""
 
 import subprocess
 import sys
@@ -24,6 +24,11 @@ def test_settings_are_fixed_or_drawn(tmp_path):
     text = "num_envs = 64\n[hidden_sizes]\nchoice = [[8], [64, 64]]\n[gamma]\nuniform = [0.9, 1]\n"
     config, space = read_settings(written(tmp_path, text))
     assert config.num_envs == 64
+    drawn = "[gamma]\nquniform = [0.9, 1, 0.02]\n[num_envs]\nrandint = [1, 9]"
+    assert read_settings(written(tmp_path, drawn))[1] == {
+        "gamma": ("quniform", [0.9, 1.0, 0.02]),
+        "num_envs": ("randint", [1, 9]),
+    }
     assert space == {"hidden_sizes": ("choice", [(8,), (64, 64)]), "gamma": ("uniform", [0.9, 1.0])}
 
 
@@ -36,6 +41,12 @@ def test_settings_are_fixed_or_drawn(tmp_path):
         ("[gamma]\nguess = [1]", "gamma: found .*, expected one of choice, grid_search"),
         ("[gamma]\nuniform = [1]", "uniform: found .*, expected lowest and highest value"),
         ("[gamma]\nchoice = ['a']", "gamma"),
+        ("[num_envs]\nuniform = [16, 64]", "expected randint or lograndint for this setting"),
+        ("[gamma]\nrandint = [0, 2]", "expected uniform or the like"),
+        ("[num_envs]\nrandint = [64, 16]", "expected lowest < highest"),
+        ("[num_envs]\nrandint = [0, 16]", "num_envs"),
+        ("[gamma]\nquniform = [0.9, 1]", "expected lowest and highest value, and a step"),
+        ("[gamma]\nuniform = [0.9, 1.5]", "gamma"),
     ],
 )
 def test_settings_that_cannot_be_used_are_refused(tmp_path, text, message):

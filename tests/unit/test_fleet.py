@@ -8,7 +8,7 @@ import pytest
 
 from flytrack.flags import Diagnose
 from flytrack.identification import run_diagnose
-from flytrack_env.jobs import ClusterError, Outcome, run_jobs
+from flytrack_env.jobs import ClusterError, Outcome, run_as_task, run_jobs
 from flytrack_sysid import collect, fleet, save_log
 from flytrack_sysid.fleet import (
     FleetError,
@@ -50,6 +50,11 @@ def test_a_cluster_that_is_none_is_refused():
         list(run_jobs(end_as, {"a": ("a",)}, 9.0, "127.0.0.1:9"))
 
 
+def test_a_node_of_other_code_is_told():
+    outcome = run_as_task(end_as, ("a",), 9.0, "another")
+    assert outcome.value is None and outcome.error.endswith(", expected another")
+
+
 def touched(path, text=""):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
@@ -79,13 +84,42 @@ def test_logs_are_sorted_into_craft_in_the_order_of_their_numbers(tmp_path):
     assert flights[1].model.endswith("red/model.json")
 
 
-def test_a_url_is_copied(tmp_path):
-    fsspec = pytest.importorskip("fsspec", reason="needs the extra cluster")
-    fsspec.filesystem("memory").pipe("/season/red/flight1.npz", b"1")
-    folders = expand([Path("memory://season")], tmp_path)
-    (flight,) = find_flights(folders, None)
-    assert flight.name == "red/flight1.npz"
-    assert Path(flight.path).read_bytes() == b"1"
+def test_every_log_has_a_name_of_its_own_and_results_are_no_logs(tmp_path):
+    for name in ("red/2026/logs/a.npz", "blue/2026/logs/a.npz", "green/a.npz", "out/logs/a.json"):
+        touched(tmp_path / name)
+    flights = find_flights([tmp_path, tmp_path / "red" / ".." / "red"], None, tmp_path / "out")
+    assert [flight.name for flight in flights] == [
+        "blue/2026/logs/a.npz",
+        "green/a.npz",
+        "red/2026/logs/a.npz",
+    ]
+
+
+@pytest.fixture
+def memory():
+    """A file system of fsspec in the memory, empty."""
+    system = pytest.importorskip("fsspec", reason="needs the extra cluster").filesystem("memory")
+    yield system
+    system.store.clear()
+
+
+def test_urls_are_copied_each_into_a_folder_of_its_own(tmp_path, memory):
+    for team in ("a", "b"):
+        memory.pipe(f"/{team}/season/red/flight1.npz", team.encode())
+    touched(tmp_path / "here" / "blue" / "flight1.npz", "c")
+    urls = ["memory://a/season", "memory://b/season", f"file://{tmp_path / 'here'}"]
+    out = tmp_path / "out"
+    flights = find_flights(expand(map(Path, urls), out), None, out)
+    assert sorted(Path(flight.path).read_bytes() for flight in flights) == [b"a", b"b", b"c"]
+    assert len({flight.name for flight in flights}) == 3
+    assert "blue/flight1.npz" in {flight.name for flight in flights}
+
+
+def test_a_name_that_leads_out_of_the_copy_is_refused(tmp_path, memory):
+    memory.pipe("/season/../../../../evil.txt", b"1")
+    with pytest.raises(FleetError, match=r"evil\.txt: found a name that leads out"):
+        expand([Path("memory://season")], tmp_path / "out")
+    assert not list(tmp_path.rglob("evil*"))
 
 
 def test_folders_that_are_no_fleet_are_refused(tmp_path):
@@ -97,6 +131,9 @@ def test_folders_that_are_no_fleet_are_refused(tmp_path):
     touched(tmp_path / "red" / "notes.toml", "a = 3")
     with pytest.raises(FleetError, match=r"notes\.toml: a: expected text"):
         find_flights([tmp_path], None)
+    touched(tmp_path / "red" / "notes.toml", '"b.npz" = "new motor"')
+    with pytest.raises(FleetError, match=r"notes\.toml: b\.npz: found no such file"):
+        find_flights([tmp_path], None)
     with pytest.raises(ValueError, match="--workers: found 0, expected more than 0"):
         run_diagnose(Diagnose((tmp_path,), tmp_path, fleet=True, workers=0))
 
@@ -107,6 +144,8 @@ def test_a_log_that_is_none_says_why(tmp_path):
     assert "readme.txt: found text, expected a flight log" in text["reason"]
     cut = diagnose_flight(Flight("red", str(touched(tmp_path / "cut.npz", "PK"))))
     assert "cut.npz" in cut["reason"]
+    with pytest.raises(FileNotFoundError):  # not a result that is kept
+        diagnose_flight(Flight("red", str(tmp_path / "gone.npz")))
 
 
 @pytest.mark.parametrize(
@@ -156,7 +195,7 @@ def test_single_diagnoses_and_the_comparison_must_agree(tmp_path):
             yield name, Outcome({"causes": result_of(*effects)["diagnosis"]["causes"]})
 
     store = Store(tmp_path / "out", run)
-    changes = find_changes(flights, results, store, lambda done, total: None)
+    changes = find_changes(flights, results, store, silent)
     assert asked == [
         ("red/begun at flight6.npz", 4, 4),
         ("red/begun at flight9.npz", 2, 4),
@@ -170,8 +209,12 @@ def test_single_diagnoses_and_the_comparison_must_agree(tmp_path):
     assert "no cause begins with flight 9" in page
     assert "gyro_bias" not in page
     # A second call asks nothing again.
-    find_changes(flights, results, store, lambda done, total: None)
+    find_changes(flights, results, store, silent)
     assert len(asked) == 3
+
+
+def silent(done, total):
+    """Report nothing."""
 
 
 def test_results_are_kept_and_a_changed_log_is_done_again(tmp_path):
@@ -180,23 +223,57 @@ def test_results_are_kept_and_a_changed_log_is_done_again(tmp_path):
     def run(function, jobs):
         for name in jobs:
             calls.append(name)
-            yield (
-                name,
-                Outcome({"state": fleet.DIAGNOSED}) if len(calls) < 3 else Outcome(None, "no"),
-            )
+            yield name, Outcome({"state": fleet.DIAGNOSED, "settings": {"rates": (1, 2)}})
 
     results = partial(Store(tmp_path / "out", run).results, diagnose_flight)
     jobs = {"red/a.npz": (Flight("red", str(path)),)}
-    results(jobs, lambda done, total: None)
-    results(jobs, lambda done, total: None)
+    new = results(jobs, silent)
+    assert results(jobs, silent) == new  # lists in place of tuples in both
     assert calls == ["red/a.npz"]
     touched(path, "22")
-    results(jobs, lambda done, total: None)
+    results(jobs, silent)
     assert len(calls) == 2
-    touched(path, "333")
-    failed = results(jobs, lambda done, total: None)
-    assert failed["red/a.npz"]["reason"] == "no"
     assert not [one for one in Path(tmp_path / "out").rglob(".*") if one.is_file()]
+
+
+def test_notes_move_to_the_next_diagnosed_flight_and_all_flights_count(tmp_path):
+    notes = {1: "new frame", 3: "new motor", 4: "new props"}
+    flights = [Flight("red", f"{n}.npz", note=notes.get(n, "")) for n in range(1, 6)]
+    results = {flight.name: result_of() for flight in flights}
+    results |= {f"red/{n}.npz": {"state": fleet.CONTRADICTS, "reason": "no"} for n in (1, 3)}
+
+    def run(function, jobs):
+        for name in jobs:
+            yield name, Outcome({"causes": []})
+
+    told = find_changes(flights, results, Store(tmp_path / "out", run), silent)
+    assert [(one.flight, one.before, one.note) for one in told] == [
+        (2, "", "new frame"),
+        (4, "2.npz", "new motor; new props"),
+    ]
+    assert "with flight 2, 2.npz (before: no diagnosed flight); noted: new frame" in format_page(
+        flights, results, told
+    )
+
+
+def test_a_failure_is_told_and_run_again_by_the_next_call(tmp_path):
+    flights = [Flight("red", str(tmp_path / f"{number}.npz")) for number in (1, 2, 3)]
+    flights[1] = flights[1]._replace(note="new motor")
+    outcomes = [Outcome(None, "it hung"), Outcome({"causes": []})]
+
+    def run(function, jobs):
+        for name in jobs:
+            yield name, outcomes.pop(0)
+
+    results = {flight.name: result_of() for flight in flights}
+    told = []
+    for _ in range(2):
+        told += find_changes(flights, results, Store(tmp_path / "out", run), silent)
+    assert [one.failure for one in told] == ["it hung", ""]
+    results["red/3.npz"] = {"state": fleet.FAILED, "reason": "it crashed"}
+    page = format_page(flights, results, told)
+    assert "unknown what begins with flight 2, 2.npz (before: 1.npz); the comparison failed" in page
+    assert "1 whose diagnosis failed" in page and "| red/3.npz | failed | it crashed |" in page
 
 
 @pytest.mark.slow

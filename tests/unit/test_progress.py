@@ -8,7 +8,7 @@ import time
 import pytest
 
 from flytrack_env import progress
-from flytrack_env.progress import LineBar, ProgressBar, waiting
+from flytrack_env.progress import LineBar, ProgressBar, progress_bar, waiting
 
 
 @pytest.fixture
@@ -34,14 +34,21 @@ def test_a_bar_that_is_dropped_writes_no_more(quick):
     assert stream.getvalue() == ""
 
 
+def test_a_bar_that_is_disabled_writes_nothing(quick, capsys):
+    bar = progress_bar("steps", 100, disable=True)
+    bar.update(50)
+    time.sleep(0.15)
+    bar.close()
+    assert capsys.readouterr().err == ""
+
+
 def test_the_time_left_is_told_once_it_is_known_and_the_clock_does_not_jump(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
-    bar = LineBar("steps", 20_000_000, desc="compile", is_large=True, stream=io.StringIO())
+    bar = LineBar("steps", 20_000_000, desc="compile", unit_scale=True, stream=io.StringIO())
     now[0] = 20.0
     assert bar.line() == "compile: 0.00 of 20.0M steps, 00:20 so far"
     bar.set_description("train")
-    bar.unpause()
     now[0] = 30.0
     bar.update(5_000_000)
     bar.set_postfix_str("return 1.0")
