@@ -19,6 +19,7 @@ import numpy as np
 from benchmarks import hidden
 from benchmarks.hidden.oracle import known, removed, signal_to_noise
 from benchmarks.report import RESULTS, command, record_trials
+from flytrack_bench.misspec.suite import nominal_model
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis import Cause, diagnose
@@ -36,6 +37,7 @@ MOTION_OF = {
 }
 AMPLITUDES = (0.5, 3.0)  # of effects outside the list, times the noise
 Rng = np.random.Generator
+model_of = nominal_model  # of a plant, as its team believes
 
 
 class Trial(NamedTuple):
@@ -66,18 +68,6 @@ ROWS: dict[str, tuple[Callable[[Rng], hidden.Truth], str]] = {
     "clock": (hidden.draw_late, "sensors"),
     "onset": (lambda rng: hidden.draw_onset(rng, SECONDS), "sensors"),
 }
-
-
-def model_of(truth: hidden.Truth) -> ModelParameters:
-    """Return the model that a plant's team believes in; they do not know how the plant moves."""
-    return ModelParameters(
-        tau=np.array(truth.tau, np.float32),
-        thrust_coeffs=np.array(truth.coeffs, np.float32),
-        max_rate=np.array(truth.max_rate, np.float32),
-        m=truth.mass,
-        g=truth.gravity,
-        battery_drain_v_per_min=truth.drain,
-    )
 
 
 def make_log(
