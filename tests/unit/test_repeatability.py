@@ -48,4 +48,4 @@ def test_a_craft_counts_pairs_values_and_widths():
     lines = [line(["linear_drag"], 0.02), line(["linear_drag"], 0.021), line(["wind"], 0.03)]
     flights, *alike, overlapping, roll, pitch, _, _ = compare(lines)
     assert (flights, alike, overlapping) == (3, 3 * ["1 of 3"], "4 of 6")
-    assert (roll, pitch) == ("± 1.0", "none")
+    assert (roll, pitch) == ("± 1.0; 1 of 3", "none")
