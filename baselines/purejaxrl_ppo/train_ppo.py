@@ -71,8 +71,8 @@ class Sources:
     devices: Annotated[str | None, tyro.conf.arg(metavar="N|all", help_behavior_hint=OPTIONAL)] = (
         None
     )
-    """Divide the environments among so many devices (of each process); by default one, and all
-    where there are several processes. On a CPU, N threads are the devices."""
+    """Number of devices in each process that share the environments. Default: one, or all with
+    several processes. On a CPU, N threads are the devices."""
     coordinator: OptionalName = None
     """Train together with other processes that are given the same command: HOST:PORT at which
     process 0 listens, or auto in a job of SLURM, Open MPI or Kubernetes."""

@@ -24,7 +24,7 @@ import numpy as np
 from scipy import stats
 from threadpoolctl import threadpool_limits
 
-from benchmarks.misspec.library import column, moving, sensing, targets
+from benchmarks.misspec.regressors import column, moving, sensing, targets
 from benchmarks.misspec.replay import State, fly, replay
 from flytrack_bench.misspec import Answer
 from flytrack_env.dynamics import ModelParameters
