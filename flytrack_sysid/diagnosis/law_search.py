@@ -28,6 +28,7 @@ from flytrack_sysid.diagnosis.unexplained import (
     SideFit,
     SideTest,
     build_flight_variables,
+    fitted_on,
     linearized_residuals,
     whitened,
 )
@@ -122,13 +123,10 @@ class Side(NamedTuple):
         """Build a side ("rate" or "force") of a problem and a model."""
         white, slopes = linearized_residuals(problem, model)
         flight = build_flight_variables(problem, model)
-        squared = np.square(slopes).sum(axis=(1, 2, 4))
-        on_side = squared[:, SIDES[name]].sum(axis=1)
-        # A parameter that acts mostly on the other side is fitted there.
-        is_kept = (on_side > 0.0) & (on_side >= 0.5 * squared.sum(axis=1))
-        acting = tuple(index for index, kept in zip(model.indices, is_kept, strict=True) if kept)
+        is_fitted = fitted_on(name, slopes)
+        acting = tuple(index for index, fits in zip(model.indices, is_fitted, strict=True) if fits)
         moment = moment_of_flight(problem, model.vector, flight)
-        test = SideTest.of(name, white, slopes[is_kept])
+        test = SideTest.of(name, white, slopes)
         return cls(name, problem, model.vector, moment, flight, test, acting)
 
     def white(self, term: Term) -> np.ndarray:

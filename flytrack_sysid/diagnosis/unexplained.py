@@ -274,6 +274,24 @@ class SideFit(NamedTuple):
         return self.chi2 / self.inflation
 
 
+def fitted_on(side: str, slopes: np.ndarray) -> np.ndarray:
+    """Return which parameters a side determines: those that act on it, and mostly on it.
+
+    A test of one side holds the others, which the other side determines. Free on a side where it
+    hardly acts, the thrust, for example, would explain any motor imbalance.
+
+    Args:
+        side: rate or force.
+        slopes: whitened columns of the parameters, (count, rows, chunks, NUM_AXES, 2).
+
+    Returns:
+        (count,) bool.
+    """
+    squared = np.square(slopes).sum(axis=(1, 2, 4))
+    on_side = squared[:, SIDES[side]].sum(axis=1)
+    return np.asarray((on_side > 0.0) & (on_side >= 0.5 * squared.sum(axis=1)))
+
+
 class SideTest(NamedTuple):
     """Score test on the axes of one side, rotation or force; all by blocks of a second.
 
@@ -289,7 +307,7 @@ class SideTest(NamedTuple):
 
     @classmethod
     def of(cls, side: str, white: np.ndarray, slopes: np.ndarray) -> "SideTest":
-        """Build the test of whitened residuals beside slopes.
+        """Build the test of whitened residuals beside the parameters that the side determines.
 
         Args:
             side: rate or force.
@@ -299,9 +317,8 @@ class SideTest(NamedTuple):
         axes = SIDES[side]
         side_white = white[..., axes, :]
         root = np.sqrt(robust_weight(side_white))
-        given = slopes[..., axes, :]
-        acting = np.abs(given).reshape(len(given), -1).max(axis=1) > 0.0
-        return cls(root, split_blocks(side_white * root), split_blocks(given[acting] * root))
+        given = slopes[fitted_on(side, slopes)][..., axes, :]
+        return cls(root, split_blocks(side_white * root), split_blocks(given * root))
 
     def given_also(self, *columns: np.ndarray) -> "SideTest":
         """Return the test with more columns that are free already."""

@@ -1,0 +1,26 @@
+"""What a side of the residuals determines."""
+
+import numpy as np
+
+from flytrack_sysid.diagnosis.unexplained import SIDES, SideTest, fitted_on
+from flytrack_sysid.inference.chunks import NUM_AXES
+
+SHAPE = (6 * 20, 2, NUM_AXES, 2)  # rows, chunks, axes, direct and level
+
+
+def test_a_side_does_not_fit_what_the_other_side_determines() -> None:
+    """A thrust that makes a motor imbalance turn the drone does not explain the imbalance."""
+    rng = np.random.default_rng(0)
+    thrust, imbalance = np.zeros(SHAPE), np.zeros(SHAPE)
+    imbalance[..., SIDES["rate"], :] = rng.normal(size=(*SHAPE[:2], 3, 2))
+    thrust[..., SIDES["rate"], :] = 0.1 * imbalance[..., SIDES["rate"], :]
+    thrust[..., SIDES["force"], :] = rng.normal(size=(*SHAPE[:2], 3, 2))
+    idle = np.zeros(SHAPE)
+    slopes = np.stack([thrust, imbalance, idle])
+    np.testing.assert_array_equal(fitted_on("rate", slopes), [False, True, False])
+    np.testing.assert_array_equal(fitted_on("force", slopes), [True, False, False])
+
+    test = SideTest.of("rate", np.zeros(SHAPE), np.stack([thrust, idle]))
+    columns = SideTest.of("rate", np.zeros(SHAPE), imbalance[None]).given
+    information = float(np.sum(np.square(columns)))
+    assert test.noncentrality(columns, np.ones(1)) > 0.99 * information
