@@ -16,7 +16,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import optimize, stats
 
 from flytrack_sysid.diagnosis.result import Estimated
 from flytrack_sysid.diagnosis.vetoes import Selection, select
@@ -25,9 +24,11 @@ from flytrack_sysid.inference.chunks import CHUNK_S, Chunks, count_lead_in
 from flytrack_sysid.inference.parameters import range_of
 from flytrack_sysid.inference.problem import Problem, Window, robust_square
 from flytrack_sysid.inference.score_test import (
+    MIN_SIDE_FRACTION,
     Candidate,
     Linearization,
     candidates_for,
+    change_threshold,
     estimate_inflation,
     solve,
 )
@@ -40,9 +41,7 @@ from flytrack_sysid.inference.search import (
 )
 from flytrack_sysid.log import FlightLog
 
-FALSE_POSITIVE_RATE = 1e-5  # of a change of each effect, if nothing changes
-MIN_SIDE_S = 2.0  # of the log on each side of a change
-MIN_SIDE_FRACTION = 0.04  # of the log there
+MIN_SIDE_S = 2.0  # of the log on each side of a change, at least
 NEAR, MAX_NEAR = (
     0.3,
     5,
@@ -56,29 +55,6 @@ RIDGE = 1e-7  # of a column's own information
 DROP_95 = -2.0 * float(np.log(1.0 - np.sqrt(0.95)))
 # The profile: seconds about the time, and seconds between the times tried, in successive rounds.
 PROFILES = ((8.0, 0.5), (1.0, 0.05), (0.1, 0.01))
-
-
-def threshold(
-    num_parameters: int, trimmed: float = MIN_SIDE_FRACTION, chance: float = FALSE_POSITIVE_RATE
-) -> float:
-    """Return the sup-LM gain of chi2 that is exceeded with probability ``chance``.
-
-    Source: Andrews 1993, section 5. The tail is that of D. DeLong (Communications in Statistics 10,
-    1981).
-
-    Args:
-        num_parameters: that change.
-        trimmed: share of the log on each side in which no change is searched for.
-        chance: the probability.
-    """
-    span = 2.0 * np.log((1.0 - trimmed) / trimmed)
-
-    def excess(size: float) -> float:
-        crossings = (size - num_parameters) * span + 2.0
-        return float(stats.chi2.logpdf(size, num_parameters) + np.log(crossings) - np.log(chance))
-
-    lowest = float(stats.chi2.isf(chance, num_parameters))
-    return float(optimize.brentq(excess, lowest, 10.0 * lowest + 100.0))
 
 
 def windowed_gains(
@@ -140,7 +116,7 @@ class Hypothesis(NamedTuple):
     @property
     def margin(self) -> float:
         """The gain over the threshold."""
-        return self.gain - threshold(self.num_parameters)
+        return self.gain - change_threshold(self.num_parameters)
 
 
 def split_seconds(chunks: Chunks) -> tuple[np.ndarray, np.ndarray]:
@@ -484,7 +460,8 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     ]
     price = PER_PARAMETER * (later.model.num_priced - selection.model.num_priced)
     is_better = (
-        misfit_changes[0] + price < -threshold(first.num_parameters) and misfit_changes[1] < 0.0
+        misfit_changes[0] + price < -change_threshold(first.num_parameters)
+        and misfit_changes[1] < 0.0
     )
     return later if is_better else None
 

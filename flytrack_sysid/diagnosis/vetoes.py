@@ -18,7 +18,7 @@ from flytrack_sysid.diagnosis.result import Unexplained
 from flytrack_sysid.inference.chunks import AXES
 from flytrack_sysid.inference.problem import Problem, split_blocks
 from flytrack_sysid.inference.record import Record
-from flytrack_sysid.inference.score_test import ALL_BASE_CAUSES, threshold
+from flytrack_sysid.inference.score_test import ALL_BASE_CAUSES, change_threshold, threshold
 from flytrack_sysid.inference.search import FittedModel, SearchState
 
 # Held-out rows contradict a cause if two conditions hold. Its gain is HELD_OUT_SIGMAS standard
@@ -153,6 +153,7 @@ def find_stand_ins(
     residuals, slopes = unknown.linearized_residuals(problem, model)
     flight = unknown.build_flight_variables(problem, model)
     disturbed = {name.split(":")[0] for name in selection.unexplained.shares}
+    changing = {one.effect for one in problem.windows}
 
     def noncentralities(suspect: Suspect, side: str) -> tuple[float, float]:
         """Return a suspect's noncentrality on a side, alone and beside the found dependences."""
@@ -182,7 +183,8 @@ def find_stand_ins(
         if before == 0.0:
             continue  # it acts on neither side: the battery
         own_side = max(by_side, key=lambda side: by_side[side][0])
-        min_gain = threshold(suspect.num_parameters)
+        limit = change_threshold if suspect.name in changing else threshold
+        min_gain = limit(suspect.num_parameters)
         rest_gain = sum(
             dependence.gain for dependence in dependences if dependence.side == own_side
         )

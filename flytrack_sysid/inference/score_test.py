@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg, stats
+from scipy import linalg, optimize, stats
 
 from flytrack_env.effects import BY_NAME, EFFECTS, Effect, acts_on_sticks, takes_motors
 from flytrack_sysid.inference.parameters import DRAIN, TAUS, THRUST_COEFFS, neutral_value, range_of
@@ -25,6 +25,8 @@ from flytrack_sysid.inference.problem import (
 )
 
 FALSE_POSITIVE_RATE = 1e-4  # that an absent effect is named, for each effect
+FALSE_CHANGE_RATE = 1e-5  # that an effect changes within a log although none does, for each effect
+MIN_SIDE_FRACTION = 0.04  # of a log on each side of a change
 # A direction cannot be told from others that explain all but this share of it.
 MIN_INDEPENDENT_FRACTION = 1e-7
 AT_BOUND = 1e-9
@@ -196,6 +198,31 @@ def candidates_for(problem: Problem) -> list[Candidate]:
 def threshold(num_parameters: int) -> float:
     """Return the gain of chi2 above which an effect with this number of parameters is named."""
     return float(stats.chi2.isf(FALSE_POSITIVE_RATE, num_parameters))
+
+
+def change_threshold(
+    num_parameters: int, trimmed: float = MIN_SIDE_FRACTION, chance: float = FALSE_CHANGE_RATE
+) -> float:
+    """Return the gain of chi2 above which an effect changes at some time within a log.
+
+    Without a change, the largest gain of all times (sup-LM) exceeds it with probability ``chance``.
+
+    Source: Andrews 1993, section 5. The tail is that of D. DeLong (Communications in Statistics 10,
+    1981).
+
+    Args:
+        num_parameters: that change.
+        trimmed: share of the log on each side in which no change is searched for.
+        chance: the probability.
+    """
+    span = 2.0 * np.log((1.0 - trimmed) / trimmed)
+
+    def excess(size: float) -> float:
+        crossings = (size - num_parameters) * span + 2.0
+        return float(stats.chi2.logpdf(size, num_parameters) + np.log(crossings) - np.log(chance))
+
+    lowest = float(stats.chi2.isf(chance, num_parameters))
+    return float(optimize.brentq(excess, lowest, 10.0 * lowest + 100.0))
 
 
 class Gain(NamedTuple):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from flytrack_sysid.diagnosis.model_selection import Marginal
-from flytrack_sysid.diagnosis.onset import is_one_flight, threshold, windowed_gains
-from flytrack_sysid.inference.score_test import Linearization
+from flytrack_sysid.diagnosis.onset import is_one_flight, windowed_gains
+from flytrack_sysid.inference.score_test import Linearization, change_threshold
 from flytrack_sysid.log import FlightLog
 
 BLOCKS, TRIMMED = 60, 0.1
@@ -31,9 +31,9 @@ def test_changes_are_found_by_chance_as_rarely_as_the_threshold_says():
     largest = np.array(
         [windowed_gains(*scores(rng), GIVEN, OWN, AFTER)[0].max() for _ in range(600)]
     )
-    share = np.mean(largest > threshold(len(OWN), TRIMMED, chance=0.05))
+    share = np.mean(largest > change_threshold(len(OWN), TRIMMED, chance=0.05))
     assert 0.015 < share < 0.07  # the tail is that of a change at any instant, not at whole seconds
-    assert threshold(1) > 20.0 and threshold(3) > threshold(1)
+    assert change_threshold(1) > 20.0 and change_threshold(3) > change_threshold(1)
 
 
 def test_a_slow_drift_gains_more_as_a_drift_than_as_a_step():
