@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flytrack_sysid.diagnosis.result import Estimated
+from flytrack_sysid.diagnosis.unexplained import find_unexplained
 from flytrack_sysid.diagnosis.vetoes import Selection, select
 from flytrack_sysid.inference import noise as noises
 from flytrack_sysid.inference.chunks import CHUNK_S, Chunks, count_lead_in
@@ -462,8 +463,20 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     is_better = (
         misfit_changes[0] + price < -change_threshold(first.num_parameters)
         and misfit_changes[1] < 0.0
+        and -misfit_changes[0] > gain_of_place(selection)
     )
     return later if is_better else None
+
+
+def gain_of_place(selection: Selection) -> float:
+    """Return the gain of the clearest dependence of what a selection leaves, other than on time.
+
+    A drone that flies through a thermal once sees a wind that begins and ends. Where the place, the
+    airspeed or the like explain more than a change does, that is what the remainder depends on.
+    """
+    state, model = selection.state, selection.model
+    _, dependences = find_unexplained(state.problem, model, selection.base.vector)
+    return max((one.gain for one in dependences if one.name != "time"), default=0.0)
 
 
 def misfit(selection: Selection, problem: Problem) -> float:
