@@ -153,8 +153,8 @@ def removed(
     """
     with jax.enable_x64(True):
         chunks = cut_chunks(clean, np.ones(len(clean), bool), base)
-        vectors = [Problem.of(chunks, model).start for model in (base, extended)]
-        residuals = Problem.of(chunks, extended).residuals(np.stack(vectors))
+        problems = [Problem.of(chunks, model) for model in (base, extended)]
+        residuals = np.stack([one.residuals(one.start[None])[0] for one in problems])
     whitened = residuals[..., :6, 0] / np.repeat([STD["w"], STD["f"]], 3)
     is_counted = chunks.counts[..., :6, 0]
     base_power, power = (float(np.mean(np.square(values[is_counted]))) for values in whitened)

@@ -12,6 +12,7 @@ from flytrack_sysid.inference.parameters import TAUS
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import (
     ALL_BASE_CAUSES,
+    CANDIDATES,
     Candidate,
     Linearization,
     candidates_for,
@@ -34,6 +35,8 @@ MAX_RIVALS = 3
 # Rivals are refitted where first order puts them within NEARLY of chi2, or within a share of the
 # gain: first order is less exact for large changes, and least exact for effects with probes.
 NEARLY, NEAR_SHARE, PROBE_SHARE = 60.0, 0.15, 0.25
+DRAGS = ("linear_drag", "quadratic_drag")  # laws of a force of the air, which a wind moves
+MOVING_AIR = next(one for one in CANDIDATES if one.effect == "wind" and "wind.v_x" in one.fields)
 CLEARLY_CHEAPER = 0.5  # of cost and price: swaps that save less would go back and forth
 
 
@@ -197,7 +200,8 @@ def select_effects(
             continue
         ablations = with_rivals(state, model, linearization, ablated)
         swaps = [swap for one in ablations.values() for swap in one.swaps.values()]
-        best = min((*swaps, *with_lags_anew(state, model)), key=price, default=model)
+        trials = (*swaps, *with_lags_anew(state, model), *with_moving_air(state, model))
+        best = min(trials, key=price, default=model)
         if price(best) >= price(model) - CLEARLY_CHEAPER:
             return state, model, ablations
         model = best
@@ -221,6 +225,28 @@ def with_lags_anew(state: SearchState, model: FittedModel) -> list[FittedModel]:
         return []
     vector[shortest] = problem.start[shortest]
     return [state.fitted(model.candidates, vector)]
+
+
+def with_moving_air(state: SearchState, model: FittedModel) -> list[FittedModel]:
+    """Return a model of drag and a steady push, refitted with each law of drag and moving air.
+
+    Without drag a wind is a push, and where it is found first it stays one. Beside the wrong law of
+    drag that is a local minimum: neither the law nor the wind can be swapped alone.
+    """
+    by_name = {candidate.effect: candidate for candidate in model.candidates}
+    is_push = "wind" in by_name and by_name["wind"].fields != MOVING_AIR.fields
+    if not is_push or by_name.keys().isdisjoint(DRAGS):
+        return []
+    rest = [one for one in model.candidates if one.effect not in ("wind", *DRAGS)]
+    gone = [field for one in model.candidates if one not in rest for field in one.fields]
+    reduced = state.fitted(rest, state.problem.at_start(model.vector, gone))
+    state, linearization = state.linearized(reduced.vector)
+    still = [
+        add_effect(state, linearization, reduced, scored)
+        for scored in score_candidates(state, linearization, reduced)
+        if scored.candidate.effect in DRAGS
+    ]
+    return [state.fitted(one.joined_by(MOVING_AIR), one.vector) for one in still]
 
 
 def price(model: FittedModel) -> float:

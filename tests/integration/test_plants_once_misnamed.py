@@ -1,0 +1,49 @@
+"""Plants whose diagnosis was wrong once, each with what is right of it.
+
+Each was found by drawing plants that no rule was made on, and chose a rule since.
+"""
+
+import pytest
+
+from benchmarks.diagnosis import Trial, make_log
+from flytrack_bench.misspec.suite import load_log_suite
+from flytrack_sysid.diagnosis import diagnose
+
+pytestmark = pytest.mark.slow
+SEED = 6101
+
+
+@pytest.mark.parametrize(
+    ("trial", "names", "is_explained"),
+    [
+        # A steady push beside linear drag was a local minimum: the wind moves the air.
+        (
+            Trial("three", 1002, SEED, "semi_implicit"),
+            {"second_order_rates", "wind", "quadratic_drag"},
+            True,
+        ),
+        # A delay of thrust that ends in flight stood in for a periodic force.
+        (Trial("outside", 1, SEED, "handout"), set(), False),
+    ],
+)
+def test_drawn_plants(trial: Trial, names: set[str], is_explained: bool) -> None:
+    _, _, log, model, _ = make_log(trial)
+    found = diagnose(log, model)
+    assert {cause.effect for cause in found.causes} == names
+    assert found.unexplained.flagged != is_explained
+
+
+@pytest.mark.parametrize(
+    ("log", "names"),
+    [
+        # Thrust that was free on the side of rates explained the motor imbalance.
+        ("52", {"rate_slew_limit", "motor_imbalance"}),
+        # A wind that began and ended stood in for a thermal that the drone passes.
+        ("57", set()),
+    ],
+)
+def test_logs_of_the_suite(log: str, names: set[str]) -> None:
+    plant = load_log_suite("misspec-v1").plant(log)
+    found = diagnose(plant.log, plant.model)
+    assert {cause.effect for cause in found.causes} == names
+    assert found.unexplained.flagged  # gusts, or the thermal
