@@ -208,22 +208,26 @@ def select_effects(
 
 
 def with_lags_anew(state: SearchState, model: FittedModel) -> list[FittedModel]:
-    """Return the model refitted from nominal lags, if any lag ended at its lower bound.
+    """Return the model refitted from other lags, if any lag ended at its lower bound.
 
-    There a lag has no slope that leads back.
+    There a lag has no slope that leads back. Lags of the base start anew from nominal, a lag of an
+    effect from the mean of the effect's other axes.
     """
     problem, vector = state.problem, model.vector.copy()
-    shortest = [
-        index for index in problem.parameter_indices(TAUS) if vector[index] <= problem.low[index]
-    ]
-    shortest = [
+    is_lowest = vector <= problem.low
+    starts = {index: problem.start[index] for index in problem.parameter_indices(TAUS)}
+    for candidate in model.candidates:
+        lags = problem.parameter_indices([probe.field for probe in candidate.probes])
+        others = [vector[index] for index in lags if not is_lowest[index]]
+        starts |= dict.fromkeys(lags, np.mean(others)) if others else {}
+    stuck = [
         index
-        for index in shortest
-        if index in model.indices and problem.start[index] > vector[index]
+        for index, value in starts.items()
+        if index in model.indices and is_lowest[index] and value > vector[index]
     ]
-    if not shortest:
+    if not stuck:
         return []
-    vector[shortest] = problem.start[shortest]
+    vector[stuck] = [starts[index] for index in stuck]
     return [state.fitted(model.candidates, vector)]
 
 
