@@ -180,6 +180,8 @@ def figures_of_motions(lines: list[Line]) -> str:
     columns = [figures(flown(lines, motion, USUAL_RATE)) for motion in MOTIONS]
     rows = []
     for figure, *others in zip(*columns, strict=True):
+        if not any(other.n for other in (figure, *others)):
+            continue  # no such plants; the page counts them
         rows.append([*figure, *(cell for other in others for cell in (other.measured, other.n))])
     heads = [head for motion in MOTIONS for head in (motion, "n")]
     return table(["figure", "target", *heads], rows)
@@ -246,7 +248,7 @@ def main() -> None:
     for line in lines:
         if line.get("visible", 0.0) >= VISIBLE:
             names = {name.split(": ")[1].split(" at ")[0] for name in line["unexplained"]}
-            outside.append((line["depends_on"], " + ".join(sorted(names)) or "none"))
+            outside.append((f"outside: {line['depends_on']}", " + ".join(sorted(names)) or "none"))
     fill_page(
         LINES.with_suffix(".md"),
         "diagnosis",
@@ -258,8 +260,7 @@ def main() -> None:
         visible=VISIBLE,
         figures=figures_of_motions(lines),
         rates=figures_of_rates(lines),
-        singles=count_names("truth | plants | named", singles),
-        outside=count_names("depends on | plants | found", outside),
+        names=count_names("truth | plants | named", [*singles, *outside]),
         misses=misses(lines),
     )
 
