@@ -4,8 +4,8 @@ Closes the loop (``flytrack_loop.close_loop``) on the shipped black box and on p
 effects drawn from the seed, or on plants with a law outside the package's list, and trains three
 alternatives with as many steps: on the nominal model, on the refitted base model, and on randomised
 models without any identification. One process per core. Writes a page, a chart and their records, a
-.jsonl; finished jobs are not run again. ``--redraw docs/results/loop.jsonl`` runs nothing: it writes
-the page and the chart beside such records.
+.jsonl; finished jobs are not run again. ``--redraw docs/results/loop.jsonl`` runs nothing: it
+writes the page and the chart beside such records.
 """
 
 import os

@@ -159,10 +159,12 @@ def main() -> None:
     suites = {result["digest"] for result in found.values()}
     assert len(suites) == 1, "results of several suites"
     logs = {name: len(result["logs"]) for name, result in found.items()}
+    source = report.provenance()
     report.fill_page(
         Path(report.RESULTS / "misspec.md"),
         "misspec",
-        packages=("scipy", "pysindy", "scikit-learn"),
+        commit=source["commit"],
+        date=source["date"],
         digest=suites.pop()[:12],
         logs=", ".join(f"{name} {count}" for name, count in logs.items()),
         against_best=against_best(found),
