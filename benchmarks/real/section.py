@@ -38,7 +38,7 @@ SHOWN_HORIZON_S = "0.5"
 SHOWN_MODELS = ("nominal", "refitted_base", "extended", "placebo")
 # They trade off against each other, so that their mean over the log says more.
 THRUST_COEFFICIENTS = ("c0", "c1", "c2", "c3", "c4", "c5")
-UNSHOWN_WARNING = "outliers, beyond"  # counts of rows, which the record has
+UNSHOWN_WARNINGS = ("outliers, beyond", "v_bat is absent", "of ")  # counts; the record has all
 
 
 def diagnose_log(
@@ -158,8 +158,6 @@ def _interval(estimate: Record) -> str:
 def errors_table(diagnosis: Record) -> str:
     """Return the errors of free flight on held-out rows at one horizon; the record has all."""
     flights = diagnosis["prediction"]["errors"]
-    if not flights:
-        return ""
     rows = []
     for key in flights["nominal"]:
         quantity, unit = split_key(key)
@@ -183,9 +181,11 @@ def format_section(measured: Record, picture: str) -> str:
     ]
     small = ", ".join(f"`{cause['effect']}`" for cause in diagnosis["negligible"])
     learned = diagnosis.get("learned")
-    warnings = [text for text in diagnosis["warnings"] if not text.startswith(UNSHOWN_WARNING)]
+    warnings = [text for text in diagnosis["warnings"] if not text.startswith(UNSHOWN_WARNINGS)]
     cost = f"{measured['cpu_s']:.0f} CPU s, compilation included; commit {measured['commit']}"
     has_flights = diagnosis["prediction"]["errors"]
+    # Else the sentence has the error of position.
+    is_without_positions = bool(has_flights) and "position_m" not in has_flights["nominal"]
     parts = [
         measured["sentence"],
         describe_responses(diagnosis["half_response_s"]),
@@ -194,7 +194,7 @@ def format_section(measured: Record, picture: str) -> str:
         f"motion `{diagnosis['motion']}`; {cost}.",
         causes_table(diagnosis),
         f"Significant, and too small to matter: {small}." if small else "",
-        errors_table(diagnosis),
+        errors_table(diagnosis) if is_without_positions else "",
         f"Unexplained: {', '.join(unexplained) or 'nothing'}.",
         f"Learnt beyond the list: {'; '.join(formulas_of(learned))}." if learned else "",
         "\n".join(f"- {warning}" for warning in warnings),
