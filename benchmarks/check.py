@@ -273,7 +273,6 @@ def write_page() -> None:
             line["name"],
             describe(line["truth"]),
             line["outcome"] if line["truth"] or line["contradicted"] else "no contradiction",
-            describe(line["alternatives"][0]) if line["alternatives"] else "none",
         ]
         for line in by_part["simulators"]
     ]
@@ -297,7 +296,7 @@ def write_page() -> None:
         exact=", ".join(exact),
         num_equal=len(equal),
         pairs=table(f"two faults | {columns}", [*two, outcomes("all", by_part["pairs"])]),
-        simulators=table("simulator | expected | outcome | first explanation", simulators),
+        simulators=table("simulator | expected | outcome", simulators),
         errors=len(lines) - len(done),
         commit=lines[-1]["commit"],
         seconds=", ".join(f"{one:.1f}" for one in cpu_seconds()),

@@ -221,17 +221,18 @@ def count_names(header: str, pairs: Iterable[tuple[str, str]]) -> str:
 
 def misses(lines: list[Line]) -> str:
     """Return every plant on which a name was missing or false, with what could be known."""
-    rows = []
+    motions: dict[tuple[str, ...], list[str]] = {}
     for line in sorted(lines, key=lambda line: [line[name] for name in Trial._fields]):
         names = names_in(line)
         if not is_exact(line) and names != [CLOCK]:
             known = ", ".join(
-                f"{name} {size:.3g}, {beside:.3g}"
+                f"{name} {size:.2g}, {beside:.2g}"
                 for name, (size, beside, _) in line.get("known", {}).items()
             )
-            conditions = f"{line['motion']}, {line['rate']} Hz"
-            rows.append((line["row"], conditions, line["truth"], known, ", ".join(names) or "none"))
-    return table("row | flown | truth | lambda, lambda_sep | named", rows)
+            plant = (f"{line['rate']} Hz", line["truth"], ", ".join(names) or "none")
+            motions.setdefault(plant, []).append(f"{line['motion']}: {known}")
+    rows = [(*plant, "<br>".join(known)) for plant, known in motions.items()]
+    return table("rate | truth | named | motion: lambda, lambda_sep", rows)
 
 
 def main() -> None:
