@@ -210,7 +210,10 @@ def on_evaluator(checkpoint: Checkpoint, model: ModelParameters) -> Thrust:
 
 
 class Measured(NamedTuple):
-    """What was measured of a model: thrust by the model, in the environment, in the C header and in a flight; and the race."""
+    """What was measured of a model: its race, and four thrusts.
+
+    These are by the model, in the environment, in the C header and in a flight.
+    """
 
     craft: TrueCraft
     kind: str

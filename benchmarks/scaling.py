@@ -388,7 +388,7 @@ def figures() -> Iterator[Figure]:
         yield Figure(f"{title}, of that of one", "95 to 105 %", f"{', '.join(curves)} %", 1)
     if one := last_of("rounding"):
         values = ", ".join(f"{one[f'{count} devices']:.1e}" for count in DEVICES)
-        title = f"{list_counts()} devices: the same after 160 steps"
+        title = f"{list_counts()} devices: largest difference of a parameter from one, 160 steps"
         yield Figure(title, "1e-5", values, 1)
         title = "one device, its start changed by 1e-7 or 2e-7, 1,280 steps: the same"
         yield Figure(title, "", spread(one["differences"], ".1e"), len(CHANGES))
