@@ -59,8 +59,6 @@ voltage_v = [{empty_v}, {full_v}]
 """
 
 
-
-
 class TrueCraft(NamedTuple):
     """A craft's truth.
 
