@@ -229,6 +229,7 @@ def write_page() -> None:
     lines = lines_in(LINES)
     flights = [line for line in lines if line["row"] == MEASURED]
     plants = [line for line in lines if line["row"] != MEASURED]
+    rules = count_by_rule(plants)
     scores = ["score lower without it", "score higher"]
     fill_page(
         RESULTS / "ablation.md",
@@ -237,13 +238,13 @@ def write_page() -> None:
         commits=", ".join(sorted({line["commit"] for line in lines})),
         seconds=f"{SECONDS:g}",
         seed=SEED,
-        table=table(["rule", "plants on which it fires", DIFFER, *scores], count_by_rule(plants)),
+        table=table(
+            ["rule", "plants on which it fires", DIFFER, *scores], [row for row in rules if row[1]]
+        ),
+        silent=", ".join(row[0] for row in rules if not row[1]),
         flights=count_whole(flights),
         shortest=f"{SHORTEST_S:g}",
-        measured=table(
-            ["rule", "flights on which it fires", DIFFER],
-            [row[:3] for row in count_by_rule(flights)],
-        ),
+        measured=", ".join(f"{row[0]} {row[1]}" for row in count_by_rule(flights) if row[1]),
     )
 
 

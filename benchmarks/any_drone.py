@@ -59,9 +59,6 @@ voltage_v = [{empty_v}, {full_v}]
 """
 
 
-SOURCES = ("by the model", "in the environment", "in the C header", "in a flight")
-
-
 class TrueCraft(NamedTuple):
     """A craft's truth.
 
@@ -211,7 +208,10 @@ def on_evaluator(checkpoint: Checkpoint, model: ModelParameters) -> Thrust:
 
 
 class Measured(NamedTuple):
-    """What was measured of a model: thrust by the four sources of ``SOURCES``, and the race."""
+    """What was measured of a model: its race, and four thrusts.
+
+    These are by the model, in the environment, in the C header and in a flight.
+    """
 
     craft: TrueCraft
     kind: str
@@ -259,10 +259,10 @@ def table(rows: list[Measured]) -> str:
     lines = []
     for row in rows:
         truth = "-" if row.kind == "nominal" else f"{row.craft.peak / G:.3f}"
-        thrusts = [f"{thrust.full:.3f} / {thrust.hover:.3f}" for thrust in row.thrusts]
+        thrust = f"{row.thrusts[0].full:.3f} / {row.thrusts[0].hover:.3f}"
         laps = [f"{row.finished} of {NUM_STARTS}", f"{row.lap_s:.2f} s"]
-        lines.append([row.craft.name, row.kind, row.battery, truth, *thrusts, *laps])
-    head = f"craft | model | battery | truth | {' | '.join(SOURCES)} | finished | flying lap"
+        lines.append([row.craft.name, row.kind, row.battery, truth, thrust, *laps])
+    head = "craft | model | battery | truth | by the model | finished | flying lap"
     return report.table(head, lines)
 
 

@@ -190,16 +190,6 @@ def write_page() -> None:
     lines = [*last.values()]
     sources = sorted({f"seed {line['seed']} at commit {line['commit']}" for line in lines})
     good = [line for line in lines if "error" not in line]
-    rows = [
-        (
-            line["row"],
-            line["truth"],
-            "; ".join(line["law"]) or "none",
-            ", ".join(line["unexplained"]) or "nothing unexplained",
-        )
-        for line in sorted(good, key=lambda line: (line["row"], line["seed"], line["number"]))
-        if line["row"] in KINDS or line["law"]
-    ]
     report.fill_page(
         LINES.with_suffix(".md"),
         "beyond",
@@ -208,7 +198,6 @@ def write_page() -> None:
         figures=report.figures_table(figures(good)),
         kinds=kinds_table(good),
         real=real_table(),
-        plants=report.table("kind | truth | learnt | left unexplained by the list", rows),
     )
 
 

@@ -221,6 +221,15 @@ def fixed(name: str, lines: list[dict[str, Any]]) -> list[Any]:
     return [name, sum(count.values()), *(count[kind] for kind in FIXED), wrong]
 
 
+def split_rows(rows: list[list[Any]]) -> tuple[list[list[Any]], list[str]]:
+    """Return the rows in which a log was not right, and the names of the others.
+
+    A row: name, how many logs show the fault, how many of these are right, and the wrong ones.
+    """
+    imperfect = [row for row in rows if row[2] < row[1]]
+    return imperfect, [row[0] for row in rows if row[2] == row[1]]
+
+
 def describe(changes: Iterable[Iterable[Any]]) -> str:
     """Return changes as text."""
     return "; ".join(" ".join(map(str, change)) for change in changes) or "none"
@@ -243,24 +252,27 @@ def write_page() -> None:
         named = ", ".join(f"{name} ({count})" for name, count in pairs.most_common())
         bound = f"{100.0 * upper_bound(len(wrong), len(flown)):.1f} %" if flown else ""
         clean.append([kind, len(flown), len(wrong), bound, named])
-    faults = [
-        outcomes(name, [line for line in by_part["faults"] if line["name"] == name])
-        for name in FAULTS
-    ]
+    faults, exact = split_rows(
+        [
+            outcomes(name, [line for line in by_part["faults"] if line["name"] == name])
+            for name in FAULTS
+        ]
+    )
     two = [
         outcomes(name, [line for line in by_part["pairs"] if is_on_one(line) == on_one])
         for name, on_one in (("on one channel", True), ("on two channels", False))
     ]
-    fixes = [
-        fixed(name, [line for line in by_part["fixes"] if name in (line["name"], "all")])
-        for name in [*FIXABLE, "all"]
-    ]
+    fixes, equal = split_rows(
+        [
+            fixed(name, [line for line in by_part["fixes"] if line["name"] == name])
+            for name in FIXABLE
+        ]
+    )
     simulators = [
         [
             line["name"],
             describe(line["truth"]),
             line["outcome"] if line["truth"] or line["contradicted"] else "no contradiction",
-            describe(line["alternatives"][0]) if line["alternatives"] else "none",
         ]
         for line in by_part["simulators"]
     ]
@@ -279,10 +291,12 @@ def write_page() -> None:
         faults=table(f"fault | {columns}", [*faults, outcomes("all", by_part["faults"])]),
         fixes=table(
             "fault | shown | equal | ambiguous | left | wrong | missed | wrong where not shown",
-            fixes,
+            [*fixes, fixed("all", by_part["fixes"])],
         ),
+        exact=", ".join(exact),
+        num_equal=len(equal),
         pairs=table(f"two faults | {columns}", [*two, outcomes("all", by_part["pairs"])]),
-        simulators=table("simulator | expected | outcome | first explanation", simulators),
+        simulators=table("simulator | expected | outcome", simulators),
         errors=len(lines) - len(done),
         commit=lines[-1]["commit"],
         seconds=", ".join(f"{one:.1f}" for one in cpu_seconds()),

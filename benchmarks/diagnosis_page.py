@@ -180,6 +180,8 @@ def figures_of_motions(lines: list[Line]) -> str:
     columns = [figures(flown(lines, motion, USUAL_RATE)) for motion in MOTIONS]
     rows = []
     for figure, *others in zip(*columns, strict=True):
+        if not any(other.n for other in (figure, *others)):
+            continue  # no such plants; the page counts them
         rows.append([*figure, *(cell for other in others for cell in (other.measured, other.n))])
     heads = [head for motion in MOTIONS for head in (motion, "n")]
     return table(["figure", "target", *heads], rows)
@@ -219,17 +221,18 @@ def count_names(header: str, pairs: Iterable[tuple[str, str]]) -> str:
 
 def misses(lines: list[Line]) -> str:
     """Return every plant on which a name was missing or false, with what could be known."""
-    rows = []
+    motions: dict[tuple[str, ...], list[str]] = {}
     for line in sorted(lines, key=lambda line: [line[name] for name in Trial._fields]):
         names = names_in(line)
         if not is_exact(line) and names != [CLOCK]:
             known = ", ".join(
-                f"{name} {size:.3g}, {beside:.3g}"
+                f"{name} {size:.2g}, {beside:.2g}"
                 for name, (size, beside, _) in line.get("known", {}).items()
             )
-            conditions = f"{line['motion']}, {line['rate']} Hz"
-            rows.append((line["row"], conditions, line["truth"], known, ", ".join(names) or "none"))
-    return table("row | flown | truth | lambda, lambda_sep | named", rows)
+            plant = (f"{line['rate']} Hz", line["truth"], ", ".join(names) or "none")
+            motions.setdefault(plant, []).append(f"{line['motion']}: {known}")
+    rows = [(*plant, "<br>".join(known)) for plant, known in motions.items()]
+    return table("rate | truth | named | motion: lambda, lambda_sep", rows)
 
 
 def main() -> None:
@@ -246,7 +249,7 @@ def main() -> None:
     for line in lines:
         if line.get("visible", 0.0) >= VISIBLE:
             names = {name.split(": ")[1].split(" at ")[0] for name in line["unexplained"]}
-            outside.append((line["depends_on"], " + ".join(sorted(names)) or "none"))
+            outside.append((f"outside: {line['depends_on']}", " + ".join(sorted(names)) or "none"))
     fill_page(
         LINES.with_suffix(".md"),
         "diagnosis",
@@ -258,8 +261,7 @@ def main() -> None:
         visible=VISIBLE,
         figures=figures_of_motions(lines),
         rates=figures_of_rates(lines),
-        singles=count_names("truth | plants | named", singles),
-        outside=count_names("depends on | plants | found", outside),
+        names=count_names("truth | plants | named", [*singles, *outside]),
         misses=misses(lines),
     )
 

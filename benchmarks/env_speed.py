@@ -30,6 +30,7 @@ VARIANTS = {
     for name in ("Noisy", "ActionHistory", "Randomized", "Robust")
 }
 MAX_COST = 1.5  # a variant's step over the plain one's
+SMALL_COST = 1.1  # rounds differ by as much
 # Our rate, the peer's, the ratio to reach.
 TARGETS = ((PLAIN, L2F_SMALL, 6.0), (BATCH, L2F_LARGE, 10.0), (DUEL, SMALL_BATCH, 0.4))
 
@@ -212,7 +213,7 @@ def cost_figure(name: str, cost: float, repeats: int) -> report.Figure:
 def effect_costs(repeats: int) -> str:
     """Return a table of the step's cost with each effect or motion, relative to the plain step.
 
-    Both are timed in turns.
+    Both are timed in turns. Those that cost little share a sentence.
     """
     plain, rows = jax_contestant(PLAIN, "FlyTrack-v0", 1024, 200, is_batch=False), []
     for name, model in report.progress(with_effects().items(), "model"):
@@ -220,7 +221,12 @@ def effect_costs(repeats: int) -> str:
         costs = ratios(measure([plain, entry], repeats, warm_up=1), PLAIN, name)
         figure = cost_figure(name, statistics.median(costs), repeats)
         rows.append([*figure, report.spread(costs, ".2f")])
-    return report.table("figure | target | measured | n | lowest to highest", rows)
+    shown = [row for row in rows if float(row[2]) > SMALL_COST]
+    small = [row for row in rows if float(row[2]) <= SMALL_COST]
+    table = report.table("figure | target | measured | n | lowest to highest", shown)
+    names = ", ".join(str(row[0]) for row in small)
+    costs_of_small = report.spread([float(row[2]) for row in small], ".2f")
+    return f"{table}\n\nThe medians of the other {len(small)} are {costs_of_small}: {names}."
 
 
 def measure(entries: list[Contestant], repeats: int, warm_up: int = 3) -> dict[str, list[float]]:

@@ -372,23 +372,25 @@ def last_of(part: str) -> dict[str, Any] | None:
     return records[-1] if records else None
 
 
+def list_counts() -> str:
+    """Return the numbers of devices as text."""
+    return ", ".join(map(str, DEVICES))
+
+
 def figures() -> Iterator[Figure]:
     """Yield the figures of the page; those that were not measured say so."""
     if one := last_of("devices"):
-        for name in (*(f"{count} devices" for count in DEVICES), "2 processes"):
-            title = f"{name}, 1,280 gradient steps: largest difference of a parameter from one"
-            yield Figure(title, "1e-5", f"{one[name]:.1e}", 1)
-        for count in DEVICES:
-            share = f"{100.0 * one[f'{count} devices, curve']:.1f} %"
-            title = f"{count} devices: rise of the mean return over {one['updates']} updates"
-            yield Figure(f"{title}, of that of one", "95 to 105 %", share, 1)
+        names = [*(f"{count} devices" for count in DEVICES), "2 processes"]
+        title = f"{', '.join(names)}: largest difference of a parameter from one, 1,280 steps"
+        yield Figure(title, "1e-5", ", ".join(f"{one[name]:.1e}" for name in names), 1)
+        curves = [f"{100.0 * one[f'{count} devices, curve']:.1f}" for count in DEVICES]
+        title = f"{list_counts()} devices: rise of the mean return over {one['updates']} updates"
+        yield Figure(f"{title}, of that of one", "95 to 105 %", f"{', '.join(curves)} %", 1)
     if one := last_of("rounding"):
-        for count in DEVICES:
-            title = (
-                f"{count} devices, 160 gradient steps: largest difference of a parameter from one"
-            )
-            yield Figure(title, "1e-5", f"{one[f'{count} devices']:.1e}", 1)
-        title = "one device, its start changed by 1e-7 or 2e-7, 1,280 gradient steps: the same"
+        values = ", ".join(f"{one[f'{count} devices']:.1e}" for count in DEVICES)
+        title = f"{list_counts()} devices: largest difference of a parameter from one, 160 steps"
+        yield Figure(title, "1e-5", values, 1)
+        title = "one device, its start changed by 1e-7 or 2e-7, 1,280 steps: the same"
         yield Figure(title, "", spread(one["differences"], ".1e"), len(CHANGES))
         title = f"one device, its start so changed: rise of the mean return over {one['updates']}"
         shares = spread([100.0 * share for share in one["curves"]], ".1f")

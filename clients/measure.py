@@ -1,9 +1,10 @@
-"""What the clients reach, seed by seed: ``python -m clients.measure``.
+"""What the clients reach: ``python -m clients.measure``.
 
-Runs the training of ``make test-clients`` for several seeds and writes a table of all of them.
+Runs the training of ``make test-clients`` for several seeds, prints each, and writes a table.
 """
 
 import time
+from statistics import fmean
 
 from benchmarks import report
 from clients import (
@@ -29,7 +30,20 @@ CLIENTS = {
     "gymnasium": cleanrl_loop,  # a loop of one's own, with Gymnasium's wrappers
     "gymnax": purejaxrl_loop,  # a compiled loop, with gymnax's wrapper
 }
-HEADER = "client | seed | return before | return after | gates before | gates after | CPU (s)"
+HEADER = "client | return before | return after | gates before | gates after | CPU (s)"
+
+
+def summarize(rows: list[tuple[float, ...]]) -> list[str]:
+    """Return the mean of each number of a client over its seeds, with lowest and highest.
+
+    Args:
+        rows: returns and gates before and after, and CPU seconds, of each seed.
+    """
+    cells = []
+    for number, digits in enumerate((".2f", ".2f", ".2f", ".2f", ".0f")):
+        values = [row[number] for row in rows]
+        cells.append(f"{fmean(values):{digits}} ({report.spread(values, digits)})")
+    return cells
 
 
 def main(seeds: int = 5) -> None:
@@ -37,15 +51,17 @@ def main(seeds: int = 5) -> None:
 
     Exits with status 1 if a client misses a margin.
     """
-    reached, rows = dict.fromkeys(CLIENTS, 0), []
+    reached = dict.fromkeys(CLIENTS, 0)
+    rows: dict[str, list[tuple[float, ...]]] = {name: [] for name in CLIENTS}
     for name, client in CLIENTS.items():
         for seed in range(seeds):
             start_s = time.process_time()
             outcome = client.measure(seed)
             seconds = time.process_time() - start_s
             reached[name] += outcome.has_gained(client.RETURN_MARGIN, client.GATE_MARGIN)
-            rows.append((name, seed, *(f"{value:.2f}" for value in outcome), f"{seconds:.0f}"))
-            print(*rows[-1], sep=", ", flush=True)
+            rows[name].append((*outcome, seconds))
+            numbers = [f"{value:.2f}" for value in rows[name][-1]]
+            print(name, seed, *numbers, sep=", ", flush=True)
     figures = [
         report.Figure(
             f"{name}: seeds that gain {client.RETURN_MARGIN:g} in return "
@@ -61,7 +77,7 @@ def main(seeds: int = 5) -> None:
         "clients",
         packages=[*CLIENTS, "torch"],
         figures=report.figures_table(figures),
-        table=report.table(HEADER, rows),
+        table=report.table(HEADER, [[name, *summarize(of)] for name, of in rows.items()]),
     )
     if min(reached.values()) < seeds:
         raise SystemExit(1)

@@ -11,7 +11,12 @@ from flytrack_env.pictures import (
     write_camera_view,
     write_pictures,
 )
-from flytrack_env.references import ghost_rollout, shipped_reference, shipped_references
+from flytrack_env.references import (
+    ghost_restarts,
+    ghost_rollout,
+    shipped_reference,
+    shipped_references,
+)
 from flytrack_env.rollout import load_named_rollouts
 from flytrack_env.tracks import load_track
 from flytrack_env.viz_rerun.recording import write_recording
@@ -35,7 +40,9 @@ def run_show(flags: Show) -> None:
     num_steps = max((len(one.states) for one in recorded), default=GHOST_STEPS)
     if flags.ghost or not recorded:
         references = shipped_references(track, (flags.ghost_model,))
-        recorded.append(Trajectory("time-optimal", *ghost_rollout(references, num_steps)))
+        restarts = ghost_restarts(references, num_steps)
+        ghost = ghost_rollout(references, num_steps)
+        recorded.append(Trajectory("time-optimal", *ghost, restarts=restarts))
     optimal = (
         shipped_reference(track.name, "flying", flags.ghost_model) if flags.animation else None
     )

@@ -19,7 +19,7 @@ from baselines.purejaxrl_ppo.networks import Memory, Policy
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.env import EnvParams
 from flytrack_env.episodes import EpisodicEnvironment
-from flytrack_env.references import References, ghost_rollout
+from flytrack_env.references import References, ghost_restarts, ghost_rollout
 from flytrack_env.rollout import save_rollout
 from flytrack_env.state import POSITION, pack
 from flytrack_env.terminations import Causes
@@ -162,7 +162,9 @@ def record_flights(
         shown.append(Trajectory(name, *flight.flown(), ended=ended))
     if references is not None:
         longest = max(len(flight.states) for flight in shown)
-        shown.append(Trajectory("time-optimal", *ghost_rollout(references, longest)))
+        restarts = ghost_restarts(references, longest)
+        ghost = ghost_rollout(references, longest)
+        shown.append(Trajectory("time-optimal", *ghost, restarts=restarts))
     write_recording(path, shown, track)
 
 

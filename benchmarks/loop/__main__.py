@@ -3,8 +3,9 @@
 Closes the loop (``flytrack_loop.close_loop``) on the shipped black box and on plants with hidden
 effects drawn from the seed, or on plants with a law outside the package's list, and trains three
 alternatives with as many steps: on the nominal model, on the refitted base model, and on randomised
-models without any identification. One process per core. Writes a page and a chart; finished jobs
-are not run again.
+models without any identification. One process per core. Writes a page, a chart and their records, a
+.jsonl; finished jobs are not run again. ``--redraw docs/results/loop.jsonl`` runs nothing: it
+writes the page and the chart beside such records.
 """
 
 import os
@@ -16,8 +17,8 @@ from typing import Any
 
 from baselines.purejaxrl_ppo import Config
 from benchmarks.loop.jobs import LAW, SHARED, pin, run_job
-from benchmarks.loop.page import write_page
-from benchmarks.report import command, progress
+from benchmarks.loop.page import read_records, write_page, write_records
+from benchmarks.report import command, command_line, progress, provenance, provenance_line
 
 
 def run_all(plants: list[str], out: Path, steps: int, seed: int) -> list[dict[str, Any]]:
@@ -40,15 +41,29 @@ def main(
     steps: int = Config.total_timesteps,
     out: Path = Path("runs/loop"),
     page: Path | None = None,
+    redraw: Path | None = None,
 ) -> None:
     """Run what is missing, print and write the page; exit 1 on a missed target.
 
     plants: with hidden effects, beside the shipped one. laws: plants with a law outside the list,
     instead. seed: of plants, trainings, logs and evaluations. steps: of every training. out: folder
-    of all runs. page: by default loop.md in it.
+    of all runs. page: by default loop.md in it. redraw: records to write the page of, instead.
     """
-    jobs = [f"{LAW}{number}" for number in range(laws)] or ["shipped", *map(str, range(plants))]
-    if not write_page(page or out / "loop.md", run_all(jobs, out, steps, seed), steps):
+    if redraw is not None:
+        about, results = read_records(redraw)
+        path = redraw.with_suffix(".md")
+    else:
+        jobs = [f"{LAW}{number}" for number in range(laws)] or ["shipped", *map(str, range(plants))]
+        results = run_all(jobs, out, steps, seed)
+        about = {
+            "command": command_line(),
+            "steps": steps,
+            "cpu_min": sum(result["cpu_s"] for result in results) / 60.0,
+            "provenance": provenance_line(provenance()),
+        }
+        path = page or out / "loop.md"
+        write_records(path.with_suffix(".jsonl"), results, about)
+    if not write_page(path, results, about):
         raise SystemExit(1)
 
 

@@ -1,37 +1,38 @@
-"""The page of the loop's benchmark: each policy on each plant, and what the extension changed."""
+"""The page of the loop's benchmark: each policy on each plant, and what the extension changed.
 
+Beside the page are a chart and a .jsonl: what was run in its first line, a plant in each other.
+"""
+
+import json
 import math
+import re
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
 
 from benchmarks import report
+from flytrack_env.effects import BY_NAME
 from flytrack_env.files import write_atomically
-from flytrack_env.pictures.drawing import png_of
+from flytrack_env.pictures.drawing import new_figure, plain, png_of
+from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
 
-# Stage -> its policy's name, and its mark and colour in the chart.
-POLICIES = {
-    "before": ("minimal model", "o", "C3"),
-    "after": ("extended model", "o", "C2"),
-    "refitted_base": ("refitted base", "s", "C0"),
-    "nominal": ("nominal model", "v", "0.5"),
-    "randomised": ("randomised, no identification", "^", "C1"),
+POLICIES = {  # stage -> its policy's name
+    "before": "minimal model",
+    "after": "extended model",
+    "refitted_base": "refitted base",
+    "nominal": "nominal model",
+    "randomised": "randomised, no identification",
 }
+RACE = ("finish", "lap (s)", "gap (%)")
 # The hidden effects matter where the minimal model's policy is worse than this.
 MATTERS_BELOW, MATTERS_ABOVE_PERCENT = 0.80, 3.0
 TARGET_SUCCESS, TARGET_GAP_PERCENT, TARGET_SHARE = 0.95, 1.0, 0.9
-MAX_GAP_PERCENT = 10.0  # larger gaps, and policies without a lap, are drawn here
-SPREAD = 0.12  # between the marks of a column
-DPI = 130
-# Kind, key and format of the errors of a model.
-ERRORS = (
-    ("one_step_nrmse", "v", ".4f"),
-    ("one_step_nrmse", "q", ".4f"),
-    ("position_m", "1", ".3f"),
-)
+MAX_GAP_PERCENT = 10.0  # larger gaps are drawn here
+DPI = 150
+HEIGHT_IN, ROW_IN, PANEL_IN = 1.5, 0.2, 2.0  # of the chart: beside the rows, a row, a panel
 Stage = dict[str, Any]
 Stages = dict[str, Stage]  # of a plant, by name
 
@@ -58,37 +59,49 @@ def _number(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
 
 
-def _race_cell(stage: Stage) -> str:
-    plant, gap = stage["plant"], stage["lap_gap_percent"]
-    success = f"{plant['success']:.1%} ({stage['simulator']['success']:.1%})"
-    return f"{success}, {_number(plant['flying_lap_s'], '.3f')} s, {_number(gap, '+.2f')} %"
+def _race_cells(stage: Stage) -> list[str]:
+    plant = stage["plant"]
+    return [
+        f"{plant['success']:.1%}",
+        _number(plant["flying_lap_s"], ".3f"),
+        _number(stage["lap_gap_percent"], "+.2f"),
+    ]
 
 
-def race_table(by_job: dict[str, Stages]) -> str:
-    """Return success and flying lap on the plant, and the gap to the simulator, by policy."""
-    rows = []
-    for job, stages in by_job.items():
-        cells = [_race_cell(stages[name]) for name in POLICIES]
-        rows.append([job, "yes" if does_matter(stages) else "no", *cells])
-    return report.table(["plant", "matters", *(name for name, _, _ in POLICIES.values())], rows)
+def _names(text: str) -> str:
+    """Return what is hidden without its numbers."""
+    return re.sub(r"\(.*?\)", "", text).replace(" + ", ", ")
 
 
-def model_table(results: list[dict[str, Any]], by_job: dict[str, Stages]) -> str:
-    """Return hidden and named effects, and the models' errors on held-out flights."""
+def race_table(results: list[dict[str, Any]], by_job: dict[str, Stages]) -> str:
+    """Return how the policies of minimal and extended model race, and their models' errors."""
     rows = []
     for result in results:
         stages = by_job[result["job"]]
-        errors = [stages[name]["errors"] for name in ("before", "refitted_base", "after")]
-        cells = [
-            " / ".join(_number(error[kind].get(key), digits) for error in errors)
-            for kind, key, digits in ERRORS
+        errors = [stages[name]["errors"]["position_m"].get("1") for name in ("before", "after")]
+        rows.append(
+            [
+                result["job"] + (", matters" if does_matter(stages) else ""),
+                _names(result["hidden"]),
+                *_race_cells(stages["before"]),
+                *_race_cells(stages["after"]),
+                " to ".join(_number(error, ".2f") for error in errors),
+            ]
+        )
+    heads = [f"{model}: {head}" for model in ("minimal", "extended") for head in RACE]
+    return report.table(["plant", "hidden", *heads, "free flight of 1 s (m)"], rows)
+
+
+def false_names(results: list[dict[str, Any]]) -> str:
+    """Return the effects that were named and are not in the plant, by plant."""
+    by_plant = []
+    for result in results:
+        names = [
+            name for name in result["causes"] if name in BY_NAME and name not in result["hidden"]
         ]
-        names = ", ".join(result["causes"]) or "nothing"
-        log = f"{result['race_log_s']:g} s"
-        rows.append([result["job"], result["hidden"], names, log, *cells])
-    return report.table(
-        "plant | hidden | named | log | velocity | attitude | free flight of 1 s (m)", rows
-    )
+        if names and result["job"] != "shipped":  # of which no truth is published
+            by_plant.append(f"{result['job']}: {', '.join(names)}")
+    return "; ".join(by_plant) or "none"
 
 
 def figures(plants: list[Stages]) -> tuple[list[report.Figure], bool]:
@@ -113,45 +126,106 @@ def figures(plants: list[Stages]) -> tuple[list[report.Figure], bool]:
     ], sum(is_met) >= TARGET_SHARE * len(is_met)
 
 
+def draw_policy(axes: Axes, stages: list[Stage]) -> int:
+    """Draw a policy's lap gaps, a row a plant; return on how many it reaches the target."""
+    plain(axes).axvspan(-TARGET_GAP_PERCENT, TARGET_GAP_PERCENT, color=GREEN, alpha=0.15)
+    num_good = 0
+    for row, stage in enumerate(stages):
+        success, gap = stage["plant"]["success"], stage["lap_gap_percent"]
+        if gap is None:
+            axes.text(0.0, row, "no lap", fontsize=6, color=GREY, va="center", ha="center")
+            continue
+        does_finish = success >= TARGET_SUCCESS
+        is_good = does_finish and abs(gap) <= TARGET_GAP_PERCENT
+        num_good += is_good
+        shown = float(np.clip(gap, -MAX_GAP_PERCENT, MAX_GAP_PERCENT))
+        mark = "o" if shown == gap else ">" if gap > 0.0 else "<"
+        colour = BLUE if is_good else ORANGE if does_finish else GREY
+        axes.plot(shown, row, mark, color=colour, markersize=5, clip_on=False, zorder=3)
+        if not does_finish:
+            axes.annotate(
+                f"{success:.0%} finish",
+                (shown, row),
+                (-6 if gap > 0.0 else 6, 0),
+                textcoords="offset points",
+                fontsize=6,
+                color=GREY,
+                va="center",
+                ha="right" if gap > 0.0 else "left",
+            )
+    return num_good
+
+
 def draw_chart(by_job: dict[str, Stages]) -> bytes:
-    """Return the chart as PNG: success and lap gap, a column per plant, a mark per policy."""
-    figure = Figure(figsize=(max(7.0, 0.75 * len(by_job) + 2.0), 6.0), layout="constrained")
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    for number, (name, (label, marker, colour)) in enumerate(POLICIES.items()):
-        stages = [stages[name] for stages in by_job.values()]
-        columns = np.arange(len(stages)) + SPREAD * (number - 2)
-        success = [100.0 * stage["plant"]["success"] for stage in stages]
-        gap = np.minimum([gap_percent(stage) for stage in stages], MAX_GAP_PERCENT)
-        for axes, values in ((upper, success), (lower, gap)):
-            axes.plot(columns, values, marker, color=colour, label=label, markersize=7)
-    upper.set(ylabel="finish 3 laps on the plant (%)", ylim=(None, 101.0))
-    lower.set(xlabel="plant", ylabel=f"|lap gap| (%), {MAX_GAP_PERCENT:g}: more, or no lap")
-    lower.set_xticks(range(len(by_job)), [*by_job])
-    for axes, target in ((upper, 95.0), (lower, 1.0)):
-        axes.axhline(target, color="0.7", linewidth=1.0)
-        axes.grid(axis="y", alpha=0.3)
-    figure.legend(*upper.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    """Return the chart as PNG: a panel a policy, a row a plant, its lap gap and who finishes.
+
+    Plants that matter are on top.
+    """
+    jobs = sorted(reversed(by_job), key=lambda job: does_matter(by_job[job]))
+    figure = new_figure(PANEL_IN * len(POLICIES) + 0.6, HEIGHT_IN + ROW_IN * len(jobs))
+    panels = figure.subplots(1, len(POLICIES), sharex=True, sharey=True)
+    num_quiet = sum(not does_matter(stages) for stages in by_job.values())
+    for axes, (name, label) in zip(panels, POLICIES.items(), strict=True):
+        num_good = draw_policy(axes, [by_job[job][name] for job in jobs])
+        title = f"{label.split(',')[0]}\n{num_good} of {len(jobs)} reach the target"
+        axes.set_title(title, fontsize=8, loc="left")
+        axes.axhline(num_quiet - 0.5, color="0.4", linewidth=0.8)
+        axes.tick_params(labelsize=7)
+    panels[0].set_yticks(range(len(jobs)), jobs)
+    panels[0].set_ylim(-0.7, len(jobs) - 0.3)
+    panels[0].set_xlim(-1.05 * MAX_GAP_PERCENT, 1.05 * MAX_GAP_PERCENT)
+    figure.supylabel("plant (above the line: effects matter)", fontsize=8)
+    caption = (
+        "how much longer the lap is on the plant than in the policy's simulator (%)\n"
+        f"triangle: beyond {MAX_GAP_PERCENT:g} %. grey: fewer than {TARGET_SUCCESS:.0%} finish. "
+        "shaded: the target"
+    )
+    figure.supxlabel(caption, fontsize=8)
     return png_of(figure, DPI)
 
 
-def write_page(path: Path, results: list[dict[str, Any]], steps: int) -> bool:
-    """Write the page and its chart; return whether the target is met."""
+def write_records(path: Path, results: list[dict[str, Any]], about: dict[str, Any]) -> None:
+    """Write what the page and the chart are made of, a plant a line, below what was run."""
+    kept = ("job", "hidden", "causes", "race_log_s", "stages")
+    lines = [about, *({name: result[name] for name in kept} for result in results)]
+    write_atomically(path, "".join(f"{json.dumps(line)}\n" for line in lines).encode())
+
+
+def read_records(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return what was run, and the plants, of a .jsonl beside a page."""
+    about, *results = map(json.loads, path.read_text(encoding="utf-8").splitlines())
+    return about, results
+
+
+def write_page(path: Path, results: list[dict[str, Any]], about: dict[str, Any]) -> bool:
+    """Write the page and its chart; return whether the target is met.
+
+    Args:
+        path: of the page; the chart is beside it.
+        results: of the plants.
+        about: ``command``, ``steps`` of a training, ``cpu_min``, ``provenance``, and ``notes`` on
+            these results, if any.
+    """
     by_job = {
         result["job"]: {stage["name"]: stage for stage in result["stages"]} for result in results
     }
     rows, is_met = figures([*by_job.values()])
     chart = path.with_suffix(".png")
     write_atomically(chart, draw_chart(by_job))
-    report.fill_page(
-        path,
+    text = report.filled(
         "loop",
-        millions=steps / 1e6,
+        command=about["command"],
+        millions=about["steps"] / 1e6,
         figures=report.figures_table(rows),
         below=MATTERS_BELOW,
         above_percent=MATTERS_ABOVE_PERCENT,
         chart=chart.name,
-        race=race_table(by_job),
-        models=model_table(results, by_job),
-        cpu_min=sum(result["cpu_s"] for result in results) / 60.0,
+        race=race_table(results, by_job),
+        false_names=false_names(results),
+        notes=f"{about['notes']}\n\n" if about.get("notes") else "",
+        records=path.with_suffix(".jsonl").name,
+        cpu_min=about["cpu_min"],
+        provenance=about["provenance"],
     )
+    report.write_page(path, text)
     return is_met

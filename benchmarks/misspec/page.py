@@ -84,21 +84,6 @@ def figures_table(found: dict[str, Line]) -> str:
     return report.table(heads, rows)
 
 
-def by_condition(found: dict[str, Line], field: str) -> str:
-    """Return exact sets and silence on clean plants by motion or noise, a row a method."""
-    values = sorted({line[field] for line in found[OURS]["logs"].values()})
-    rows = []
-    for name, result in found.items():
-        cells = []
-        for value in values:
-            lines = [line for line in result["logs"].values() if line[field] == value]
-            named = [line["exact"] for line in lines if line["row"] in NAMED_ROWS]
-            clean = [line["silent"] for line in lines if line["row"] == "clean"]
-            cells.append(f"{sum(named)} of {len(named)}, {sum(clean)} of {len(clean)}")
-        rows.append([name, *cells])
-    return report.table(["method", *values], rows)
-
-
 def missed(lines: dict[str, Line]) -> dict[str, Line]:
     """Return the lines on which not everything is right that could be."""
     result = {}
@@ -174,18 +159,18 @@ def main() -> None:
     suites = {result["digest"] for result in found.values()}
     assert len(suites) == 1, "results of several suites"
     logs = {name: len(result["logs"]) for name, result in found.items()}
+    source = report.provenance()
     report.fill_page(
         Path(report.RESULTS / "misspec.md"),
         "misspec",
-        packages=("scipy", "pysindy", "scikit-learn"),
+        commit=source["commit"],
+        date=source["date"],
         digest=suites.pop()[:12],
         logs=", ".join(f"{name} {count}" for name, count in logs.items()),
         against_best=against_best(found),
         naming=shares_table(found, NAMING),
         others=shares_table(found, OTHERS),
         figures=figures_table(found),
-        motions=by_condition(found, "motion"),
-        noises=by_condition(found, "noise"),
         misses=misses_table(found[OURS]["logs"]),
     )
 

@@ -34,6 +34,11 @@ STYLES: dict[str, dict[str, Any]] = {
     "network": {"color": "black", "linestyle": "--"},
 }
 WIDTH_IN, HEIGHT_IN = 2.6, 3.2
+SHOWN_HORIZON_S = "0.5"
+SHOWN_MODELS = ("nominal", "refitted_base", "extended", "placebo")
+# They trade off against each other, so that their mean over the log says more.
+THRUST_COEFFICIENTS = ("c0", "c1", "c2", "c3", "c4", "c5")
+UNSHOWN_WARNINGS = ("outliers, beyond", "v_bat is absent", "of ")  # counts; the record has all
 
 
 def diagnose_log(
@@ -131,25 +136,19 @@ def draw_errors(measured: Record) -> Figure | None:
 
 
 def causes_table(diagnosis: Record) -> str:
-    """Return the causes with intervals, gains and what they may be confused with."""
+    """Return the causes with intervals and what they may be confused with."""
     rows = []
     for cause in (*diagnosis["causes"], *diagnosis["beyond_the_list"]):
         values = [
             f"{name} {format_number(one['value'], one['unit'])} ({_interval(one)})"
             for name, one in cause["parameters"].items()
+            if name not in THRUST_COEFFICIENTS
         ]
         if cause["beyond"]:
             values.append(f"**not named; beyond the list: {cause['beyond']}**")
-        gains = [cause[key] for key in ("chi2_gain", "heldout_gain", "lambda", "lambda_sep")]
-        rival = cause["closest_rival"]
-        none = f"no (closest: {rival})" if rival else "not tried"
-        equivalent = ", ".join(cause["equivalent"]) or none
-        name = f"`{cause['effect']}`"
-        rows.append([name, "<br>".join(values), *map(format_number, gains), equivalent])
-    header = (
-        "cause | values, 95 % intervals | chi2_gain | heldout_gain | lambda | lambda_sep | alike?"
-    )
-    return table(header, rows)
+        equivalent = ", ".join(cause["equivalent"])
+        rows.append([f"`{cause['effect']}`", "<br>".join(values), equivalent])
+    return table("cause | values, 95 % intervals | or", rows)
 
 
 def _interval(estimate: Record) -> str:
@@ -157,32 +156,15 @@ def _interval(estimate: Record) -> str:
 
 
 def errors_table(diagnosis: Record) -> str:
-    """Return the errors of the models on held-out rows, of one step and of free flight."""
-    one_step = {name: error["one_step_nrmse"] for name, error in diagnosis["error"].items()}
+    """Return the errors of free flight on held-out rows at one horizon; the record has all."""
     flights = diagnosis["prediction"]["errors"]
-    columns = [*dict.fromkeys([*one_step, *flights])]
     rows = []
-    for channel in one_step["nominal"]:
-        cells = [format_number(one_step.get(name, {}).get(channel)) for name in columns]
-        rows.append([f"{channel}, one step, NRMSE", *cells])
-    for key, by_horizon in flights.get("nominal", {}).items():
+    for key in flights["nominal"]:
         quantity, unit = split_key(key)
-        for horizon in by_horizon:
-            errors = [flights.get(name, {}).get(key, {}).get(horizon) for name in columns]
-            rows.append([f"{quantity} after {horizon} s, {unit}", *map(format_number, errors)])
-    heads = [name.replace("_", " ") for name in columns]
-    return table(["rms error on held-out rows", *heads], rows)
-
-
-def changed_table(diagnosis: Record) -> str:
-    """Return every parameter of the extended model that is not nominal."""
-    rows = []
-    for one in diagnosis["changed"]:
-        nominal, value = (format_number(one[key], one["unit"]) for key in ("nominal", "value"))
-        if one["is_at_bound"]:
-            value += " (end of what is searched)"
-        rows.append([f"`{one['name']}`", nominal, value, _interval(one)])
-    return table("parameter | nominal | extended | 95 % interval", rows)
+        errors = [flights.get(name, {}).get(key, {}).get(SHOWN_HORIZON_S) for name in SHOWN_MODELS]
+        rows.append([f"{quantity}, {unit}", *map(format_number, errors)])
+    heads = [name.replace("_", " ") for name in SHOWN_MODELS]
+    return table([f"rms error after {SHOWN_HORIZON_S} s", *heads], rows)
 
 
 def formulas_of(learned: Record) -> list[str]:
@@ -199,8 +181,11 @@ def format_section(measured: Record, picture: str) -> str:
     ]
     small = ", ".join(f"`{cause['effect']}`" for cause in diagnosis["negligible"])
     learned = diagnosis.get("learned")
+    warnings = [text for text in diagnosis["warnings"] if not text.startswith(UNSHOWN_WARNINGS)]
     cost = f"{measured['cpu_s']:.0f} CPU s, compilation included; commit {measured['commit']}"
     has_flights = diagnosis["prediction"]["errors"]
+    # Else the sentence has the error of position.
+    is_without_positions = bool(has_flights) and "position_m" not in has_flights["nominal"]
     parts = [
         measured["sentence"],
         describe_responses(diagnosis["half_response_s"]),
@@ -209,11 +194,9 @@ def format_section(measured: Record, picture: str) -> str:
         f"motion `{diagnosis['motion']}`; {cost}.",
         causes_table(diagnosis),
         f"Significant, and too small to matter: {small}." if small else "",
-        errors_table(diagnosis),
-        "Every parameter that changed:",
-        changed_table(diagnosis),
+        errors_table(diagnosis) if is_without_positions else "",
         f"Unexplained: {', '.join(unexplained) or 'nothing'}.",
         f"Learnt beyond the list: {'; '.join(formulas_of(learned))}." if learned else "",
-        *diagnosis["warnings"],
+        "\n".join(f"- {warning}" for warning in warnings),
     ]
     return "\n\n".join(filter(None, parts))

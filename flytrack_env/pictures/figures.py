@@ -26,7 +26,8 @@ from flytrack_env.state import APPLIED_ACTION, BATTERY, POSITION, Action
 from flytrack_env.tracks import Gate, Track, build_course
 
 # From above.
-PANEL_IN, BESIDE_IN, TITLE_IN = 7.0, 1.6, 1.0  # the view's longer side; room beside and above it
+# The view's longer side; room beside it, and above and below.
+PANEL_IN, BESIDE_IN, TITLE_IN = 7.0, 1.6, 1.4
 NARROWEST = 0.35  # of the longer side
 MARGIN_SHARE = 0.03
 TOP_VIEW = [0, 1]

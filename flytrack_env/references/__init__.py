@@ -31,6 +31,7 @@ __all__ = [
     "Reference",
     "ReferenceFileError",
     "References",
+    "ghost_restarts",
     "ghost_rollout",
     "is_model_of",
     "load_reference",
@@ -257,7 +258,7 @@ def ghost_rollout(references: References, num_steps: int) -> tuple[np.ndarray, n
 
     It is a standing start, then flying laps. Row t is the sample that is nearest in time, at most
     half a step off: laps are no whole number of steps. The ghost jumps where its start ends,
-    because a standing start may pass its last gate anywhere.
+    because a standing start may pass its last gate anywhere (``ghost_restarts``).
     """
     standing, flying = references["standing"], references["flying"]
     times_s = standing.dt_s * np.arange(num_steps)
@@ -270,3 +271,16 @@ def ghost_rollout(references: References, num_steps: int) -> tuple[np.ndarray, n
         return np.where(is_start[:, None], *picked)
 
     return pick(standing.states, flying.states), pick(standing.commands, flying.commands)
+
+
+def ghost_restarts(references: References, num_steps: int) -> np.ndarray:
+    """Return the rows of ``ghost_rollout`` at which a flight of it begins, (num_steps,) bool.
+
+    Across these the ghost does not move: it goes to the beginning of a flying lap, with the battery
+    of that. Row 0 is one.
+    """
+    standing, flying = references["standing"], references["flying"]
+    times_s = standing.dt_s * np.arange(num_steps)
+    laps = np.floor((times_s - standing.time_s) / flying.time_s)
+    number = np.maximum(laps, -1.0)  # -1: the standing start, however long that is
+    return np.diff(number, prepend=-2.0) > 0.0

@@ -293,13 +293,23 @@ class Writer:
                 self._send(f"{self.world}/trajectory/{name}", rows, columns.partition(lengths))
 
     def _send_plot(self, plot: Plot, label: str) -> None:
-        """Send a line of a plot, in the colour of its model or of the flight, and its name once."""
+        """Send a line of a plot, in the colour of its model or of the flight, and its name once.
+
+        It has a gap where the path begins anew: the drone did not move from one to the other.
+        """
         entity, is_command = f"{self.plots}/{plot.path}", plot.path.startswith("action/")
         colour = self.colours[plot.model or self.trajectory.name]
         shade = tuple(int(DIM**is_command * part) for part in colour)
         width = THIN if is_command else THICK
         self._log(entity, rr.SeriesLines(names=label + plot.label, colors=shade, widths=width))
-        self._send(entity, self.all_rows, rr.Scalars.columns(scalars=plot.values))
+        self._send(entity, self.all_rows, rr.Scalars.columns(scalars=self._with_gaps(plot.values)))
+
+    def _with_gaps(self, values: np.ndarray) -> np.ndarray:
+        """Return values of all rows, NaN where the path begins anew but in the first row."""
+        if self.trajectory.restarts is None:
+            return values
+        is_gap = self.trajectory.restarts & (np.arange(len(values)) > 0)
+        return np.where(is_gap, np.nan, values)
 
     def _send_passes(self, race: FlownRace) -> None:
         """Send markers where gates were passed, all so far, and at the last lap's end its time."""

@@ -31,7 +31,7 @@ RUN = (
     "environment.md",
     "effects.md",
     "gymnasium.md",
-    "pictures.md",
+    "recordings.md",
     "identification.md",
     "real_logs.md",
     "check.md",

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from flytrack.cli import main
 from flytrack_env.flown_race import follow_race
-from flytrack_env.references import ghost_rollout, shipped_references
+from flytrack_env.references import ghost_restarts, ghost_rollout, shipped_references
 from flytrack_env.rollout import save_rollout
 from flytrack_env.state import POSITION, Action
 from flytrack_env.tracks import build_course, load_track
@@ -66,6 +66,26 @@ def test_gates_alone_are_flown_as_the_flight_passes_them(tmp_path, is_back):
     vectors = recording.once("/world/gates/direction", "Arrows3D:vectors")
     forward = np.stack(build_course(TRACK).gates.forward, axis=-1)
     assert_allclose(vectors, -forward if is_back else forward, atol=1e-6)
+
+
+def test_a_ghost_does_not_jump_where_its_start_or_lap_ends(tmp_path):
+    references = shipped_references(TRACK, ("nominal",))
+    num_steps = 900
+    states, actions = ghost_rollout(references, num_steps)
+    restarts = ghost_restarts(references, num_steps)
+    start_s, lap_s = (references[kind].time_s for kind in ("standing", "flying"))
+    rows = [0, *(int(np.ceil(100.0 * (start_s + lap * lap_s))) for lap in range(2))]
+    assert np.flatnonzero(restarts).tolist() == rows
+    steps_m = np.linalg.norm(np.diff(states[:, POSITION], axis=0), axis=1)
+    speeds_m = 0.01 * np.linalg.norm(states[:-1, 3:6], axis=1)
+    is_jump = np.abs(steps_m - speeds_m) > 0.1
+    assert set(np.flatnonzero(is_jump) + 1) == {rows[1]}  # which a line would draw as motion
+    ghost = viz.Trajectory("ghost", states, actions, restarts=restarts)
+    viz.write_recording(tmp_path / "ghost.rrd", [ghost], TRACK)
+    recording = Recording(tmp_path / "ghost.rrd")
+    for path in ("speed", "battery", "orientation/yaw"):
+        plotted = recording.series(f"/plots/{path}", "Scalars:scalars")
+        assert np.flatnonzero(np.isnan(plotted)).tolist() == rows[1:], path
 
 
 def with_state(index, value):
