@@ -6,7 +6,6 @@ forward, y left, z up; rear right, front right, rear left, front left. A pilot w
 the rate of the log keeps a craft in the air.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -18,8 +17,7 @@ STEP_S = 1e-3
 TO_TORQUE = np.stack([PLACES[:, 1], -PLACES[:, 0], YAW])  # (3, 4)
 
 
-@dataclass
-class Crafts:
+class Crafts(NamedTuple):
     """Crafts; (n, ...) each.
 
     Attributes:
@@ -29,9 +27,9 @@ class Crafts:
         thrust: of each motor at full speed, N, (n, 4).
         linear: share of the thrust that goes with the speed, not with its square, (n,).
         yaw_arm: torque over thrust, m, (n,).
-        momentum: of a rotor at full speed, kg m^2/s, (n,).
         up_s: lag of a motor that speeds up, (n,).
         down_s: of one that slows down, (n,).
+        momentum: of a rotor at full speed, kg m^2/s, (n,).
         drag: force against the airspeed, by body axis, N s/m, (n, 3).
         quadratic: the same with the square of each axis's airspeed, N s^2/m^2, (n, 3).
         rotor_drag: force against the airspeed in the rotors' plane over the thrust, s/m, (n,).
@@ -44,16 +42,13 @@ class Crafts:
     thrust: np.ndarray
     linear: np.ndarray
     yaw_arm: np.ndarray
-    momentum: np.ndarray
     up_s: np.ndarray
     down_s: np.ndarray
-    drag: np.ndarray
-    quadratic: np.ndarray
-    rotor_drag: np.ndarray
-    damping: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.mass)
+    momentum: np.ndarray = np.zeros(1)
+    drag: np.ndarray = np.zeros((1, 3))
+    quadratic: np.ndarray = np.zeros((1, 3))
+    rotor_drag: np.ndarray = np.zeros(1)
+    damping: np.ndarray = np.zeros((1, 3))
 
 
 class State(NamedTuple):
@@ -68,12 +63,11 @@ class State(NamedTuple):
 
 def hovering(crafts: Crafts, height_m: float = 2.0) -> State:
     """Return level crafts at rest whose motors turn as for a hover."""
-    count = len(crafts)
+    count = len(crafts.mass)
     pos = np.tile([0.0, 0.0, height_m], (count, 1))
     speed = speed_for(crafts, crafts.mass * GRAVITY / crafts.thrust.sum(axis=1))
-    identity = np.tile(np.eye(3), (count, 1, 1))
-    zeros = np.zeros((count, 3))
-    return State(pos, zeros, identity, zeros.copy(), np.repeat(speed[:, None], 4, axis=1))
+    identity, zeros = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+    return State(pos, zeros, identity, zeros, np.repeat(speed[:, None], 4, axis=1))
 
 
 def speed_for(crafts: Crafts, share: np.ndarray) -> np.ndarray:
@@ -103,7 +97,7 @@ def _change(crafts: Crafts, state: State, commands: np.ndarray) -> State:
     lag = np.where(commands > state.speeds, crafts.up_s[:, None], crafts.down_s[:, None])
     spin_up = (commands - state.speeds) / lag
     thrusts = compute_thrusts(crafts, state.speeds)
-    force = np.zeros((len(crafts), 4, 3))
+    force = np.zeros((*thrusts.shape, 3))
     force[..., 2] = thrusts
     torque = np.cross(crafts.places, force).sum(axis=1)
     torque[:, 2] += crafts.yaw_arm * (thrusts @ YAW) + crafts.momentum * (spin_up @ YAW)
@@ -111,13 +105,11 @@ def _change(crafts: Crafts, state: State, commands: np.ndarray) -> State:
     momentum = np.einsum("nij,nj->ni", crafts.inertia, state.rates)
     momentum[:, 2] -= crafts.momentum * (state.speeds @ YAW)
     torque -= np.cross(state.rates, momentum)
-    zero = np.zeros(len(crafts))
-    x, y, z = state.rates.T
-    skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    turning = np.cross(state.turn, state.rates[:, None])
     acc = np.einsum("nij,nj->ni", state.turn, specific_force(crafts, state))
     acc[:, 2] -= GRAVITY
     spun = np.linalg.solve(crafts.inertia, torque[..., None])[..., 0]
-    return State(state.vel, acc, state.turn @ skew, spun, spin_up)
+    return State(state.vel, acc, turning, spun, spin_up)
 
 
 def advance(crafts: Crafts, state: State, commands: np.ndarray, step_s: float = STEP_S) -> State:
