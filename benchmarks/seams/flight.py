@@ -157,7 +157,7 @@ def _fly(rng: np.random.Generator, craft: Craft, plan: Plan, dt: float) -> tuple
 def _fly_from(craft: Craft, start: State, plan: Plan, wind: Any, dt: Any, steps: Any) -> Any:
     """Return states and commands of a flight in rows of ``dt``, s, that take some steps each."""
 
-    def fly_row(carry: Any, doublets: jax.Array) -> Any:
+    def fly_row(carry: Any, doublets: Any) -> Any:
         state, target, since_s = carry
         u = jnp.clip(_steer(craft, state, plan, target, dt) + doublets, -1.0, 1.0)
         after, since_s = advance(craft, state, u, wind, steps), since_s + dt
@@ -167,7 +167,8 @@ def _fly_from(craft: Craft, start: State, plan: Plan, wind: Any, dt: Any, steps:
         return (after, target, jnp.where(is_passed, 0.0, since_s)), (state, u)
 
     plan = jax.tree.map(jnp.asarray, plan)
-    return jax.lax.scan(fly_row, (start, 0, 0.0), plan.doublets)[1]
+    begun: Any = (start, 0, 0.0)
+    return jax.lax.scan(fly_row, begun, plan.doublets)[1]
 
 
 def _steer(craft: Craft, x: State, plan: Plan, target: Any, dt: Any) -> jax.Array:
@@ -179,9 +180,9 @@ def _steer(craft: Craft, x: State, plan: Plan, target: Any, dt: Any) -> jax.Arra
     velocity_gain, position_gain = attitude_gain / 2.0, attitude_gain / 6.0
     way = plan.waypoints[target] - x.p
     distance = jnp.linalg.norm(way) + 1e-9
-    if plan.headings is None:
-        heading, speed = jnp.arctan2(way[1], way[0]), plan.speed
-    else:
+    heading: Any = jnp.arctan2(way[1], way[0])
+    speed: Any = plan.speed
+    if plan.headings is not None:
         heading = plan.headings[target]
         speed = jnp.minimum(plan.speed, position_gain * distance)
     wanted = velocity_gain * (way * (speed / distance) - x.v)
