@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.seams.craft import GRAVITY
-from benchmarks.seams.faults import Change, Truth
+from benchmarks.seams.faults import Change, Truth, axes_matrix
 
 FLU = "x y z"
 MAX_RATE = np.deg2rad([600.0, 600.0, 250.0])  # rad/s
@@ -27,14 +27,6 @@ LAGS_S = np.array([0.03, 0.035, 0.05, 0.03])  # roll, pitch, yaw, thrust
 THRUST_TO_WEIGHT, DRAG_PER_S = 3.0, 0.3
 SUBSTEP_S = 0.002
 Layout = dict[str, Any]
-
-
-def _matrix(axes: str) -> np.ndarray:
-    """Return the matrix that turns true axes into those written as "x -y -z"."""
-    rows = [
-        np.eye(3)["xyz".index(axis[-1])] * (-1.0 if "-" in axis else 1.0) for axis in axes.split()
-    ]
-    return np.array(rows)
 
 
 @dataclass(frozen=True)
@@ -111,7 +103,7 @@ class Simulator:
         """Return the state after ``dt`` with an action held; both as the simulator writes them."""
         p, v, attitude, w, throttle = self._read(np.asarray(x, float))
         u = np.asarray(u, float)
-        aim_w = _matrix(self.sticks).T @ np.clip(u[:3], -1.0, 1.0) * MAX_RATE
+        aim_w = axes_matrix(self.sticks).T @ np.clip(u[:3], -1.0, 1.0) * MAX_RATE
         thrust = u[3] if self.throttle == "0..1" else 0.5 * (u[3] + 1.0)
         aim_throttle = np.clip(thrust, 0.0, 1.0)
         steps = round(self.dt / SUBSTEP_S)
@@ -132,11 +124,11 @@ class Simulator:
         self, p: np.ndarray, v: np.ndarray, attitude: Rotation, w: np.ndarray, throttle: float
     ) -> np.ndarray:
         """Return a state in the simulator's conventions."""
-        matrix = _matrix(self.world) @ attitude.as_matrix() @ _matrix(self.body).T
-        rates = _matrix(self.body) @ w
+        matrix = axes_matrix(self.world) @ attitude.as_matrix() @ axes_matrix(self.body).T
+        rates = axes_matrix(self.body) @ w
         blocks = {
-            "p": _matrix(self.position_axes) @ p,
-            "v": _matrix(self.velocity_axes) @ v,
+            "p": axes_matrix(self.position_axes) @ p,
+            "v": axes_matrix(self.velocity_axes) @ v,
             "q": TO_NUMBERS[self.attitude](matrix),
             "w": matrix @ rates if self.has_world_rates else rates,
         }
@@ -149,10 +141,10 @@ class Simulator:
         matrix = FROM_NUMBERS[self.attitude](parts["q"])
         rates = matrix.T @ parts["w"] if self.has_world_rates else parts["w"]
         return (
-            _matrix(self.position_axes).T @ parts["p"],
-            _matrix(self.velocity_axes).T @ parts["v"],
-            Rotation.from_matrix(_matrix(self.world).T @ matrix @ _matrix(self.body)),
-            _matrix(self.body).T @ rates,
+            axes_matrix(self.position_axes).T @ parts["p"],
+            axes_matrix(self.velocity_axes).T @ parts["v"],
+            Rotation.from_matrix(axes_matrix(self.world).T @ matrix @ axes_matrix(self.body)),
+            axes_matrix(self.body).T @ rates,
             float(x[-1]),
         )
 
