@@ -65,10 +65,6 @@ REPEATS, LENGTH = 5, 64  # calls, and steps of each
 CALLS = 200  # of one step each
 PACKAGES = ("mujoco-mjx", "crazyflow")
 PAGE = report.RESULTS / "gpu.md"
-WHAT = (
-    "Rates with random actions, observations and resets included, 64 steps a call; "
-    "compilation excluded, wall time."
-)
 # A quadcopter's size and nothing else: no battery, lags, gates, observations or resets.
 RIGID_BODY = """
 <mujoco>
@@ -305,7 +301,7 @@ def main(cpu: bool = False) -> None:
             print(parts[-1], end="\n\n", flush=True)
         device = jax.devices()[0].device_kind
         parts.append(f"{device}. {report.provenance_line(report.provenance(*PACKAGES))}")
-    report.write_page(path, report.page("On a GPU", f"{report.command_line()}: {WHAT}", *parts))
+    report.fill_page(path, "gpu", parts="\n\n".join(parts))
 
 
 if __name__ == "__main__":

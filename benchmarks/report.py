@@ -155,11 +155,6 @@ def progress(items: Iterable[Item], unit: str) -> Iterable[Item]:
     return tqdm(items, unit=f" {unit}", disable=None)
 
 
-def page(title: str, *parts: str) -> str:
-    """Return a page in Markdown: its title and its parts, a blank line between them."""
-    return "\n\n".join([f"# {title}", *(part.strip("\n") for part in parts)]) + "\n"
-
-
 def filled(name: str, /, **values: Any) -> str:
     """Return a template of ``benchmarks/pages`` with values filled in."""
     template = ROOT / "benchmarks" / "pages" / f"{name}.md"
