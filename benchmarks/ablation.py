@@ -10,17 +10,19 @@ docs/results/ablation.md from them.
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cache, wraps
 from itertools import product
 from types import ModuleType
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 from benchmarks import hidden
 from benchmarks.diagnosis import ROWS, Trial, make_log
 from benchmarks.real.crazyflie import DATA
 from benchmarks.report import (
     RESULTS,
+    Line,
     append_line,
     command,
     commit_of_checkout,
@@ -105,19 +107,15 @@ def replaced(rule: Rule, function: Callable[..., Any]) -> Iterator[None]:
     places = [
         place for place in (rule.module, *loaded) if getattr(place, rule.name, None) is original
     ]
-    kept_vetoes = vetoes.VETOES
-    for place in places:
-        setattr(place, rule.name, function)
-    vetoes.VETOES = tuple(function if one is original else one for one in kept_vetoes)
-    try:
-        yield
-    finally:
-        vetoes.VETOES = kept_vetoes
+    listed = tuple(function if one is original else one for one in vetoes.VETOES)
+    with ExitStack() as stack:
         for place in places:
-            setattr(place, rule.name, original)
+            stack.enter_context(patch.object(place, rule.name, function))
+        stack.enter_context(patch.object(vetoes, "VETOES", listed))
+        yield
 
 
-def outcome(diagnosis: Diagnosis) -> dict[str, Any]:
+def outcome(diagnosis: Diagnosis) -> Line:
     """Return what is compared: verdict, causes with their equivalents, and what is unexplained."""
     return {
         "verdict": diagnosis.verdict,
@@ -154,7 +152,7 @@ def measured() -> dict[str, Imported]:
     return chosen
 
 
-def census(trial: Trial) -> dict[str, Any]:
+def census(trial: Trial) -> Line:
     """Return the outcome on a plant, and how often each rule fired."""
     names, log, model = flown(trial)
     fired: Counter[str] = Counter()
@@ -170,24 +168,21 @@ def census(trial: Trial) -> dict[str, Any]:
 
         return call
 
-    def with_all_watched(rules: tuple[Rule, ...]) -> Diagnosis:
-        if not rules:
-            return diagnose(log, model)
-        with replaced(rules[0], watched(rules[0])):
-            return with_all_watched(rules[1:])
-
-    result = outcome(with_all_watched(RULES))
+    with ExitStack() as stack:
+        for rule in RULES:
+            stack.enter_context(replaced(rule, watched(rule)))
+        result = outcome(diagnose(log, model))
     return {"truth": names, "fired": +fired, "outcome": result}
 
 
-def without(trial: Trial, name: str) -> dict[str, Any]:
+def without(trial: Trial, name: str) -> Line:
     """Return the outcome on a plant without a rule."""
     _, log, model = flown(trial)
     with replaced(BY_NAME[name], BY_NAME[name].disabled):
         return {"outcome": outcome(diagnose(log, model))}
 
 
-def score(line: dict[str, Any], truth: list[str]) -> int:
+def score(line: Line, truth: list[str]) -> int:
     """Return the number of true effects named minus the number of false ones.
 
     A cause with a true effect among its equivalents is true.
@@ -202,7 +197,7 @@ def score(line: dict[str, Any], truth: list[str]) -> int:
     return len(found) - len(false)
 
 
-def plant_of(line: dict[str, Any]) -> tuple[Any, ...]:
+def plant_of(line: Line) -> tuple[Any, ...]:
     """Return the fields of a line that identify its plant."""
     return tuple(line[field] for field in Trial._fields)
 
@@ -251,12 +246,12 @@ def write_page() -> None:
 DIFFER = "outcomes that differ without it"
 
 
-def count_whole(lines: list[dict[str, Any]]) -> int:
+def count_whole(lines: list[Line]) -> int:
     """Return the number of plants or flights that were diagnosed with all rules."""
     return sum(not line["without"] for line in lines)
 
 
-def count_by_rule(lines: list[dict[str, Any]]) -> list[list[Any]]:
+def count_by_rule(lines: list[Line]) -> list[list[Any]]:
     """Return for each rule how often it fires, and what differs without it."""
     counted = {plant_of(line): line for line in lines if not line["without"]}
     rows = []

@@ -9,7 +9,7 @@ docs/results/adapt.jsonl, and a later run resumes there; ``--page`` writes docs/
 
 import time
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,6 +20,7 @@ from baselines.purejaxrl_ppo.flights import fly_many
 from benchmarks import report
 from benchmarks.diagnosis import model_of
 from benchmarks.loop.plants import draw_base
+from benchmarks.report import Line
 from flytrack_bench import load_suite
 from flytrack_bench.hidden import MOTIONS, HiddenPlant
 from flytrack_env import Motion, nominal_parameters
@@ -27,8 +28,8 @@ from flytrack_env.effects import BY_NAME
 from flytrack_env.model_file import model_as_json, model_from_json
 from flytrack_loop import race
 from flytrack_loop.adapt import Adapted, Settings, adapt, improve
-from flytrack_loop.stages import BATCH, MIN_ROWS, rounded
-from flytrack_sysid import Diagnosis, FlightLog, log_of_states
+from flytrack_loop.stages import BATCH, log_of_flights, rounded
+from flytrack_sysid import Diagnosis, FlightLog
 from flytrack_sysid.diagnosis.plausible import PlausibleModels
 from flytrack_sysid.inference.parameters import to_vector
 from flytrack_sysid.sensors import measure
@@ -75,13 +76,8 @@ def fly(plant: HiddenPlant, policy: Checkpoint, seconds: float, seed: int) -> Fl
     An accelerometer feels the force in the axes in which it acts, which depend on the motion.
     """
     env = plant_env(policy, plant)
-    flown = fly_many(env, policy.policy, seed, BATCH, NUM_STEPS, NUM_LAPS)
-    flights = []
-    for number, is_flying in enumerate(np.asarray(flown.is_flying)):
-        if is_flying.sum() >= MIN_ROWS:
-            states, actions = (np.asarray(leaf[number]) for leaf in (flown.states, flown.actions))
-            flights.append((states[is_flying], actions[is_flying]))
-    log = log_of_states(flights, DT_S, f"flights of {POLICY}")
+    flights = fly_many(env, policy.policy, seed, BATCH, NUM_STEPS, NUM_LAPS)
+    log = log_of_flights(flights, DT_S, seed, seconds, noise=0.0)
     log = log.select(np.arange(len(log)) < round(seconds / DT_S))
     gravity = float(nominal_parameters().g)
     if plant.truth.motion != "handout":
@@ -99,27 +95,29 @@ def felt_after_step(log: FlightLog, gravity: float) -> np.ndarray:
     return (before * attitude.inv()).apply(lifted) - [0.0, 0.0, gravity]
 
 
-def raced(policy: Checkpoint, plant: HiddenPlant) -> dict[str, Any]:
+def raced(policy: Checkpoint, plant: HiddenPlant) -> Line:
     """Return the share of starts that finish, and the mean flying lap, s."""
     outcome = race(policy, plant_env(policy, plant), START_SEED, STARTS)
     return {"success": outcome.success, "flying_lap_s": rounded(outcome.flying_lap_s)}
 
 
-def format_lap(entry: dict[str, Any]) -> str:
+def format_lap(entry: Line) -> str:
     """Return who finishes, and the flying lap."""
     lap_s = entry["flying_lap_s"]
     return f"{entry['success']:.1%}, " + ("-" if lap_s is None else f"{lap_s:.3f} s")
 
 
-def figures(plants: list[dict[str, Any]], unchanged: list[dict[str, Any]]) -> list[report.Figure]:
+def figures(plants: list[Line], unchanged: list[Line]) -> list[report.Figure]:
     """Return the figures of the page, of trials that were not refused."""
-    count = len(plants)
+
+    def count_true(name: str, target: str, flags: list[bool]) -> report.Figure:
+        return report.Figure(name, target, f"{sum(flags)} of {len(flags)}", len(flags))
+
     lines = [
-        report.Figure(
+        count_true(
             f"hidden plants on which 99 % of starts finish: {name}",
             "all" if name == "adapted" else "",
-            f"{sum(one['entries'][name]['success'] >= 0.99 for one in plants)} of {count}",
-            count,
+            [one["entries"][name]["success"] >= 0.99 for one in plants],
         )
         for name in ENTRIES
     ]
@@ -137,34 +135,21 @@ def figures(plants: list[dict[str, Any]], unchanged: list[dict[str, Any]]) -> li
     kept = [one["is_new"] is False and one["verdict"] == "consistent" for one in unchanged]
     return [
         *lines,
-        report.Figure(
-            "mean flying lap within what was expected of a flight",
-            "",
-            f"{sum(inside)} of {len(inside)}",
-            len(inside),
-        ),
-        report.Figure(
-            "hidden plants with a named effect that is not in them",
-            "none",
-            f"{sum(invented)} of {count}",
-            count,
-        ),
+        count_true("mean flying lap within what was expected of a flight", "", inside),
+        count_true("hidden plants with a named effect that is not in them", "none", invented),
         report.Figure(
             "CPU s from log to policy, median (all)",
             "60",
             f"{np.median(cpu_s):.0f} ({report.spread(cpu_s)})",
-            count,
+            len(plants),
         ),
-        report.Figure(
-            "plants that are what the policy was made for: nothing to adapt to",
-            "20 of 20",
-            f"{sum(kept)} of {len(kept)}",
-            len(kept),
+        count_true(
+            "plants that are what the policy was made for: nothing to adapt to", "20 of 20", kept
         ),
     ]
 
 
-def plants_table(plants: list[dict[str, Any]]) -> str:
+def plants_table(plants: list[Line]) -> str:
     """Return a row for each hidden plant."""
     rows = []
     for one in sorted(plants, key=lambda line: (line["number"], line["motion"])):
@@ -179,7 +164,7 @@ def plants_table(plants: list[dict[str, Any]]) -> str:
     return report.table(header, rows)
 
 
-def write_page(lines: list[dict[str, Any]]) -> None:
+def write_page(lines: list[Line]) -> None:
     """Write the page of lines."""
     plants = [one for one in lines if one["kind"] == PLANT]
     unchanged = [one for one in lines if one["kind"] == UNCHANGED]
@@ -213,18 +198,18 @@ def write_page(lines: list[dict[str, Any]]) -> None:
     )
 
 
-def measure_trial(trial: Trial) -> dict[str, Any]:
+def measure_trial(trial: Trial) -> Line:
     """Return what is made of a trial's plant."""
     return measure_unchanged(trial) if trial.kind == UNCHANGED else measure_plant(trial)
 
 
-def measure_plant(trial: Trial) -> dict[str, Any]:
+def measure_plant(trial: Trial) -> Line:
     """Return what each way makes of a hidden plant's log."""
     craft = load_suite("v1").chosen((f"plant_{trial.number}",))[0].craft
     assert craft is not None
     plant, policy = HiddenPlant(replace(craft, motion=trial.motion)), load_checkpoint(POLICY)
     log = fly(plant, policy, trial.seconds, trial.seed)
-    result: dict[str, Any] = {"hidden": craft.text(), "flights": len(np.unique(log.segment))}
+    result: Line = {"hidden": craft.text(), "flights": len(np.unique(log.segment))}
     entries = result["entries"] = {"nothing": raced(policy, plant)}
     begun_s = time.process_time()
     try:
@@ -239,7 +224,7 @@ def measure_plant(trial: Trial) -> dict[str, Any]:
     return result
 
 
-def about(found: Adapted) -> dict[str, Any]:
+def about(found: Adapted) -> Line:
     """Return what an adaptation found, and the flying lap that it expects, 95 %, s."""
     diagnosis, new = found.diagnosis, found.new
     expected = None
@@ -267,7 +252,7 @@ def ignore(done: int, total: int) -> None:
     """Show no progress."""
 
 
-def measure_unchanged(trial: Trial) -> dict[str, Any]:
+def measure_unchanged(trial: Trial) -> Line:
     """Return what is made of a plant without effects that the policy claims to be made for."""
     rng = np.random.default_rng([trial.seed, trial.number, NUM_UNCHANGED])
     truth = replace(draw_base(rng), motion=trial.motion)

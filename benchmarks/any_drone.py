@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 import flytrack_env
 from baselines.purejaxrl_ppo import Checkpoint, flights, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint_env import simulated_env
 from benchmarks import report
+from benchmarks.misspec.replay import lagged
 from flytrack_env import ModelParameters
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import ACCELERATION, APPLIED_ACTION, BATTERY, QUATERNION, unpack_action
@@ -103,17 +103,13 @@ def write_log(craft: TrueCraft, folder: Path, seed: int) -> tuple[Path, Path]:
     def hold(changes_hz: float, size: float) -> np.ndarray:
         return rng.uniform(-size, size, 1000)[(time * changes_hz).astype(int)]
 
-    def lag(values: np.ndarray, tau_s: float) -> np.ndarray:
-        decay = np.exp(-1.0 / RATE_HZ / tau_s)
-        return lfilter([1.0 - decay], [1.0, -decay], values, axis=0)
-
     turns = [hold(changes_hz, 0.3) for changes_hz in (1.5, 1.3, 1.1)]
     sticks = np.column_stack([*turns, -0.2 + hold(1.7, 0.6)])
     empty_v, full_v = craft.volts
     volts = full_v - 0.9 * (full_v - empty_v) * time / time[-1]
-    before = np.vstack([sticks[:1], sticks[:-1]])  # held from the row before on
-    rates = lag(before[:, :3] * np.deg2rad(craft.max_rate_deg_s), craft.lag_s)
-    throttle = 0.5 * (lag(before[:, 3], craft.thrust_lag_s) + 1.0)
+    applied = lagged([craft.lag_s] * 3 + [craft.thrust_lag_s], sticks, 1.0 / RATE_HZ)
+    rates = applied[:, :3] * np.deg2rad(craft.max_rate_deg_s)
+    throttle = 0.5 * (applied[:, 3] + 1.0)
     force = np.zeros((len(time), 3))
     force[:, 2] = craft.peak * throttle * volts / full_v
     rates += rng.normal(0.0, GYRO_NOISE, rates.shape)

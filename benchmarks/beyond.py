@@ -23,6 +23,7 @@ from benchmarks.hidden.oracle import removed
 from benchmarks.real.crafts import CRAFTS
 from benchmarks.real.section import formulas_of
 from benchmarks.real_logs import record_path
+from benchmarks.report import Line
 from flytrack_sysid.diagnosis import diagnose
 from flytrack_sysid.log import FlightLog
 
@@ -45,7 +46,6 @@ RIGHT: dict[str, tuple[set[str], set[str]]] = {
 }
 LOAD = "payload"  # swings on a string, for which the grammar has no term
 KINDS = (*RIGHT, LOAD)
-Line = dict[str, Any]
 
 
 class Trial(NamedTuple):

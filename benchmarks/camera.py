@@ -8,7 +8,7 @@ the shipped black box, whose states are seen through the same camera.
 
 import statistics
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,23 +49,39 @@ def project_corners(image: Image, position: Any, quaternion: Any, gate: Any) -> 
     return coordinates, jnp.stack([jnp.asarray(pixel.is_visible) for pixel in pixels])
 
 
+class Poses(NamedTuple):
+    """Poses about the course; positions and quaternions are float32, for both cameras."""
+
+    course: Any
+    gates: ray_caster.Gates
+    positions: np.ndarray
+    quaternions: np.ndarray
+    indices: np.ndarray
+
+
+def draw_poses(count: int) -> Poses:
+    """Draw poses about the course."""
+    from flytrack_env import FlyTrack
+
+    env = FlyTrack()
+    gates = ray_caster.read_gates(env.track)
+    positions, quaternions, indices = ray_caster.draw_poses(SEED, count, gates)
+    pose = positions.astype(np.float32), quaternions.astype(np.float32)
+    return Poses(env.default_params.course, gates, *pose, indices)
+
+
 def corner_figures(num_poses: int) -> list[report.Figure]:
     """Return how far corners are from those of rays cast apart, and how often flags differ."""
     import jax
 
-    from flytrack_env import FlyTrack
-
-    env, figures = FlyTrack(), []
-    gates, course = ray_caster.read_gates(env.track), env.default_params.course
-    positions, quaternions, indices = ray_caster.draw_poses(SEED, num_poses, gates)
-    positions, quaternions = positions.astype(np.float32), quaternions.astype(np.float32)
+    course, gates, positions, quaternions, indices = draw_poses(num_poses)
+    figures = []
     for name, image in IMAGES.items():
         find = jax.jit(
             jax.vmap(lambda p, q, i, image=image: project_corners(image, p, q, course.gate(i)))
         )
         projected, is_visible = map(np.asarray, find(positions, quaternions, indices))
-        poses = positions.astype(float), quaternions.astype(float)
-        expected, _ = ray_caster.find_corners(*poses, gates, indices, image)
+        expected, _ = ray_caster.find_corners(positions, quaternions, gates, indices, image)
         is_inside = (np.abs(expected) <= np.array([image.width, image.height]) / 2.0).all(axis=-1)
         errors_px = np.abs(projected - expected).max(axis=-1)[is_visible & is_inside]
         figures += [
@@ -90,26 +106,21 @@ def mask_figure(num_poses: int) -> report.Figure:
     import jax
 
     from flytrack_env import camera
-    from flytrack_env.env import FlyTrack
     from flytrack_env.quaternion import Quaternion, Vec3
 
-    env = FlyTrack()
-    gates = ray_caster.read_gates(env.track)
-    positions, quaternions, _ = ray_caster.draw_poses(SEED, num_poses, gates)
-    positions, quaternions = positions.astype(np.float32), quaternions.astype(np.float32)
+    course, gates, positions, quaternions, _ = draw_poses(num_poses)
 
     def draw(position: Any, quaternion: Any) -> Any:
         return camera.draw_frames(
             camera.CameraPose(Vec3(*position), Quaternion(*quaternion)),
-            env.default_params.course.gates,
+            course.gates,
             MASK_IMAGE.pitch_deg,
             MASK_IMAGE.field_of_view_deg,
             (MASK_IMAGE.height, MASK_IMAGE.width),
         )
 
     masks = np.asarray(jax.jit(jax.vmap(draw))(positions, quaternions))[..., 0] > 0
-    poses = positions.astype(float), quaternions.astype(float)
-    share = np.mean(masks == ray_caster.cast_masks(*poses, gates, MASK_IMAGE))
+    share = np.mean(masks == ray_caster.cast_masks(positions, quaternions, gates, MASK_IMAGE))
     return report.Figure(
         "pixels of masks as by rays", "at least 99.9 %", f"{100 * share:.4f} %", masks.size
     )
@@ -119,20 +130,17 @@ def gradient_figure() -> report.Figure:
     """Return the largest relative error of gradients of corners against finite differences."""
     import jax
 
-    from flytrack_env import FlyTrack
-
-    env, image = FlyTrack(), IMAGES["barrel distortion"]
-    gates = ray_caster.read_gates(env.track)
-    positions, quaternions, indices = ray_caster.draw_poses(SEED, 10 * NUM_GRADIENTS, gates)
+    image = IMAGES["barrel distortion"]
+    float32_course, _, positions, quaternions, indices = draw_poses(10 * NUM_GRADIENTS)
     weights = np.random.default_rng(SEED).normal(size=(4, 2))
     with jax.enable_x64(True):
-        course = jax.tree.map(lambda leaf: np.asarray(leaf, float), env.default_params.course)
+        course = jax.tree.map(lambda leaf: np.asarray(leaf, float), float32_course)
 
         def value(pose: Any, index: Any) -> Any:
             projected, is_visible = project_corners(image, pose[:3], pose[3:], course.gate(index))
             return (weights * projected).sum(), is_visible.all()
 
-        poses = np.concatenate([positions, quaternions], axis=1)
+        poses = np.concatenate([positions, quaternions], axis=1).astype(float)
         evaluate = jax.jit(jax.vmap(jax.value_and_grad(value, has_aux=True)))
         (_, is_visible), gradients = evaluate(poses, indices)
         rows = np.flatnonzero(is_visible)[:NUM_GRADIENTS]

@@ -6,7 +6,7 @@ later run of the same commit resumes there; ``--page`` writes docs/results/check
 """
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,7 +18,15 @@ import numpy as np
 from scipy.stats import beta
 
 from benchmarks.real.crazyflie import DATA
-from benchmarks.report import RESULTS, command, fill_page, lines_of_commit, record_trials, table
+from benchmarks.report import (
+    RESULTS,
+    Line,
+    command,
+    fill_page,
+    lines_of_commit,
+    record_trials,
+    table,
+)
 from benchmarks.seams.faults import FAULTS, UNITS, Change, Truth, draw_pair, inject, is_shown
 from benchmarks.seams.flight import Flight, make_flight
 from benchmarks.seams.mapped import MAPPING, import_csv, is_equal, write_csv
@@ -32,6 +40,7 @@ from flytrack_sysid.log import FlightLog
 LINES = RESULTS / "check.jsonl"
 Part = Literal["clean", "faults", "fixes", "pairs", "simulators", "measured"]
 PARTS: tuple[Part, ...] = ("clean", "faults", "fixes", "pairs", "simulators", "measured")
+OUTCOMES = ("exact", "partial", "unexplained", "false", "missed")
 FIXED = ("equal", "ambiguous", "left", "wrong", "missed")
 MAX_ALTERNATIVES = 4
 SCALE_TOLERANCE, DELAY_TOLERANCE, DELAY_TOLERANCE_S = 0.05, 0.1, 0.003
@@ -80,7 +89,7 @@ def flights_at(data: Path) -> dict[str, FlightLog]:
     return {name: one.log for name, one in imported}
 
 
-def measure(trial: Trial) -> dict[str, Any]:
+def measure(trial: Trial) -> Line:
     """Check a log or a plant and compare what is found with the truth."""
     if trial.part == "measured":
         log = flights_at(DATA)[trial.name]
@@ -109,9 +118,7 @@ def measure(trial: Trial) -> dict[str, Any]:
     return {"truth": sorted(truth), **result, **compare(check, truth)}
 
 
-def fix_and_compare(
-    faulty: FlightLog, right: FlightLog, model: ModelParameters | None
-) -> dict[str, Any]:
+def fix_and_compare(faulty: FlightLog, right: FlightLog, model: ModelParameters | None) -> Line:
     """Import a faulty log by a mapping that takes it as it is, correct the mapping, import again.
 
     Returns:
@@ -134,7 +141,7 @@ def fix_and_compare(
     return {"alternatives": [tuple(one) for one in alternatives], "outcome": outcome}
 
 
-def compare(check: Any, truth: Iterable[Change]) -> dict[str, Any]:
+def compare(check: Any, truth: Iterable[Change]) -> Line:
     """Compare a check with the truth.
 
     Returns:
@@ -203,22 +210,21 @@ def plan_trials(parts: Iterable[Part], logs: int, seed: int, model: bool) -> lis
     return trials
 
 
-def outcomes(name: str, lines: list[dict[str, Any]]) -> list[Any]:
-    """Return a row of the page: how often each outcome was, of the faults that motion shows."""
-    shown = [line for line in lines if line["shown"]]
-    count = Counter(line["outcome"] for line in shown)
-    hidden = [line for line in lines if not line["shown"]]
-    kinds = ("exact", "partial", "unexplained", "false", "missed")
-    false = f"{sum(line['outcome'] == 'false' for line in hidden)} of {len(hidden)}"
-    return [name, len(shown), *(count[kind] for kind in kinds), false]
+def count_outcomes(
+    name: str, lines: list[Line], kinds: Sequence[str] = OUTCOMES, wrong: str = "false"
+) -> list[Any]:
+    """Return a row of the page: how often each outcome was, of the faults that motion shows.
 
-
-def fixed(name: str, lines: list[dict[str, Any]]) -> list[Any]:
-    """Return a row of the page: what corrected mappings read."""
+    Args:
+        name: of the row.
+        lines: of it.
+        kinds: of outcomes.
+        wrong: outcome that is counted where the motion does not show the fault.
+    """
     count = Counter(line["outcome"] for line in lines if line["shown"])
-    hidden = [line for line in lines if not line["shown"]]
-    wrong = f"{sum(line['outcome'] == 'wrong' for line in hidden)} of {len(hidden)}"
-    return [name, sum(count.values()), *(count[kind] for kind in FIXED), wrong]
+    hidden = [line["outcome"] for line in lines if not line["shown"]]
+    counts = [count[kind] for kind in kinds]
+    return [name, count.total(), *counts, f"{hidden.count(wrong)} of {len(hidden)}"]
 
 
 def split_rows(rows: list[list[Any]]) -> tuple[list[list[Any]], list[str]]:
@@ -252,21 +258,32 @@ def write_page() -> None:
         named = ", ".join(f"{name} ({count})" for name, count in pairs.most_common())
         bound = f"{100.0 * upper_bound(len(wrong), len(flown)):.1f} %" if flown else ""
         clean.append([kind, len(flown), len(wrong), bound, named])
-    faults, exact = split_rows(
-        [
-            outcomes(name, [line for line in by_part["faults"] if line["name"] == name])
-            for name in FAULTS
-        ]
-    )
-    two = [
-        outcomes(name, [line for line in by_part["pairs"] if is_on_one(line) == on_one])
-        for name, on_one in (("on one channel", True), ("on two channels", False))
+    faults = [
+        count_outcomes(name, [line for line in by_part["faults"] if name in (line["name"], "all")])
+        for name in [*FAULTS, "all"]
     ]
-    fixes, equal = split_rows(
-        [
-            fixed(name, [line for line in by_part["fixes"] if line["name"] == name])
-            for name in FIXABLE
-        ]
+    imperfect, exact = split_rows(faults[:-1])
+    two = [
+        count_outcomes(name, [line for line in by_part["pairs"] if is_on_one(line) in kinds])
+        for name, kinds in (
+            ("on one channel", {True}),
+            ("on two channels", {False}),
+            ("all", {True, False}),
+        )
+    ]
+    fixes = [
+        count_outcomes(
+            name,
+            [line for line in by_part["fixes"] if name in (line["name"], "all")],
+            FIXED,
+            "wrong",
+        )
+        for name in [*FIXABLE, "all"]
+    ]
+    unequal, equal = split_rows(fixes[:-1])
+    folders = Counter(folder_of(line) for line in by_part["measured"])
+    contradicted = Counter(
+        folder_of(line) for line in by_part["measured"] if line["outcome"] != "exact"
     )
     simulators = [
         [
@@ -282,20 +299,17 @@ def write_page() -> None:
         "check",
         measured=table(
             "folder | logs | contradicted",
-            [
-                [folder, len(flown), sum(line["outcome"] != "exact" for line in flown)]
-                for folder, flown in by_folder(by_part["measured"]).items()
-            ],
+            [[folder, count, contradicted[folder]] for folder, count in folders.items()],
         ),
         clean=table("flight | logs | contradicted | 95 % upper bound | what", clean),
-        faults=table(f"fault | {columns}", [*faults, outcomes("all", by_part["faults"])]),
+        faults=table(f"fault | {columns}", [*imperfect, faults[-1]]),
         fixes=table(
             "fault | shown | equal | ambiguous | left | wrong | missed | wrong where not shown",
-            [*fixes, fixed("all", by_part["fixes"])],
+            [*unequal, fixes[-1]],
         ),
         exact=", ".join(exact),
         num_equal=len(equal),
-        pairs=table(f"two faults | {columns}", [*two, outcomes("all", by_part["pairs"])]),
+        pairs=table(f"two faults | {columns}", two),
         simulators=table("simulator | expected | outcome", simulators),
         errors=len(lines) - len(done),
         commit=lines[-1]["commit"],
@@ -318,15 +332,12 @@ def cpu_seconds() -> list[float]:
     return seconds
 
 
-def by_folder(lines: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Return the lines of measured flights by their folder."""
-    folders: dict[str, list[dict[str, Any]]] = {}
-    for line in lines:
-        folders.setdefault(line["name"].partition("/")[0], []).append(line)
-    return folders
+def folder_of(line: Line) -> str:
+    """Return the folder of a measured flight."""
+    return str(line["name"].partition("/")[0])
 
 
-def is_on_one(line: dict[str, Any]) -> bool:
+def is_on_one(line: Line) -> bool:
     """Return whether both faults of a line are on one channel."""
     return len({channel.split("_")[0] for channel, *_ in line["truth"]}) == 1
 

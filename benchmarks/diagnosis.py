@@ -12,13 +12,13 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from benchmarks import hidden
 from benchmarks.hidden.oracle import known, removed, signal_to_noise
-from benchmarks.report import RESULTS, command, record_trials
+from benchmarks.report import RESULTS, Line, command, record_trials
 from flytrack_bench.misspec.suite import nominal_model
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
@@ -86,13 +86,13 @@ def make_log(
     return truth, clean, hidden.measure(clean, noise, rng), model_of(truth), rng
 
 
-def plant(trial: Trial) -> dict[str, Any]:
+def plant(trial: Trial) -> Line:
     """Return the diagnosis of one plant, graded."""
     truth, clean, log, model, rng = make_log(trial)
     started = time.process_time()
     diagnosis = diagnose(log, model)
     seconds = time.process_time() - started
-    line: dict[str, Any] = {
+    line: Line = {
         "truth": truth.text(),
         "effects": list(truth.effects),
         "verdict": diagnosis.verdict,
@@ -135,7 +135,7 @@ def round_values(values: Mapping[str, float]) -> dict[str, float]:
     return {name: round(value, 3) for name, value in values.items()}
 
 
-def _grade_cause(cause: Cause, truth: hidden.Truth) -> dict[str, Any]:
+def _grade_cause(cause: Cause, truth: hidden.Truth) -> Line:
     """Return a cause's name, when it acts, and, by parameter, true value, estimate and interval."""
     true = truth.effects.get(cause.effect, {})
     times = {"onset_s": cause.onset_s, "end_s": cause.end_s}

@@ -5,7 +5,6 @@
 
 from collections import Counter
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from benchmarks.diagnosis import LINES, ROWS, Trial
 from benchmarks.hidden import MOTIONS
 from benchmarks.report import (
     Figure,
+    Line,
     figures_table,
     fill_page,
     lines_of_commit,
@@ -20,7 +20,6 @@ from benchmarks.report import (
     table,
 )
 
-Line = dict[str, Any]
 CONTROLS = ("clean", "heavy", "coloured", "gusts")
 SHOWN, SEPARATE, HIDDEN = 30.0, 20.0, 8.0  # lambda
 NOTABLE = 0.2  # of the noise: error that a new flight shows
@@ -36,7 +35,7 @@ def names_in(line: Line) -> list[str]:
     return [cause["effect"] for cause in line["causes"]]
 
 
-def causes_in(line: Line) -> list[dict[str, Any]]:
+def causes_in(line: Line) -> list[Line]:
     """Return the causes that a line names, and true ones that it lists as too small to matter."""
     true = [cause for cause in line["negligible"] if cause["effect"] in line["effects"]]
     return line["causes"] + true
@@ -96,9 +95,7 @@ def is_onset_right(line: Line) -> bool:
 
 def is_time_told(line: Line) -> bool:
     """Return whether a line says of any cause when it began or ended."""
-    return any(
-        "onset_s" in cause or "end_s" in cause for cause in (*line["causes"], *line["negligible"])
-    )
+    return any({"onset_s", "end_s"} & {*cause} for cause in line["causes"] + line["negligible"])
 
 
 def figures(lines: list[Line]) -> list[Figure]:

@@ -256,13 +256,8 @@ def main(repeats: int = 7, out: Path | None = None, effects: bool = False) -> No
     """
     core = report.pin_to_one_core()
     if effects:
-        about = (
-            f"{report.command_line()}: `vmap(step)` of 1,024 environments, CPU time over that "
-            "of the plain step, median of the rounds."
-        )
-        source = f"{repeats} rounds, {core}. {report.provenance_line(report.provenance())}"
-        text = report.page("What an effect costs", about, effect_costs(repeats), source)
-        report.write_page(out, text)
+        costs = effect_costs(repeats)
+        report.fill_page(out, "effects_speed", table=costs, repeats=repeats, core=core)
         return
     rates = measure(contestants(), repeats)
     speeds = [

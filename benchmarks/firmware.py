@@ -19,6 +19,7 @@ from msgspec.structs import asdict
 from baselines.purejaxrl_ppo import load_checkpoint
 from benchmarks import report
 from benchmarks.champion import CHAMPION
+from benchmarks.report import Line
 from firmware import Betaflight, Body
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import BY_NAME
@@ -52,7 +53,6 @@ GAINS, LATE, CENTER, *MOTORS = (f"betaflight_loop.{group[0]}" for group in LOOP_
 RESPONSE = ("second_order_rates", "rate_slew_limit", "command_delay", GAINS, LATE)
 THRUST = ("thrust_curve", "thrust_scale")
 Rng = np.random.Generator
-Line = dict[str, Any]
 
 
 class Kind(NamedTuple):

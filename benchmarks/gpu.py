@@ -65,10 +65,6 @@ REPEATS, LENGTH = 5, 64  # calls, and steps of each
 CALLS = 200  # of one step each
 PACKAGES = ("mujoco-mjx", "crazyflow")
 PAGE = report.RESULTS / "gpu.md"
-WHAT = (
-    "Rates with random actions, observations and resets included, 64 steps a call; "
-    "compilation excluded, wall time."
-)
 # A quadcopter's size and nothing else: no battery, lags, gates, observations or resets.
 RIGID_BODY = """
 <mujoco>
@@ -107,18 +103,21 @@ def mjx_contestant(num_envs: int) -> Contestant:
     rates = jax.random.normal(jax.random.key(0), (num_envs, 6))
     state = jax.vmap(lambda rate: mjx.make_data(model).replace(qvel=rate))(rates)
     controls = jax.random.uniform(jax.random.key(1), (LENGTH, num_envs, 4), maxval=4.0)
+    step = jax.vmap(lambda data, control: mjx.step(model, data.replace(ctrl=control)))
+    return scan_contestant(MJX, step, state, controls)
+
+
+def scan_contestant(
+    name: str, step: Callable[[Any, jax.Array], Any], state: Any, actions: jax.Array
+) -> Contestant:
+    """Return a scan of ``LENGTH`` steps with actions (LENGTH, num_envs, ...)."""
 
     @jax.jit
-    def fly(state: Any, controls: jax.Array) -> Any:
-        def step_once(state: Any, controls: jax.Array) -> tuple[Any, None]:
-            step = jax.vmap(lambda data, control: mjx.step(model, data.replace(ctrl=control)))
-            return step(state, controls), None
+    def fly(state: Any, actions: jax.Array) -> Any:
+        return jax.lax.scan(lambda state, action: (step(state, action), None), state, actions)[0]
 
-        return jax.lax.scan(step_once, state, controls)[0]
-
-    return Contestant(
-        MJX, LENGTH * num_envs / 1e6, lambda: jax.block_until_ready(fly(state, controls))
-    )
+    amount = LENGTH * actions.shape[1] / 1e6
+    return Contestant(name, amount, lambda: jax.block_until_ready(fly(state, actions)))
 
 
 def crazyflow_contestant(num_envs: int) -> Contestant:
@@ -127,21 +126,15 @@ def crazyflow_contestant(num_envs: int) -> Contestant:
 
     attitude_control = crazyflow.sim.functional.attitude_control
     sim = crazyflow.Sim(n_worlds=num_envs, device=jax.default_backend())
-    data, step, steps_per_command = sim.data, sim.build_step_fn(), sim.freq // 100
+    step, steps_per_command = sim.build_step_fn(), sim.freq // 100
     space = crazyflow.envs.drone_env.action_space(sim.control, sim.dynamics, sim.drone)
     shape = (LENGTH, num_envs, 1, *space.shape)
     commands = jax.random.uniform(jax.random.key(1), shape, minval=space.low, maxval=space.high)
 
-    @jax.jit
-    def fly(data: Any, commands: jax.Array) -> Any:
-        def step_once(data: Any, command: jax.Array) -> tuple[Any, None]:
-            return step(attitude_control(data, command), n_steps=steps_per_command), None
+    def hold(data: Any, command: jax.Array) -> Any:
+        return step(attitude_control(data, command), n_steps=steps_per_command)
 
-        return jax.lax.scan(step_once, data, commands)[0]
-
-    return Contestant(
-        CRAZYFLOW, LENGTH * num_envs / 1e6, lambda: jax.block_until_ready(fly(data, commands))
-    )
+    return scan_contestant(CRAZYFLOW, hold, sim.data, commands)
 
 
 def rate_of(entry: Contestant) -> float:
@@ -308,7 +301,7 @@ def main(cpu: bool = False) -> None:
             print(parts[-1], end="\n\n", flush=True)
         device = jax.devices()[0].device_kind
         parts.append(f"{device}. {report.provenance_line(report.provenance(*PACKAGES))}")
-    report.write_page(path, report.page("On a GPU", f"{report.command_line()}: {WHAT}", *parts))
+    report.fill_page(path, "gpu", parts="\n\n".join(parts))
 
 
 if __name__ == "__main__":

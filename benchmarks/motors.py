@@ -7,7 +7,6 @@ docs/results/motors.jsonl; lines that are there are not computed again. It ends 
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -78,13 +77,8 @@ def draw(rng: np.random.Generator) -> Crafts:
         "thrust": np.full(4, full),
         "linear": rng.uniform(0.05, 0.35),
         "yaw_arm": arm * rng.uniform(0.1, 0.2),
-        "momentum": 0.0,
         "up_s": up_s,
         "down_s": up_s * rng.uniform(1.1, 1.6),
-        "drag": np.zeros(3),
-        "quadratic": np.zeros(3),
-        "rotor_drag": 0.0,
-        "damping": np.zeros(3),
     }
     return Crafts(**{name: np.asarray(value, float)[None] for name, value in one.items()})
 
@@ -116,19 +110,19 @@ def nominal_model(craft: Crafts) -> ModelParameters:
 
 
 def _scaled(name: str, factor: Any) -> Callable[[Crafts], Crafts]:
-    return lambda craft: replace(craft, **{name: getattr(craft, name) * factor})
+    return lambda craft: craft._replace(**{name: getattr(craft, name) * factor})
 
 
 def _moved(craft: Crafts) -> Crafts:
-    return replace(craft, places=craft.places - np.array([0.005, 0.0, 0.0]))
+    return craft._replace(places=craft.places - np.array([0.005, 0.0, 0.0]))
 
 
 def _slower(craft: Crafts) -> Crafts:
-    return replace(craft, up_s=1.2 * craft.up_s, down_s=1.2 * craft.down_s)
+    return craft._replace(up_s=1.2 * craft.up_s, down_s=1.2 * craft.down_s)
 
 
 def _draggy(craft: Crafts) -> Crafts:
-    return replace(craft, drag=0.25 * craft.mass[:, None] * np.ones((1, 3)))
+    return craft._replace(drag=0.25 * craft.mass[:, None] * np.ones((1, 3)))
 
 
 WEAK = np.array([1.0, 1.0, 0.9, 1.0])
@@ -143,7 +137,7 @@ FAULTS: dict[str, tuple[Callable[[Crafts], Crafts], set[str]]] = {
     "drag": (_draggy, {"linear_drag"}),
     "motor lag": (_slower, {"motor_lag"}),
     "thrust curve": (
-        lambda craft: replace(craft, linear=craft.linear + 0.3),
+        lambda craft: craft._replace(linear=craft.linear + 0.3),
         {"thrust_curve", "thrust_scale"},
     ),
     "mass": (_scaled("mass", 1.1), {"load"}),
@@ -163,11 +157,8 @@ def cases(seed: int) -> list[Case]:
     rng = np.random.default_rng(seed)
     drawn = [draw(rng) for _ in FAULTS]
     changed = [change(craft) for craft, (change, _) in zip(drawn, FAULTS.values(), strict=True)]
-    fields = Crafts.__dataclass_fields__
-    together = Crafts(
-        **{name: np.concatenate([getattr(craft, name) for craft in changed]) for name in fields}
-    )
-    flight = fly(together, Pilot(rng, len(together), DURATION_S, REACH), DURATION_S)
+    together = Crafts(*map(np.concatenate, zip(*changed, strict=True)))
+    flight = fly(together, Pilot(rng, len(changed), DURATION_S, REACH), DURATION_S)
     return [
         Case(fault, nominal_model(craft), log_of_flight(flight, index, rng, 1.0))
         for index, (fault, craft) in enumerate(zip(FAULTS, drawn, strict=True))

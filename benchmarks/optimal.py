@@ -382,66 +382,57 @@ def resample(flight: Flight, counts: np.ndarray, steps_s: np.ndarray) -> Flight:
     return new._replace(states=states, commands=flight.commands.take(held, axis=0, mode="clip"))
 
 
-class _Search:
-    """The stages of one search; counts iterations."""
+Solve = Callable[[Flight, bool, dict[str, Any]], Solution]  # guess, whether on grid, options
 
-    def __init__(self, task: Task, model: ModelParameters, dt_s: float):
-        self.task, self.dt_s, self.step = task, dt_s, step_function(model)
-        self.iterations = 0
 
-    def solve(self, guess: Flight, is_on_grid: bool, options: dict[str, Any]) -> Solution:
-        """Return the solution from a guess; count iterations."""
-        solution = solve(self.task, self.step, guess, is_on_grid, options)
-        self.iterations += solution.iterations
-        return solution
+def _solve_coarsely(task: Task, solve_from: Solve) -> tuple[Flight, list[float]]:
+    """Return the best of all starts, and all times, s (NaN if failed)."""
+    counts = np.round(segment_lengths(task) / COARSE_STEP_M).astype(int)
+    counts = np.maximum(counts, MIN_STEPS)
+    guesses = [
+        first_guess(task, counts, speed, heading)
+        for speed, heading in product(SPEEDS_M_S, HEADINGS_RAD)
+    ]
+    solutions = [solve_from(guess, False, COARSE) for guess in guesses]
+    times_s = [one.flight.gate_times_s[-1] if one.is_solved else np.nan for one in solutions]
+    if np.isnan(times_s).all():
+        raise RuntimeError(f"{task.kind}: no start of {len(times_s)} converged")
+    return solutions[int(np.nanargmin(times_s))].flight, times_s
 
-    def coarse(self) -> tuple[Flight, list[float]]:
-        """Return the best of all starts, and all times, s (NaN if failed)."""
-        counts = np.round(segment_lengths(self.task) / COARSE_STEP_M).astype(int)
-        counts = np.maximum(counts, MIN_STEPS)
-        guesses = [
-            first_guess(self.task, counts, speed, heading)
-            for speed, heading in product(SPEEDS_M_S, HEADINGS_RAD)
-        ]
-        solutions = [self.solve(guess, False, COARSE) for guess in guesses]
-        times_s = [one.flight.gate_times_s[-1] if one.is_solved else np.nan for one in solutions]
-        if np.isnan(times_s).all():
-            raise RuntimeError(f"{self.task.kind}: no start of {len(times_s)} converged")
-        return solutions[int(np.nanargmin(times_s))].flight, times_s
 
-    def fine(self, flight: Flight) -> Flight:
-        """Return the optimum with free segment times, steps of about ``dt_s``."""
-        durations_s = flight.counts * flight.steps_s
-        counts = np.round(durations_s / self.dt_s).astype(int)
-        solution = self.solve(resample(flight, counts, durations_s / counts), False, FINE)
+def _solve_finely(flight: Flight, dt_s: float, solve_from: Solve) -> Flight:
+    """Return the optimum with free segment times, steps of about ``dt_s``."""
+    durations_s = flight.counts * flight.steps_s
+    counts = np.round(durations_s / dt_s).astype(int)
+    solution = solve_from(resample(flight, counts, durations_s / counts), False, FINE)
+    if not solution.is_solved:
+        raise RuntimeError(f"free segment times: {solution.status}")
+    return solution.flight
+
+
+def _solve_on_grid(flight: Flight, dt_s: float, solve_from: Solve) -> Solution:
+    """Return the optimum in steps of ``dt_s``, each gate within the step where it is best.
+
+    Gates at an end of their step move to the next one, as long as that is new and can be solved.
+    """
+    steps = flight.gate_times_s / dt_s
+    nodes = np.ceil(steps).astype(int)
+    guess = resample(flight, np.diff(nodes, prepend=0), np.full(len(nodes), dt_s))
+    guess = guess._replace(fractions=steps - (nodes - 1))
+    solutions: dict[tuple[int, ...], Solution] = {}
+    while tuple(nodes) not in solutions and len(solutions) < MAX_SHIFTS:
+        solution = solve_from(guess, True, FINE | WARM)
         if not solution.is_solved:
-            raise RuntimeError(f"{self.task.kind}: free segment times: {solution.status}")
-        return solution.flight
-
-    def on_grid(self, flight: Flight) -> Solution:
-        """Return the optimum in steps of ``dt_s``, each gate within the step where it is best.
-
-        Gates at an end of their step move to the next one, as long as that is new and can be
-        solved.
-        """
-        steps = flight.gate_times_s / self.dt_s
-        nodes = np.ceil(steps).astype(int)
-        guess = resample(flight, np.diff(nodes, prepend=0), np.full(len(nodes), self.dt_s))
-        guess = guess._replace(fractions=steps - (nodes - 1))
-        solutions: dict[tuple[int, ...], Solution] = {}
-        while tuple(nodes) not in solutions and len(solutions) < MAX_SHIFTS:
-            solution = self.solve(guess, True, FINE | WARM)
-            if not solution.is_solved:
-                break
-            solutions[tuple(nodes)] = solution
-            fractions = solution.flight.fractions
-            is_early = fractions < FRACTION_EDGE + NEAR_EDGE
-            is_late = fractions > 1.0 - FRACTION_EDGE - NEAR_EDGE
-            nodes = nodes + is_late - is_early
-            guess = _moved(solution.flight, nodes)
-        if not solutions:
-            raise RuntimeError(f"{self.task.kind}: steps of {self.dt_s} s: {solution.status}")
-        return min(solutions.values(), key=lambda one: one.flight.gate_times_s[-1])
+            break
+        solutions[tuple(nodes)] = solution
+        fractions = solution.flight.fractions
+        is_early = fractions < FRACTION_EDGE + NEAR_EDGE
+        is_late = fractions > 1.0 - FRACTION_EDGE - NEAR_EDGE
+        nodes = nodes + is_late - is_early
+        guess = _moved(solution.flight, nodes)
+    if not solutions:
+        raise RuntimeError(f"steps of {dt_s} s: {solution.status}")
+    return min(solutions.values(), key=lambda one: one.flight.gate_times_s[-1])
 
 
 def _moved(flight: Flight, nodes: np.ndarray) -> Flight:
@@ -470,14 +461,20 @@ def find_optimum(task: Task, model: ModelParameters, dt_s: float) -> tuple[Fligh
         RuntimeError: no optimum was found.
     """
     wall_s, cpu_s = time.perf_counter(), time.process_time()
-    search = _Search(task, model, dt_s)
-    flight, coarse_times_s = search.coarse()
-    free = search.fine(flight)
-    optimum = search.on_grid(free)
+    step, iterations = step_function(model), []
+
+    def solve_from(guess: Flight, is_on_grid: bool, options: dict[str, Any]) -> Solution:
+        solution = solve(task, step, guess, is_on_grid, options)
+        iterations.append(solution.iterations)
+        return solution
+
+    flight, coarse_times_s = _solve_coarsely(task, solve_from)
+    free = _solve_finely(flight, dt_s, solve_from)
+    optimum = _solve_on_grid(free, dt_s, solve_from)
     return optimum.flight, {
         "solver": "IPOPT",
         "status": optimum.status,
-        "iterations": search.iterations,
+        "iterations": sum(iterations),
         "cpu_s": round(time.process_time() - cpu_s, 1),
         "wall_s": round(time.perf_counter() - wall_s, 1),
         "coarse_times_s": [

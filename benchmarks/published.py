@@ -182,9 +182,9 @@ def leave_one_out(flights: Imported, **settings: Any) -> list[Published]:
     """Return the predictions of each flight by a model of all others."""
     log, results = flights.log, []
     for number in np.unique(log.segment):
-        parts = [replace(flights, log=log.select(log.segment == number))]
-        parts.append(replace(flights, log=joined([log.select(log.segment != number)])))
-        results.append(predicted(parts[1], parts[0], **settings))
+        test = replace(flights, log=log.select(log.segment == number))
+        train = replace(flights, log=joined([log.select(log.segment != number)]))
+        results.append(predicted(train, test, **settings))
     return results
 
 

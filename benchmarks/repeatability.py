@@ -8,7 +8,7 @@ appended to docs/results/repeatability.jsonl, and a later run of the same commit
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import combinations
@@ -21,7 +21,15 @@ from benchmarks import hidden
 from benchmarks.diagnosis import AMPLITUDES, SECONDS, model_of
 from benchmarks.hidden.oracle import known
 from benchmarks.real.crazyflie import DATA
-from benchmarks.report import RESULTS, command, fill_page, lines_of_commit, record_trials, table
+from benchmarks.report import (
+    RESULTS,
+    Line,
+    command,
+    fill_page,
+    lines_of_commit,
+    record_trials,
+    table,
+)
 from benchmarks.seams.measured import measured_flights
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
@@ -40,7 +48,6 @@ CRAFT = {  # and the beginnings of its flights' names
 PLANT = "plant "  # begins the name of a simulated craft
 SEED = 57  # no rule was made on it
 VISIBLE, SEPARABLE = 30.0, 20.0  # lambda and lambda_sep of an effect that a log can show
-Line = Mapping[str, Any]
 
 
 class Trial(NamedTuple):
@@ -114,7 +121,7 @@ def trials(plants: int) -> list[Trial]:
     ]
 
 
-def measure(trial: Trial) -> dict[str, Any]:
+def measure(trial: Trial) -> Line:
     """Diagnose a flight: causes with their classes, values and times to half response."""
     flight = (simulated if trial.craft.startswith(PLANT) else measured)(trial)
     start = process_time()

@@ -23,6 +23,7 @@ import tyro
 from tqdm import tqdm
 
 Item = TypeVar("Item")
+Line = dict[str, Any]  # what was measured of something, JSON values
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "docs" / "results"
 PACKAGES = ("jax", "jaxlib", "gymnax", "numpy")
@@ -77,7 +78,7 @@ def command_line() -> str:
     return f"`{shlex.join(['python', '-m', module, *sys.argv[1:]])}`"
 
 
-def provenance(*packages: str) -> dict[str, Any]:
+def provenance(*packages: str) -> Line:
     """Return what every record names: commit, date, machine and versions, as JSON values.
 
     packages: whose versions matter besides those of ``PACKAGES``; "not installed" if missing.
@@ -96,7 +97,7 @@ def provenance(*packages: str) -> dict[str, Any]:
     }
 
 
-def provenance_line(record: dict[str, Any]) -> str:
+def provenance_line(record: Line) -> str:
     """Return a record's provenance as the last line of a page."""
     packages = ", ".join(f"{name} {number}" for name, number in record["versions"].items())
     return (
@@ -154,11 +155,6 @@ def progress(items: Iterable[Item], unit: str) -> Iterable[Item]:
     return tqdm(items, unit=f" {unit}", disable=None)
 
 
-def page(title: str, *parts: str) -> str:
-    """Return a page in Markdown: its title and its parts, a blank line between them."""
-    return "\n\n".join([f"# {title}", *(part.strip("\n") for part in parts)]) + "\n"
-
-
 def filled(name: str, /, **values: Any) -> str:
     """Return a template of ``benchmarks/pages`` with values filled in."""
     template = ROOT / "benchmarks" / "pages" / f"{name}.md"
@@ -186,13 +182,13 @@ def write_json(path: Path, value: Any) -> None:
     _write(path, json.dumps(value, indent=1) + "\n")
 
 
-def append_line(path: Path, line: dict[str, Any]) -> None:
+def append_line(path: Path, line: Line) -> None:
     """Append JSON values to a file as a line."""
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(line, default=str) + "\n")
 
 
-def lines_in(path: Path) -> list[dict[str, Any]]:
+def lines_in(path: Path) -> list[Line]:
     """Return the lines of JSON in a file, none if there is no file."""
     text = path.read_text(encoding="utf-8") if path.exists() else ""
     # What a kill has cut off has no end of line.
@@ -202,7 +198,7 @@ def lines_in(path: Path) -> list[dict[str, Any]]:
 def record_trials(
     path: Path,
     trials: Iterable[Any],
-    measure: Callable[[Any], dict[str, Any]],
+    measure: Callable[[Any], Line],
     programs_kept: int | None = None,
 ) -> None:
     """Measure what has no line of this commit yet, and append a line of JSON for each trial.
@@ -217,10 +213,9 @@ def record_trials(
         programs_kept: trials after which compiled programs are dropped, None for never; the system
             limits how many memory mappings a process may have.
     """
-    commit = commit_of_checkout()  # before lines change a file
     machine = f"{platform.machine()}, {os.cpu_count()} cores, jax {version('jax')}"
-    stamp = {"commit": commit, "date": str(date.today()), "machine": machine}
-    done = lines_of_commit(path, commit)
+    stamp = {"commit": commit_of_checkout(), "date": str(date.today()), "machine": machine}
+    done = lines_of_commit(path, stamp["commit"])
 
     def is_done(trial: Any) -> bool:
         fields = json.loads(json.dumps(trial._asdict()))
@@ -239,7 +234,7 @@ def record_trials(
         append_line(path, {**trial._asdict(), **stamp, **result})
 
 
-def lines_of_commit(path: Path, commit: str | None = None) -> list[dict[str, Any]]:
+def lines_of_commit(path: Path, commit: str | None = None) -> list[Line]:
     """Return the lines in a file that were measured at a commit; None: at that of the last line."""
     lines = lines_in(path)
     commit = lines[-1]["commit"] if commit is None and lines else commit

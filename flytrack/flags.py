@@ -16,6 +16,8 @@ Paths = Positional[tuple[Path, ...]]
 OptionalPath = Annotated[Path | None, arg(metavar="PATH", help_behavior_hint=NO_HINT)]
 SomeLogs = Annotated[tuple[Path, ...], arg(metavar="LOG [LOG ...]", help_behavior_hint=NO_HINT)]
 MotionName = Literal["auto", "euler", "semi_implicit", "continuous", "handout"]  # handout: euler
+LogFormat = Literal["csv", "ulog", "betaflight", "dataflash", "usd", "bag"]
+MappingName = Annotated[str | None, arg(metavar="MAPPING", help_behavior_hint=NO_HINT)]
 
 
 @dataclass(frozen=True)
@@ -86,11 +88,11 @@ class Import:
 
     files: Annotated[Paths, arg(metavar="FILE [FILE ...]", help_behavior_hint="(at least one)")]
     """Logs of one craft."""
-    format: Literal["csv", "ulog", "betaflight", "dataflash", "usd", "bag"]
+    format: LogFormat
     """Their format."""
     out: Path
     """The log, .npz or .csv."""
-    map: Annotated[str | None, arg(metavar="MAPPING", help_behavior_hint=NO_HINT)] = None
+    map: MappingName = None
     """A mapping file, .toml, or the name of a shipped one; CSV, uSD logs and bags need it."""
     model_out: OptionalPath = None
     """Also write the nominal model of this craft, .json."""
@@ -104,9 +106,9 @@ class Check:
 
     log: Annotated[Positional[Path | None], arg(metavar="LOG", help_behavior_hint=NO_HINT)] = None
     """The flight log; with --map, a file of another format."""
-    map: Annotated[str | None, arg(metavar="MAPPING", help_behavior_hint=NO_HINT)] = None
+    map: MappingName = None
     """A mapping file, .toml, or the name of a shipped one, to import the log with."""
-    format: Literal["csv", "ulog", "betaflight", "dataflash", "usd", "bag"] = "csv"
+    format: LogFormat = "csv"
     """The format of a log with --map."""
     model: OptionalPath = None
     """A model of the craft, whose lags and full-stick rates are compared with the log."""

@@ -204,12 +204,11 @@ def run_diagnose(flags: Diagnose) -> None:
     if flags.fleet:
         run_fleet(flags)
         return
-    train, test = (
-        [load_log(path) for path in flags.logs],
-        [load_log(path) for path in flags.hold_out],
+    train, test, before = (
+        [load_log(path) for path in paths] for paths in (flags.logs, flags.hold_out, flags.before)
     )
-    logs, before = [*train, *test], [load_log(path) for path in flags.before]
-    for one in (*logs, *before):
+    logs = train + test
+    for one in logs + before:
         check_plausible(one, flags.accept)
         print(describe(one), flush=True)  # what follows takes a while
     log = joined(logs)

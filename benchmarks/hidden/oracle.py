@@ -11,12 +11,14 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from scipy import optimize, signal
+from scipy import optimize
 
+from benchmarks.misspec.replay import lagged
 from flytrack_bench.hidden import Truth
 from flytrack_bench.hidden.drone import SECONDS_PER_MINUTE
 from flytrack_bench.hidden.noise import DIGIT, STD
 from flytrack_env.dynamics import ModelParameters
+from flytrack_env.thrust import collective_thrust
 from flytrack_sysid.diagnosis.model_selection import MAX_RIVALS, ablate_all
 from flytrack_sysid.inference.chunks import NUM_AXES, cut_chunks
 from flytrack_sysid.inference.noise import fit_noise
@@ -171,17 +173,11 @@ def _expected(truth: Truth, log: FlightLog, tau: np.ndarray, coeffs: np.ndarray)
     truth's.
     """
     before = np.maximum(np.arange(len(log)) - 1, 0)
-    applied = []
-    for column, keep in zip(
-        log["u"][before].T, np.exp(-(log.time[1] - log.time[0]) / tau), strict=True
-    ):
-        applied.append(signal.lfilter([1.0 - keep], [1.0, -keep], column, zi=[keep * column[0]])[0])
-    *turns, stick = applied
-    volt = log["v_bat"][before, 0]
-    terms = np.stack([stick**0, stick, stick**2, stick**3, volt, stick * volt])
+    applied = lagged(tau, log["u"], float(log.time[1] - log.time[0]))
+    thrust = collective_thrust(applied[:, 3], log["v_bat"][before, 0], coeffs)
     expected = np.zeros((len(log), len(SCALES)))
-    expected[:, 2] = coeffs @ terms / truth.mass
-    expected[:, 3:6] = np.radians(truth.max_rate) * np.stack(turns, axis=1)
+    expected[:, 2] = np.asarray(thrust) / truth.mass
+    expected[:, 3:6] = np.radians(truth.max_rate) * applied[:, :3]
     expected[:, 6] = log["v_bat"][0, 0] - truth.drain / SECONDS_PER_MINUTE * log.time
     return expected
 

@@ -1,4 +1,4 @@
-"""What a camera sees of a track, by casting rays in float64: NumPy alone, no code of the package.
+"""What a camera sees of a track, by casting rays in float64: no code of the package.
 
 World and body: x forward, y left, z up; quaternions (w, x, y, z), body to world. The camera is at
 the body's origin and looks along body x, pitched up. A gate is a square of edge ``frame`` with a
@@ -8,6 +8,7 @@ square hole of edge ``opening``, in the plane of its local x and z axes.
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 POSES_AT_ONCE = 100  # so that the arrays of a mask stay within the caches
 
@@ -46,14 +47,8 @@ class Image(NamedTuple):
 
 
 def matrices(quaternions: np.ndarray) -> np.ndarray:
-    """Return the rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
-    vector = quaternions[..., 1:]
-    cross = np.zeros((*quaternions.shape[:-1], 3, 3))
-    for row, column, part, sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 2, 0, -1)):
-        cross[..., row, column] = sign * vector[..., part]
-        cross[..., column, row] = -sign * vector[..., part]
-    w = quaternions[..., :1, None]
-    return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+    """Return the rotation matrices (num, 3, 3) of quaternions (num, 4)."""
+    return Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
 
 
 def read_gates(track: Any) -> Gates:
@@ -68,9 +63,8 @@ def read_gates(track: Any) -> Gates:
 
 def camera_rotations(quaternions: np.ndarray, image: Image) -> np.ndarray:
     """Return the rotations camera to world, (num_poses, 3, 3)."""
-    pitch = np.radians(image.pitch_deg)
-    cos, sin = np.cos(pitch), np.sin(pitch)
-    return matrices(quaternions) @ np.array([[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]])
+    upwards = Rotation.from_euler("y", -image.pitch_deg, degrees=True)
+    return matrices(quaternions) @ upwards.as_matrix()
 
 
 def cast_masks(positions: np.ndarray, quaternions: np.ndarray, gates: Gates, image: Image) -> Any:
@@ -130,9 +124,7 @@ def find_corners(
     for left, up in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
         # Who flies along local +y has local +x to the right.
         local = np.stack([-left * along * half, 0.0 * half, up * half], axis=-1)
-        points_w.append(
-            gates.centres[indices] + np.einsum("nij,nj->ni", gates.rotations[indices], local)
-        )
+        points_w.append(gates.centres[indices] + _rotate(gates.rotations[indices], local))
     offsets_w = np.stack(points_w, axis=1) - positions[:, None]
     offsets_c = offsets_w @ camera_rotations(quaternions, image)
     depth = np.where(offsets_c[..., 0] > 0.0, offsets_c[..., 0], np.nan)
@@ -161,26 +153,21 @@ def draw_poses(seed: int, count: int, gates: Gates) -> tuple[np.ndarray, np.ndar
     centres = gates.centres[indices]
     spread = np.where(np.arange(count) % 2, 0.8, 8.0)[:, None]
     positions = centres + spread * rng.normal(size=(count, 3))
-    positions[::5] = (
-        centres[::5]
-        + 0.1 * _unit(rng.normal(size=positions[::5].shape))
-        + (
-            np.einsum(
-                "nij,nj->ni",
-                gates.rotations[indices[::5]],
-                rng.choice([-1.0, 1.0], (len(positions[::5]), 3))
-                * np.array([1.0, 0.0, 1.0])
-                * gates.openings[indices[::5], None]
-                / 2.0,
-            )
-        )
-    )
+    near = indices[::5]
+    offsets = 0.1 * _unit(rng.normal(size=(len(near), 3)))
+    corners = rng.choice([-1.0, 1.0], (len(near), 3)) * [0.5, 0.0, 0.5]
+    corners = _rotate(gates.rotations[near], corners * gates.openings[near, None])
+    positions[::5] = centres[::5] + offsets + corners
     quaternions = _unit(rng.normal(size=(count, 4)))
     heading = np.arctan2(*(centres - positions)[:, 1::-1].T) + rng.normal(0.0, 0.5, count)
     level = np.stack([np.cos(heading / 2), 0 * heading, 0 * heading, np.sin(heading / 2)], axis=-1)
     facing = _unit(level + 0.15 * rng.normal(size=level.shape))
     is_facing = (np.arange(count) % 3 > 0)[:, None]
     return positions, np.where(is_facing, facing, quaternions), indices
+
+
+def _rotate(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

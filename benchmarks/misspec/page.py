@@ -7,13 +7,13 @@ each plant whose names the diagnosis missed, it computes what the log could show
 
 import json
 from pathlib import Path
-from typing import Any
 
 from scipy.stats import binomtest
 
 from benchmarks import report
 from benchmarks.diagnosis import MOTION_OF
 from benchmarks.hidden.oracle import known
+from benchmarks.report import Line
 from flytrack_bench.misspec import LogSuite, load_log_suite, summarize
 from flytrack_bench.misspec.scores import NAMED_ROWS
 from flytrack_bench.misspec.suite import ROWS
@@ -28,7 +28,6 @@ OTHERS = {
     "detected": "fault detected",
     "left_open": "outside: flagged, no name",
 }
-Line = dict[str, Any]
 
 
 def results() -> dict[str, Line]:

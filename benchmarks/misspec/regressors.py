@@ -118,10 +118,7 @@ def column(found: Replay, feature: Feature, scales: np.ndarray) -> np.ndarray:
     rates = nothing if feature.rates_b is None else feature.rates_b
     gyro = rates + (nothing if feature.gyro is None else feature.gyro)
     felt = force + (nothing if feature.accelerometer is None else feature.accelerometer)
-    parts = [gyro, felt, found.turned(rates), found.pushed(force)]
-    return np.concatenate(
-        [(part / scale).ravel() for part, scale in zip(parts, scales, strict=True)]
-    )
+    return _over_noise([gyro, felt, found.turned(rates), found.pushed(force)], scales)
 
 
 def targets(found: Replay) -> tuple[np.ndarray, np.ndarray]:
@@ -137,5 +134,6 @@ def targets(found: Replay) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _over_noise(parts: list[np.ndarray], scales: np.ndarray) -> np.ndarray:
-    weighted = [part / scale for part, scale in zip(parts, scales, strict=True)]
-    return np.concatenate([part.ravel() for part in weighted])
+    return np.concatenate(
+        [(part / scale).ravel() for part, scale in zip(parts, scales, strict=True)]
+    )

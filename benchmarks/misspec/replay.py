@@ -1,7 +1,7 @@
 """What rivals that know no package share: the nominal model in NumPy, along a log and in flight."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.signal import lfilter
@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_bench.misspec import Flights
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
+from flytrack_env.thrust import collective_thrust
 from flytrack_sysid import FlightLog
 
 SECONDS_PER_MINUTE = 60.0
@@ -143,15 +144,14 @@ class Replay(NamedTuple):
 
 def thrust_over_mass(model: ModelParameters, stick: np.ndarray, volt: np.ndarray) -> np.ndarray:
     """Return the model's thrust over mass (m/s^2)."""
-    one, linear, square, cube, by_volt, both = np.asarray(model.thrust_coeffs, float)
-    curve = one + stick * (linear + stick * (square + stick * cube))
-    return np.asarray((curve + volt * (by_volt + stick * both)) / float(model.m))
+    coeffs = np.asarray(model.thrust_coeffs, float)
+    return np.asarray(collective_thrust(stick, volt, coeffs)) / float(model.m)
 
 
-def lagged(model: ModelParameters, commands: np.ndarray, step_s: float) -> np.ndarray:
+def lagged(tau: Any, commands: np.ndarray, step_s: float) -> np.ndarray:
     """Return the lagged sticks at each row, (rows, ..., 4), from held commands (rows, ..., 4)."""
     before = np.concatenate([commands[:1], commands[:-1]])
-    keep = np.exp(-step_s / np.asarray(model.tau, float))
+    keep = np.exp(-step_s / np.asarray(tau, float))
     columns = [
         lfilter([1.0 - k], [1.0, -k], before[..., i], axis=0, zi=k * before[:1, ..., i])[0]
         for i, k in enumerate(keep)
@@ -166,7 +166,7 @@ def replay(log: FlightLog, model: ModelParameters) -> Replay:
     grid = np.arange(index[-1] + 1)
     before = np.searchsorted(index, grid, side="right") - 1
     applied, otherwise = (
-        lagged(model, log["u"][row], step_s) for row in (before, np.searchsorted(index, grid))
+        lagged(model.tau, log["u"][row], step_s) for row in (before, np.searchsorted(index, grid))
     )
     # A lost row's command is unknown: rows count where the one before or after it do the same.
     is_certain = np.abs(applied - otherwise).max(axis=1) < CERTAIN
@@ -206,7 +206,7 @@ def fly(
     residual: returns what force (m/s^2) and rates (rad/s) of the body have beyond the model.
     """
     step_s, past = flights.step_s, flights.past
-    applied = lagged(model, flights.commands.swapaxes(0, 1), step_s)
+    applied = lagged(model.tau, flights.commands.swapaxes(0, 1), step_s)
     # One row more: the last command acts until the end of the flight.
     final = applied[-1] + (flights.commands[:, -1] - applied[-1]) * -np.expm1(
         -step_s / np.asarray(model.tau, float)

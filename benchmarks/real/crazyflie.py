@@ -14,7 +14,6 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -27,7 +26,7 @@ from benchmarks.real.black_boxes import (
     fly_windows,
     rows_of,
 )
-from benchmarks.report import ROOT, table
+from benchmarks.report import ROOT, Line, table
 from flytrack_env.dynamics import ModelParameters
 from flytrack_sysid import FlightLog, import_log
 from flytrack_sysid.diagnosis import flight_errors, joined, refinement
@@ -64,7 +63,6 @@ OTHERS = {
     "placebo": "placebo: the state at the start, no commands",
 }
 AS_GOOD = 1.005  # rounds to 1.00
-Line = dict[str, Any]
 
 
 def policies_in(folder: Path) -> list[str]:
@@ -104,7 +102,7 @@ def fit_models(log: FlightLog, nominal: ModelParameters) -> tuple[np.ndarray, re
     return base.vector, refined
 
 
-def measure_fold(folder: Path, policy: str, seconds: float) -> dict[str, Any]:
+def measure_fold(folder: Path, policy: str, seconds: float) -> Line:
     """Return what the flights of all policies but one say, and how that predicts the one."""
     others = [name for name in policies_in(folder) if name != policy]
     training = joined([shortened(load_flights(folder, [name])[0], seconds) for name in others])

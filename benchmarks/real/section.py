@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
+from benchmarks.report import Line as Record
 from benchmarks.report import commit_of_checkout, table
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.pictures.drawing import new_figure, plain
@@ -23,7 +24,6 @@ from flytrack_sysid import FlightLog, Imported, diagnose, import_log
 from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.report import describe_verdict
 
-Record = dict[str, Any]
 STYLES: dict[str, dict[str, Any]] = {
     "nominal": {"color": ORANGE, "marker": "o"},
     "refitted_base": {"color": GREY, "marker": "o"},

@@ -192,18 +192,15 @@ def _inject_one(rng: np.random.Generator, flight: Flight, change: Change) -> Fli
     return flight._replace(log=replace(log, channels={**log.channels, name: values}))
 
 
-def _signed_axes(text: str) -> tuple[list[int], np.ndarray]:
-    """Return indices and signs of axes written as "y -x z"."""
-    axes = text.split()
-    return ["xyz".index(axis[-1]) for axis in axes], np.array([1 - 2 * ("-" in a) for a in axes])
+def axes_matrix(text: str) -> np.ndarray:
+    """Return the matrix that turns true axes into those written as "y -x z"."""
+    signs = [-1.0 if "-" in axis else 1.0 for axis in text.split()]
+    return np.diag(signs) @ np.eye(3)[["xyz".index(axis[-1]) for axis in text.split()]]
 
 
 def _change_axes(values: np.ndarray, text: str) -> np.ndarray:
     """Return columns permuted, with signs; text: "-" for one column."""
-    if text == "-":
-        return -values
-    indices, signs = _signed_axes(text)
-    return values[:, indices] * signs
+    return -values if text == "-" else values @ axes_matrix(text).T
 
 
 def _stick(rates: np.ndarray, curve: str) -> np.ndarray:
@@ -251,13 +248,18 @@ def _late(truth: FlightLog, log: FlightLog, channel: str, delay_s: float) -> np.
     return multiply(late, noise)
 
 
+def _yaw(log: FlightLog) -> np.ndarray:
+    """Return the heading of each row, rad in (-pi, pi]."""
+    w, x, y, z = log["q"].T
+    return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
 def _interpolate_across_wrap(log: FlightLog, source_rows: int) -> np.ndarray:
     """Return attitudes whose yaw, in (-180, 180] degrees, was interpolated between every few rows.
 
     Only what lies between two source rows on both sides of the wrap is changed.
     """
-    w, x, y, z = log["q"].T
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    yaw = _yaw(log)
     rows = np.arange(len(yaw))
     sources = rows[::source_rows]
     jumps = np.abs(np.diff(yaw[sources], append=yaw[sources[-1]])) > np.pi
@@ -306,8 +308,7 @@ def _motion(truth: FlightLog) -> _Motion:
     def rms(values: np.ndarray) -> np.ndarray:
         return np.sqrt(np.mean(values**2, axis=0))
 
-    w, x, y, z = truth["q"].T
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    _, x, y, _ = truth["q"].T
     return _Motion(
         rates=rms(truth["w"]),
         turns=rms(np.gradient(truth["w"], truth.time, axis=0)),
@@ -317,7 +318,7 @@ def _motion(truth: FlightLog) -> _Motion:
         tilt=float(rms(2.0 * np.arcsin(np.minimum(np.hypot(x, y), 1.0)))),
         lift_spread=float(np.std(truth["f"][:, 2])),
         stick=float(np.mean(np.abs(truth["u"][:, :3]).max(axis=1) > 0.3)),
-        wraps=int(np.sum(np.abs(np.diff(yaw)) > np.pi)),
+        wraps=int(np.sum(np.abs(np.diff(_yaw(truth))) > np.pi)),
     )
 
 
@@ -332,8 +333,7 @@ def _is_one_shown(motion: _Motion, change: Change) -> bool:
         return True
     turning = bool(np.all(motion.rates[:2] > 0.2) and motion.tilt > 0.1)
     if kind == "axes" and value != "-":
-        indices, signs = _signed_axes(str(value))
-        changed = [i for i in range(3) if indices[i] != i or signs[i] < 0]
+        changed = np.diag(axes_matrix(str(value))) != 1.0
         strength, least = {
             "w": (motion.rates, 0.15),  # rad/s
             "u_rates": (motion.rates, 0.15),

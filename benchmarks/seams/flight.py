@@ -8,11 +8,24 @@
 - ``hover``: around a point.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from benchmarks.seams.craft import GRAVITY, STEP_S, Craft, State, at_rest, draw_craft, hold
+from benchmarks.seams.craft import (
+    GRAVITY,
+    STEP_S,
+    UP,
+    Craft,
+    State,
+    advance,
+    at_rest,
+    draw_craft,
+    hold,
+)
 from flytrack_sysid.log import FlightLog
 
 KINDS = {"race": 0.4, "excitation": 0.3, "gentle": 0.2, "hover": 0.1}  # shares
@@ -69,19 +82,17 @@ def make_flight(seed: int, seconds: float = 60.0, kind: str | None = None) -> Fl
     plan = _draw_plan(rng, kind, craft, round(seconds * rate_hz), dt)
     states, commands = _fly(rng, craft, plan, dt)
     truth = FlightLog(
-        time=np.arange(len(states)) * dt,
+        time=np.arange(len(commands)) * dt,
         channels={
             "u": commands,
-            **{name: np.array([getattr(x, name) for x in states]) for name in ("p", "v", "q", "w")},
-            "f": np.array([x.f for x in states]),
-            "v_bat": np.array([[x.v_bat] for x in states]),
+            **{name: getattr(states, name) for name in ("p", "v", "q", "w", "f")},
+            "v_bat": states.v_bat[:, None],
         },
-        segment=np.zeros(len(states), int),
+        segment=np.zeros(len(commands), int),
         source=f"simulated flight {seed}",
         origin="measured",
     )
-    motors = np.array([x.outputs for x in states])
-    return Flight(_with_noise(rng, truth), motors, craft, kind, truth)
+    return Flight(_with_noise(rng, truth), states.outputs, craft, kind, truth)
 
 
 def _draw_plan(rng: np.random.Generator, kind: str, craft: Craft, rows: int, dt: float) -> Plan:
@@ -130,63 +141,66 @@ def _draw_doublets(rng: np.random.Generator, craft: Craft, rows: int, dt: float)
     return doublets
 
 
-def _fly(
-    rng: np.random.Generator, craft: Craft, plan: Plan, dt: float
-) -> tuple[list[State], np.ndarray]:
-    """Fly a plan; returns the state at each row and the command from it on, (num_rows, 4)."""
+def _fly(rng: np.random.Generator, craft: Craft, plan: Plan, dt: float) -> tuple[State, np.ndarray]:
+    """Fly a plan; returns the state at each row and the command from it on, (num_rows, ...)."""
     wind = np.append(rng.normal(size=2), 0.0)
     wind *= rng.uniform(0.0, MAX_WIND_M_S) / np.linalg.norm(wind)
-    start = 0.0 if plan.headings is None else plan.headings[0]
-    x = at_rest(craft, plan.waypoints[-1], start, rng.uniform(0.0, 30.0))
-    x = hold(craft, x, np.array([0.0, 0.0, 0.0, craft.hover]), wind, 1)  # so that f is a flight's
-    states, commands, target, since_s = [], [], 0, 0.0
-    for doublets in plan.doublets:
-        heading = None if plan.headings is None else plan.headings[target]
-        u = np.clip(_steer(craft, x, plan, target, heading, dt) + doublets, -1.0, 1.0)
-        states.append(x)
-        commands.append(u)
-        x = hold(craft, x, u, wind, round(dt / STEP_S))
-        since_s += dt
-        near = np.linalg.norm(plan.waypoints[target] - x.p) < plan.reach_m
-        if near or since_s > plan.stay_s:
-            target, since_s = (target + 1) % len(plan.waypoints), 0.0
-    return states, np.array(commands)
+    heading = 0.0 if plan.headings is None else plan.headings[0]
+    start = at_rest(craft, plan.waypoints[-1], heading, rng.uniform(0.0, 30.0))
+    hover = np.array([0.0, 0.0, 0.0, craft.hover])
+    start = hold(craft, start, hover, wind, 1)  # so that f is a flight's
+    with jax.enable_x64(True):
+        flown = _fly_from(craft, start, plan, wind, dt, round(dt / STEP_S))
+        return jax.tree.map(np.array, flown)
 
 
-def _steer(
-    craft: Craft, x: State, plan: Plan, target: int, heading: float | None, dt: float
-) -> np.ndarray:
+@jax.jit
+def _fly_from(craft: Craft, start: State, plan: Plan, wind: Any, dt: Any, steps: Any) -> Any:
+    """Return states and commands of a flight in rows of ``dt``, s, that take some steps each."""
+
+    def fly_row(carry: Any, doublets: Any) -> Any:
+        state, target, since_s = carry
+        u = jnp.clip(_steer(craft, state, plan, target, dt) + doublets, -1.0, 1.0)
+        after, since_s = advance(craft, state, u, wind, steps), since_s + dt
+        is_near = jnp.linalg.norm(plan.waypoints[target] - after.p) < plan.reach_m
+        is_passed = is_near | (since_s > plan.stay_s)
+        target = (target + is_passed) % len(plan.waypoints)
+        return (after, target, jnp.where(is_passed, 0.0, since_s)), (state, u)
+
+    plan = jax.tree.map(jnp.asarray, plan)
+    begun: Any = (start, 0, 0.0)
+    return jax.lax.scan(fly_row, begun, plan.doublets)[1]
+
+
+def _steer(craft: Craft, x: State, plan: Plan, target: Any, dt: Any) -> jax.Array:
     """Return the command, (4,), that flies towards a waypoint.
 
     Each loop is slower than the one inside it: attitude, velocity, position.
     """
-    attitude_gain = 0.3 / (max(craft.lags) + dt)
+    attitude_gain = 0.3 / (craft.lags.max() + dt)
     velocity_gain, position_gain = attitude_gain / 2.0, attitude_gain / 6.0
-    (w, i, j, k), way = x.q, plan.waypoints[target] - np.array(x.p)
-    attitude = np.array(
-        [
-            [1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j)],
-            [2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i)],
-            [2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j)],
-        ]
-    )
-    distance = float(np.sqrt(way @ way)) + 1e-9
-    speed = plan.speed if heading is None else min(plan.speed, position_gain * distance)
-    wanted = velocity_gain * (way * (speed / distance) - np.array(x.v))
+    way = plan.waypoints[target] - x.p
+    distance = jnp.linalg.norm(way) + 1e-9
+    heading: Any = jnp.arctan2(way[1], way[0])
+    speed: Any = plan.speed
+    if plan.headings is not None:
+        heading = plan.headings[target]
+        speed = jnp.minimum(plan.speed, position_gain * distance)
+    wanted = velocity_gain * (way * (speed / distance) - x.v)
     most = 0.5 * (craft.thrust_to_weight - 1.0) * GRAVITY
-    wanted *= min(1.0, most / (float(np.sqrt(wanted @ wanted)) + 1e-9))
-    wanted[2] = max(wanted[2] + GRAVITY, 2.0)  # upright
-    lift = wanted @ attitude  # body
-    tilt = np.arctan2(np.hypot(lift[0], lift[1]), lift[2])
-    along = tilt / (np.hypot(lift[0], lift[1]) + 1e-9)
-    heading = np.arctan2(way[1], way[0]) if heading is None else heading
-    turn = heading - np.arctan2(attitude[1, 0], attitude[0, 0])
-    turn = (turn + np.pi) % (2.0 * np.pi) - np.pi
-    rates = np.array([-lift[1] * along, lift[0] * along, 0.4 * turn]) * attitude_gain
-    rates[2] = np.clip(rates[2], -2.0, 2.0)
+    wanted = wanted * jnp.minimum(1.0, most / (jnp.linalg.norm(wanted) + 1e-9)) + GRAVITY * UP
+    wanted = wanted.at[2].set(jnp.maximum(wanted[2], 2.0))  # upright
+    lift = x.attitude.inv().apply(wanted)  # body
+    across = jnp.hypot(lift[0], lift[1])
+    along = jnp.arctan2(across, lift[2]) / (across + 1e-9)
+    nose = x.attitude.apply(jnp.array([1.0, 0.0, 0.0]))
+    turn = heading - jnp.arctan2(nose[1], nose[0])
+    turn = (turn + jnp.pi) % (2.0 * jnp.pi) - jnp.pi
+    yaw_rate = jnp.clip(0.4 * turn * attitude_gain, -2.0, 2.0)
+    rates = jnp.stack([-lift[1] * along * attitude_gain, lift[0] * along * attitude_gain, yaw_rate])
     strength = (x.v_bat / craft.voltage[1]) ** 2 * craft.thrust_to_weight * GRAVITY
-    throttle = craft.output_for(max(lift[2], 0.0) / strength)
-    return np.append(rates / np.deg2rad(craft.max_rate), 2.0 * throttle - 1.0)
+    throttle = craft.output_for(jnp.maximum(lift[2], 0.0) / strength)
+    return jnp.append(rates / jnp.deg2rad(craft.max_rate), 2.0 * throttle - 1.0)
 
 
 def _with_noise(rng: np.random.Generator, truth: FlightLog) -> FlightLog:
@@ -197,7 +211,6 @@ def _with_noise(rng: np.random.Generator, truth: FlightLog) -> FlightLog:
 
     q, angle = truth["q"], white(np.deg2rad(rng.uniform(0.2, 0.5)))
     q = multiply(q, np.column_stack([np.ones(len(q)), 0.5 * angle]))
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
     if rng.random() < 0.5:  # half the loggers keep q_w positive
         q *= np.where(q[:, :1] < 0.0, -1.0, 1.0)
     channels = {
@@ -213,14 +226,6 @@ def _with_noise(rng: np.random.Generator, truth: FlightLog) -> FlightLog:
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return products of quaternions (w, x, y, z), (num_rows, 4); arguments broadcast."""
-    (aw, ax, ay, az), (bw, bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
-    )
+    """Return products of unit quaternions (w, x, y, z), (num_rows, 4); arguments broadcast."""
+    first, second = (Rotation.from_quat(quat, scalar_first=True) for quat in (a, b))
+    return np.asarray((first * second).as_quat(scalar_first=True))

@@ -1,6 +1,7 @@
 """Small plants with the conventions of ten simulators, as their documentation states them.
 
-All share one quadcopter; a ``Simulator`` states how its state and its actions are written. They
+All share one quadcopter; a ``Simulator`` states how its state and its actions are written, and
+``simulators.toml`` has all of them. They
 take FlyTrack's actions, (roll, pitch, yaw, thrust) in [-1, 1], through the adapter that one writes
 first: fractions of full rate, passed on in the simulator's own axes. Where a simulator has no rate
 mode, a rate loop is assumed. ``expected`` is what differs from FlyTrack's conventions.
@@ -8,30 +9,24 @@ mode, a rate loop is assumed. ``expected`` is what differs from FlyTrack's conve
 Besides the kinds of ``faults``: ``frame`` of w, "world" if angular velocity is not in body axes.
 """
 
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.seams.craft import GRAVITY
-from benchmarks.seams.faults import FRD, Change, Truth
+from benchmarks.seams.faults import Change, Truth, axes_matrix
 
-FLU, ENU = "x y z", "-y x z"  # ENU: x east, while FlyTrack's x is taken as north
+FLU = "x y z"
 MAX_RATE = np.deg2rad([600.0, 600.0, 250.0])  # rad/s
 LAGS_S = np.array([0.03, 0.035, 0.05, 0.03])  # roll, pitch, yaw, thrust
 THRUST_TO_WEIGHT, DRAG_PER_S = 3.0, 0.3
 SUBSTEP_S = 0.002
 Layout = dict[str, Any]
-
-
-def _matrix(axes: str) -> np.ndarray:
-    """Return the matrix that turns true axes into those written as "x -y -z"."""
-    rows = [
-        np.eye(3)["xyz".index(axis[-1])] * (-1.0 if "-" in axis else 1.0) for axis in axes.split()
-    ]
-    return np.array(rows)
 
 
 @dataclass(frozen=True)
@@ -108,7 +103,7 @@ class Simulator:
         """Return the state after ``dt`` with an action held; both as the simulator writes them."""
         p, v, attitude, w, throttle = self._read(np.asarray(x, float))
         u = np.asarray(u, float)
-        aim_w = _matrix(self.sticks).T @ np.clip(u[:3], -1.0, 1.0) * MAX_RATE
+        aim_w = axes_matrix(self.sticks).T @ np.clip(u[:3], -1.0, 1.0) * MAX_RATE
         thrust = u[3] if self.throttle == "0..1" else 0.5 * (u[3] + 1.0)
         aim_throttle = np.clip(thrust, 0.0, 1.0)
         steps = round(self.dt / SUBSTEP_S)
@@ -129,11 +124,11 @@ class Simulator:
         self, p: np.ndarray, v: np.ndarray, attitude: Rotation, w: np.ndarray, throttle: float
     ) -> np.ndarray:
         """Return a state in the simulator's conventions."""
-        matrix = _matrix(self.world) @ attitude.as_matrix() @ _matrix(self.body).T
-        rates = _matrix(self.body) @ w
+        matrix = axes_matrix(self.world) @ attitude.as_matrix() @ axes_matrix(self.body).T
+        rates = axes_matrix(self.body) @ w
         blocks = {
-            "p": _matrix(self.position_axes) @ p,
-            "v": _matrix(self.velocity_axes) @ v,
+            "p": axes_matrix(self.position_axes) @ p,
+            "v": axes_matrix(self.velocity_axes) @ v,
             "q": TO_NUMBERS[self.attitude](matrix),
             "w": matrix @ rates if self.has_world_rates else rates,
         }
@@ -146,10 +141,10 @@ class Simulator:
         matrix = FROM_NUMBERS[self.attitude](parts["q"])
         rates = matrix.T @ parts["w"] if self.has_world_rates else parts["w"]
         return (
-            _matrix(self.position_axes).T @ parts["p"],
-            _matrix(self.velocity_axes).T @ parts["v"],
-            Rotation.from_matrix(_matrix(self.world).T @ matrix @ _matrix(self.body)),
-            _matrix(self.body).T @ rates,
+            axes_matrix(self.position_axes).T @ parts["p"],
+            axes_matrix(self.velocity_axes).T @ parts["v"],
+            Rotation.from_matrix(axes_matrix(self.world).T @ matrix @ axes_matrix(self.body)),
+            axes_matrix(self.body).T @ rates,
             float(x[-1]),
         )
 
@@ -166,92 +161,7 @@ FROM_NUMBERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "euler": lambda numbers: Rotation.from_euler("xyz", numbers).as_matrix(),
     "columns": lambda numbers: numbers.reshape(3, 3).T,
 }
-SIMULATORS = (
-    Simulator(
-        "crazyflow",
-        "https://github.com/learnsyslab/crazyflow, crazyflow/sim/data.py: SimState",
-        "a rate loop around its force and torque control",
-        blocks="pqvw",
-        attitude="xyzw",
-    ),
-    Simulator(
-        "gym-pybullet-drones",
-        "https://github.com/utiasDSL/gym-pybullet-drones, BaseAviary.py: _getDroneStateVector, of "
-        "which the kinematic observation has position, roll-pitch-yaw, velocity, angular velocity; "
-        "PyBullet's getBaseVelocity is in world axes",
-        "a rate loop around its motor speeds",
-        blocks="pqvw",
-        attitude="euler",
-        has_world_rates=True,
-        dt=1.0 / 240.0,
-    ),
-    Simulator(
-        "RotorPy",
-        "https://github.com/spencerfolk/rotorpy, rotorpy/vehicles/multirotor.py: state, cmd_ctbr",
-        "actions are scaled to N and rad/s",
-        attitude="xyzw",
-    ),
-    Simulator(
-        "PX4 SITL",
-        "https://docs.px4.io/main/en/msg_docs/VehicleOdometry and VehicleRatesSetpoint",
-        "thrust_body[2] is the negative of a throttle in 0..1",
-        blocks="pqvw",
-        position_axes=FRD,
-        world=FRD,
-        velocity_axes=FRD,
-        body=FRD,
-        sticks=FRD,
-        throttle="0..1",
-    ),
-    Simulator(
-        "Betaflight SITL",
-        "https://github.com/betaflight/betaflight, SITL's target.h (fdm_packet: velocity ENU, "
-        "position NED) and sitl.c (updateState: rates of the packet are FRD)",
-        "sticks: pitch forward is nose down, yaw right is clockwise; throttle -1 is 1000 us",
-        blocks="wqvp",
-        position_axes=FRD,
-        world=FRD,
-        velocity_axes=ENU,
-        body=FRD,
-        sticks="x y -z",
-    ),
-    Simulator(
-        "Isaac Gym",
-        "Isaac Gym Preview 4, docs/programming/tensors.html: actor root state, in world axes",
-        "a rate loop around its forces",
-        blocks="pqvw",
-        attitude="xyzw",
-        has_world_rates=True,
-    ),
-    Simulator(
-        "AirSim",
-        "https://microsoft.github.io/AirSim/apis/: NED; airsim/types.py: Quaternionr.to_numpy_array"
-        " is x, y, z, w; client.py: moveByAngleRatesThrottleAsync takes FLU rates, throttle 0..1",
-        "angular velocity is in body axes, FRD",
-        blocks="pqvw",
-        attitude="xyzw",
-        position_axes=FRD,
-        world=FRD,
-        velocity_axes=FRD,
-        body=FRD,
-        throttle="0..1",
-    ),
-    Simulator(
-        "Flightmare",
-        "https://github.com/uzh-rpg/flightmare, VisionEnv::getObs: p, R, v, w; Eigen stores "
-        "matrices by column",
-        "collective thrust in 0..1 of full thrust",
-        blocks="pqvw",
-        attitude="columns",
-        throttle="0..1",
-    ),
-    Simulator(
-        "MuJoCo",
-        "https://mujoco.readthedocs.io/en/stable/overview.html#floating-objects: quaternion "
-        "w, x, y, z; linear velocity in world, angular velocity in body axes",
-        "a rate loop around its actuators",
-        blocks="pqvw",
-        dt=0.004,
-    ),
-    Simulator("the handout", "shared/handout.md"),
+SIMULATORS = tuple(
+    Simulator(**fields)
+    for fields in tomllib.loads(Path(__file__).with_suffix(".toml").read_text())["simulator"]
 )

@@ -1,4 +1,4 @@
-"""Batches of pytrees packed as one matrix of 32-bit words, and one of flags if there are any.
+"""Batches of pytrees packed as one matrix of 32-bit words.
 
 Handing an array to a compiled function, or taking one from it, costs one to four microseconds; a
 state has some fifty leaves and the parameters as many again.
@@ -43,8 +43,7 @@ class Layout:
     Equal layouts are one object: every call of a compiled function hashes and compares them.
 
     Attributes:
-        groups: each dtype, with the first row of its words and the row after its last; flags come
-            last, and their rows are counted on.
+        groups: each dtype, with the first row of its words and the row after its last.
         slots: a leaf's shape, group, first value of the group, and the value after its last.
     """
 
@@ -54,14 +53,8 @@ class Layout:
 
     @property
     def num_rows(self) -> int:
-        """Number of words and flags of one pytree."""
+        """Number of words of one pytree."""
         return int(self.groups[-1][2])
-
-    @property
-    def num_words(self) -> int:
-        """Number of words without flags."""
-        dtype, first, end = self.groups[-1]
-        return int(first if dtype.kind == "b" else end)
 
     def __reduce__(self) -> tuple[Any, ...]:
         forms = tuple((shape, self.groups[group][0]) for shape, group, *_ in self.slots)
@@ -70,7 +63,7 @@ class Layout:
 
 @cache
 def _layout(structure: Any, forms: tuple[tuple[tuple[int, ...], Any], ...]) -> Layout:
-    dtypes = sorted(dict.fromkeys(dtype for _, dtype in forms), key=lambda dtype: dtype.kind == "b")
+    dtypes = list(dict.fromkeys(dtype for _, dtype in forms))
     counts, slots = [0] * len(dtypes), []
     for shape, dtype in forms:
         group = dtypes.index(dtype)
@@ -84,7 +77,7 @@ def _layout(structure: Any, forms: tuple[tuple[tuple[int, ...], Any], ...]) -> L
 
 
 def _words_per_value(dtype: Any) -> int:
-    return 1 if dtype.kind == "b" else dtype.itemsize // WORD.itemsize
+    return max(dtype.itemsize // WORD.itemsize, 1)
 
 
 def _as_pairs(words: Any, size: int) -> Any:
@@ -95,38 +88,29 @@ def _as_pairs(words: Any, size: int) -> Any:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Packed:
-    """A batch of pytrees as matrices (rows, num_envs).
+    """A batch of pytrees as a matrix (rows, num_envs).
 
     A number of all environments is contiguous.
 
     Attributes:
-        words: of all leaves but flags.
-        flags: leaves of bool, None if there are none.
+        words: of all leaves; those of flags are 0.0 or 1.0.
     """
 
     words: jax.Array | np.ndarray
-    flags: jax.Array | np.ndarray | None
     layout: Layout = field(metadata={"static": True})
-
-    def as_words(self) -> jax.Array:
-        """Return the words with those of the flags, 0.0 or 1.0, below them."""
-        if self.flags is None:
-            return jnp.asarray(self.words)
-        return jnp.concatenate([self.words, self.flags.astype(WORD)])
 
     def unpack(self) -> Any:
         """Return the batch that was packed, leaves (num_envs, ...); works under ``jit``."""
 
-        def restore(dtype: Any, words: Any) -> jax.Array:
+        def restore(dtype: Any, words: Any) -> Any:
+            if dtype.kind == "b":
+                return words != 0
             size = _words_per_value(dtype)
             return jax.lax.bitcast_convert_type(
                 words if size == 1 else _as_pairs(words, size), dtype
             )
 
-        values: list[Any] = [
-            self.flags if dtype.kind == "b" else restore(dtype, self.words[first:end])
-            for dtype, first, end in self.layout.groups
-        ]
+        values = [restore(dtype, self.words[first:end]) for dtype, first, end in self.layout.groups]
         leaves = [
             values[group][first:end].T.reshape(-1, *shape)
             for shape, group, first, end in self.layout.slots
@@ -142,15 +126,14 @@ class Packed:
         words = np.asarray(self.words)
 
         def restore(dtype: Any, words: np.ndarray) -> np.ndarray:
+            if dtype.kind == "b":
+                return words != 0
             size, num_envs = _words_per_value(dtype), words.shape[1]
             if size > 1:
                 words = np.ascontiguousarray(_as_pairs(words, size)).reshape(-1, size * num_envs)
             return words.view(dtype).astype(HOST_DTYPES[dtype.kind])
 
-        arrays = [
-            np.array(self.flags) if dtype.kind == "b" else restore(dtype, words[first:end])
-            for dtype, first, end in self.layout.groups
-        ]
+        arrays = [restore(dtype, words[first:end]) for dtype, first, end in self.layout.groups]
         leaves = [
             arrays[group][first:end].T.reshape(-1, *shape) if shape else arrays[group][first]
             for shape, group, first, end in self.layout.slots
@@ -159,13 +142,12 @@ class Packed:
 
 
 def from_words(words: jax.Array, layout: Layout) -> Packed:
-    """Return what ``Packed.as_words`` was called of; rows beyond are left out."""
-    flags = words[layout.num_words : layout.num_rows] != 0
-    return Packed(words[: layout.num_words], flags if len(flags) else None, layout)
+    """Return the packed batch of these words; rows beyond are left out."""
+    return Packed(words[: layout.num_rows], layout)
 
 
 def make_reader(layout: Layout, first_row: int) -> Callable[[Any], tuple[Any, ...]]:
-    """Return a function of a buffer of ``as_words`` that returns the leaves as Python's numbers.
+    """Return a function of a buffer of words that returns the leaves as Python's numbers.
 
     Args:
         layout: of scalars.
@@ -194,10 +176,10 @@ def pack(batch: Any) -> Packed:
     columns: list[list[jax.Array]] = [[] for _ in layout.groups]
     # The fence: a concatenation would compute each of its parts again for every element.
     for leaf, (_, group, *_) in zip(compute_once(leaves), layout.slots, strict=True):
-        rows = leaf if leaf.dtype.kind == "b" else jax.lax.bitcast_convert_type(leaf, WORD)
+        is_flag = leaf.dtype.kind == "b"
+        rows = leaf.astype(WORD) if is_flag else jax.lax.bitcast_convert_type(leaf, WORD)
         columns[group].append(rows.reshape(leaf.shape[0], -1).T)
-    flags = jnp.concatenate(columns.pop()) if layout.num_words < layout.num_rows else None
-    return Packed(jnp.concatenate([part for parts in columns for part in parts]), flags, layout)
+    return Packed(jnp.concatenate([part for parts in columns for part in parts]), layout)
 
 
 def pack_one(tree: Any) -> Packed:

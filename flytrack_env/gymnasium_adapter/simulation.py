@@ -135,7 +135,7 @@ class SingleStep:
         def fly_words(words: Any, action: jax.Array, params_words: Any) -> jax.Array:
             after, observation, scene, numbers = fly(words, action, params_words)
             rows = observation.reshape(-1, 1), scene[:, None]
-            arrays = after.as_words(), *rows, numbers.as_words()
+            arrays = after.words, *rows, numbers.words
             return jnp.concatenate([array.astype(WORD) for array in arrays])
 
         inputs[0] = jax.ShapeDtypeStruct((self._num_rows, 1), WORD)
@@ -143,7 +143,7 @@ class SingleStep:
 
     def start(self, state: Packed) -> np.ndarray:
         """Return the words of a state before the first step."""
-        words = np.asarray(state.as_words())
+        words = np.asarray(state.words)
         return np.concatenate([words, np.zeros((self._num_rows - len(words), 1), WORD)])
 
     def __call__(self, words: Any, action: np.ndarray, params_words: Any) -> tuple[Any, ...]:
@@ -282,7 +282,7 @@ class Simulation:
         self.step_s = float(self.params.dt)
         # As arrays of NumPy: a number of Python's and one of NumPy's would be compiled apart.
         self.packed_params = _pack_params(jax.tree.map(np.asarray, self.params))
-        self.params_words = self.packed_params.as_words()
+        self.params_words = self.packed_params.words
         plant = overrides.get("plant")
         key = env_id, self.env.missed_gate, plant and id(plant), self.env.plant.delay_steps
         self.compiled = _COMPILED.setdefault((*key, self.packed_params.layout), self.env)

@@ -9,8 +9,8 @@ from PIL import Image, ImageDraw
 
 from flytrack_env import scene
 from flytrack_env.rendering.camera import Camera, unit
-from flytrack_env.rendering.views import PIXEL, draw_drone, draw_gate, font
-from flytrack_env.scene import Colour, gates_of, ground_grid
+from flytrack_env.rendering.views import PIXEL, Floor, draw_drone, draw_gate, font
+from flytrack_env.scene import Colour, gates_of
 from flytrack_env.state import POSITION, QUATERNION
 from flytrack_env.tracks import Course
 
@@ -82,13 +82,10 @@ class FixedView:
 
     def __init__(self, course: Course, gate_ids: Sequence[int], laps: Sequence[Lap]):
         self.gates, self.gate_ids = gates_of(course), gate_ids
-        low, high = (np.array(corner, float) for corner in (course.bounds_low, course.bounds_high))
+        self.floor = Floor(course, GRID_M)
         paths_w = np.concatenate([lap.states[:, POSITION] for lap in laps])
         shown_w = np.concatenate([self.gates.outer.reshape(-1, 3), paths_w])
         self.camera = self._fit(shown_w)
-        self.grid_w = ground_grid(low, high, GRID_M)
-        corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
-        self.floor_w = np.array([(x, y, low[2]) for x, y in corners])
 
     def _fit(self, points_w: np.ndarray) -> Camera:
         """Return a camera that sees all of these points, as large as they fit."""
@@ -111,9 +108,7 @@ class FixedView:
         """Return the picture at a row of the laps: the paths so far, the drones, the lap times."""
         canvas = Image.new("RGB", (PIXEL * WIDTH, PIXEL * HEIGHT), scene.BACKGROUND)
         draw = ImageDraw.Draw(canvas)
-        draw.polygon(self.camera.polygon(self.camera.look(self.floor_w)), scene.GROUND)
-        for line in self.camera.look(self.grid_w):
-            draw.line(self.camera.polygon(line), scene.GROUND_GRID, PIXEL)
+        self.floor.draw(draw, self.camera)
         gates_c = self.camera.look(np.concatenate([self.gates.outer, self.gates.inner], axis=1))
         for index in np.argsort(-gates_c[:, :, 2].mean(axis=1)):
             draw_gate(draw, self.camera, gates_c[index], GATE_COLOUR)
@@ -124,7 +119,7 @@ class FixedView:
         for lap in laps:
             path_w = lap.states[: max(row, 1) + 1, POSITION].astype(float)
             dim = scene.blend(lap.colour, scene.GROUND, 0.45)
-            shadow_w = np.where([True, True, False], path_w, self.floor_w[0])
+            shadow_w = np.where([True, True, False], path_w, self.floor.height_m)
             draw.line(self._pixels(shadow_w), scene.SHADOW, PIXEL)
             draw.line(self._pixels(path_w), dim, 3 * PIXEL, joint="curve")
             draw.line(self._pixels(path_w[-RECENT_STEPS:]), lap.colour, 5 * PIXEL, joint="curve")

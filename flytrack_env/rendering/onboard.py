@@ -8,8 +8,8 @@ from flytrack_env.flown_camera import HEIGHT_PX, WIDTH_PX, Film
 from flytrack_env.rendering.animation import save_gif
 from flytrack_env.rendering.camera import Camera
 from flytrack_env.rendering.flight_log import FlightLog
-from flytrack_env.rendering.views import PIXEL, ChaseView, draw_gate
-from flytrack_env.scene import gates_of, ground_grid, rotations
+from flytrack_env.rendering.views import CHASE_GRID_M, PIXEL, ChaseView, Floor, draw_gate
+from flytrack_env.scene import gates_of, rotations
 from flytrack_env.state import POSITION, QUATERNION
 from flytrack_env.tracks import Course
 
@@ -17,18 +17,13 @@ STEPS_PER_FRAME = 4  # of 0.01 s
 VIEW_WIDTH, VIEW_HEIGHT = WIDTH_PX * 3 // 4, HEIGHT_PX * 3 // 4  # of each half of a picture
 MASK_WIDTH = 128
 MARGIN, DOT = 8, 4
-GRID_M = 2.0
 
 
 class OnboardView:
     """Draws what the drone's camera sees: gates, ground, and the corners that it is given."""
 
     def __init__(self, course: Course):
-        self.gates = gates_of(course)
-        low, high = (np.array(corner, float) for corner in (course.bounds_low, course.bounds_high))
-        self.grid_w = ground_grid(low, high, GRID_M)
-        corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
-        self.floor_w = np.array([(x, y, low[2]) for x, y in corners])
+        self.gates, self.floor = gates_of(course), Floor(course, CHASE_GRID_M)
 
     def draw(self, state: np.ndarray, corners_px: np.ndarray, visible: np.ndarray) -> Image.Image:
         """Return the picture of a state (21,); corners and flags as in a row of ``Film``."""
@@ -36,11 +31,7 @@ class OnboardView:
         picture = Image.new("RGB", (width, height), scene.SKY)
         draw = ImageDraw.Draw(picture)
         view = _onboard_camera(state, width, height)
-        floor = view.polygon(view.look(self.floor_w))
-        if floor:
-            draw.polygon(floor, scene.GROUND)
-        for line in view.look(self.grid_w):
-            draw.line(view.polygon(line), scene.GROUND_GRID, PIXEL)
+        self.floor.draw(draw, view)
         gates_c = view.look(np.concatenate([self.gates.outer, self.gates.inner], axis=1))
         for index in np.argsort(-np.linalg.norm(gates_c.mean(axis=1), axis=1)):
             draw_gate(draw, view, gates_c[index], scene.GATE)

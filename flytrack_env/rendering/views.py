@@ -56,6 +56,27 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)
 
 
+class Floor:
+    """Draws the floor of a course with a grid, in perspective."""
+
+    def __init__(self, course: Course, spacing_m: float):
+        low, high = (np.array(corner, float) for corner in (course.bounds_low, course.bounds_high))
+        self.height_m = low[2]
+        self.grid_w = ground_grid(low, high, spacing_m)
+        corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
+        self.corners_w = np.array([(x, y, low[2]) for x, y in corners])
+
+    def draw(self, draw: ImageDraw.ImageDraw, camera: Camera) -> None:
+        """Draw the floor within the bounds."""
+        fill(draw, camera, camera.look(self.corners_w), scene.GROUND)
+        self.draw_grid(draw, camera)
+
+    def draw_grid(self, draw: ImageDraw.ImageDraw, camera: Camera) -> None:
+        """Draw its grid alone."""
+        for line in camera.look(self.grid_w):
+            draw.line(camera.polygon(line), scene.GROUND_GRID, PIXEL)
+
+
 class TopView:
     """Draws the course from above, the trail, and the drone as an arrow.
 
@@ -180,9 +201,7 @@ class ChaseView:
         self.corners_w = np.concatenate([gates.outer, gates.inner], axis=1)
         self.focal_px = 0.5 * width / np.tan(0.5 * np.radians(FIELD_OF_VIEW_DEG))
         self.centre_px = np.array([0.5 * width, 0.5 * height])
-        low, high = (np.array(corner, float) for corner in (course.bounds_low, course.bounds_high))
-        self.floor_m = low[2]
-        self.grid_w = ground_grid(low, high, CHASE_GRID_M)
+        self.floor = Floor(course, CHASE_GRID_M)
 
     def camera(self, rows: np.ndarray, follows_nose: bool = False) -> Camera:
         """Return the camera behind the drone, looking towards the next gate, or ahead.
@@ -210,7 +229,7 @@ class ChaseView:
         direction = unit(direction * np.array([1.0, 1.0, 0.5]), np.array([1.0, 0.0, 0.0]))
         drone_w = recent[-1, POSITION]
         eye_w = drone_w - BEHIND_M * direction + ABOVE_M * UP_W
-        eye_w[2] = max(eye_w[2], self.floor_m + MIN_CAMERA_HEIGHT_M)
+        eye_w[2] = max(eye_w[2], self.floor.height_m + MIN_CAMERA_HEIGHT_M)
         forward = unit(drone_w + LOOK_AHEAD_M * direction - eye_w, direction)
         return Camera(eye_w, forward, self.centre_px, self.focal_px)
 
@@ -229,7 +248,9 @@ class ChaseView:
         horizon = max(camera.horizon_px(), 0.0)
         if horizon < self.height:
             draw.rectangle([0, horizon, self.width, self.height], scene.GROUND)
-        self._draw_ground(draw, camera, row[POSITION])
+        self.floor.draw_grid(draw, camera)
+        below_w = np.array([*row[POSITION][:2], self.floor.height_m])
+        fill(draw, camera, camera.look(below_w + SHADOW_M * CIRCLE), scene.SHADOW)
         distances_m = np.linalg.norm(self.gates.centres - camera.eye_w, axis=1)
         is_beyond = distances_m > np.linalg.norm(row[POSITION] - camera.eye_w)
         corners_c, colours = camera.look(self.corners_w), [scene.GATE] * len(self.corners_w)
@@ -248,20 +269,25 @@ class ChaseView:
             draw_outlines(draw, camera, corners_c[index], colours[index])
         canvas.paste(picture, (self.left, 0))
 
-    def _draw_ground(self, draw: ImageDraw.ImageDraw, camera: Camera, drone_w: np.ndarray) -> None:
-        for line in camera.look(self.grid_w):
-            draw.line(camera.polygon(line), scene.GROUND_GRID, PIXEL)
-        below = np.array([drone_w[0], drone_w[1], self.floor_m])
-        shadow = camera.polygon(camera.look(below + SHADOW_M * CIRCLE))
-        if shadow:
-            draw.polygon(shadow, scene.SHADOW)
-
     def _draw_trail(self, draw: ImageDraw.ImageDraw, camera: Camera, rows: np.ndarray) -> None:
         recent = rows[-TRAIL_STEPS:].astype(float)
         points_c = camera.look(recent[:, POSITION])
         colours = speed_colours(np.linalg.norm(recent[1:, VELOCITY], axis=1))
         for start, colour in enumerate(colours):
             draw.line(camera.polygon(points_c[start : start + 2]), colour, 2 * PIXEL)
+
+
+def fill(
+    draw: ImageDraw.ImageDraw,
+    camera: Camera,
+    points_c: np.ndarray,
+    colour: Colour,
+    outline: Colour | None = None,
+) -> None:
+    """Draw the visible part of a polygon (n, 3), camera's frame."""
+    polygon = camera.polygon(points_c)
+    if polygon:
+        draw.polygon(polygon, colour, outline, PIXEL)
 
 
 def draw_gate(
@@ -274,9 +300,7 @@ def draw_gate(
     """
     for a in range(4):
         b = (a + 1) % 4
-        beam = camera.polygon(corners_c[[a, b, 4 + b, 4 + a]])
-        if beam:
-            draw.polygon(beam, colour)
+        fill(draw, camera, corners_c[[a, b, 4 + b, 4 + a]], colour)
     draw_outlines(draw, camera, corners_c, scene.blend(colour, scene.BACKGROUND, 0.4))
 
 
@@ -316,9 +340,7 @@ def draw_drone(
         (camera.look(points_w), colour) for points_w, colour in [*parts, (body_w, colours[0])]
     ]
     for points_c, colour in sorted(looked, key=lambda part: -part[0][:, 2].mean()):
-        rim = camera.polygon(points_c)
-        if rim:
-            draw.polygon(rim, colour, outline=scene.BACKGROUND, width=PIXEL)
+        fill(draw, camera, points_c, colour, scene.BACKGROUND)
 
 
 class Renderer:

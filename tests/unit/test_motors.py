@@ -1,4 +1,4 @@
-"""The body driven by motors, against rigid bodies in NumPy that share no code with it."""
+"""The body driven by motors, against rigid bodies that share no code with it."""
 
 from types import SimpleNamespace
 
