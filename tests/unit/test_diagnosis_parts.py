@@ -1,22 +1,17 @@
 """Parts of the diagnosis: its noise filter, chunks, messages, and logs that say too little."""
 
-import operator
 from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
 from flytrack.cli import main
-from flytrack_env.dynamics import collective_thrust
-from flytrack_env.effects import CommandDelay, LinearDrag, SecondOrderRates
+from flytrack_env.effects import LinearDrag
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, vetoes
-from flytrack_sysid.diagnosis.craft import lift_of
 from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
 from flytrack_sysid.diagnosis.flight_fit import Fit
 from flytrack_sysid.diagnosis.learned import improves_flights
@@ -26,7 +21,7 @@ from flytrack_sysid.diagnosis.refinement import Refined
 from flytrack_sysid.diagnosis.report import describe_verdict
 from flytrack_sysid.diagnosis.result import Cause, Estimated
 from flytrack_sysid.diagnosis.size import is_bent
-from flytrack_sysid.diagnosis.summary import collect_warnings, stand_in_notes, with_refined_values
+from flytrack_sysid.diagnosis.summary import stand_in_notes, with_refined_values
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.inference import noise as noises
 from flytrack_sysid.inference.chunks import (
@@ -42,7 +37,6 @@ from flytrack_sysid.inference.chunks import (
 from flytrack_sysid.inference.parameters import DRAIN, THRUST_COEFFS
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.record import make_record
-from flytrack_sysid.inference.replay import replay, start_replay
 from flytrack_sysid.inference.search import SearchState
 from flytrack_sysid.log_file import save_log
 from tests.support.compiling import programs
@@ -96,29 +90,6 @@ def disturbed(chunks):
     return series[chunks.row] * chunks.is_joined[..., None, None]
 
 
-def correlation(first, second):
-    """Return the mean product over rows and chunks where both are there; 0 where none are."""
-    product = first * second
-    return np.nansum(product, axis=(0, 1)) / np.maximum(np.isfinite(product).sum(axis=(0, 1)), 1)
-
-
-def test_innovations_are_white_and_of_variance_one(chunks, disturbed):
-    ones = np.ones(NUM_AXES)
-    shares = np.log([WANDER / LEVEL, DISTURBANCE / DIRECT, TAU_S * ones])
-    felt = 30.0 * ones  # a logit: the drone feels all of the disturbance
-    log_noise = np.concatenate([np.log([DIRECT, LEVEL]), shares, felt[None]])  # made of
-    with jax.enable_x64(True):
-        found = noises.Whitener(chunks, log_noise)(disturbed[None])[0]
-    found[~chunks.counts] = np.nan
-    counting = chunks.counts.any(axis=(0, 1))
-    assert counting.sum() == 2 * NUM_AXES - 1
-    sigmas = 5.0 / np.sqrt(chunks.counts.sum(axis=(0, 1))[counting])
-    assert np.all(np.abs(correlation(found, found)[counting] - 1.0) < np.sqrt(2.0) * sigmas)
-    for lag in (1, 2, 10):
-        assert np.all(np.abs(correlation(found[lag:], found[:-lag])[counting]) < sigmas)
-    assert np.all(np.abs(correlation(found[..., 0], found[..., 1])[:BATTERY]) < sigmas[0])
-
-
 def test_the_noise_of_residuals_is_found_again(chunks, disturbed):
     with jax.enable_x64(True):
         found = jax.tree.map(np.asarray, noises.noise_of(noises.fit_noise(chunks, disturbed)))
@@ -147,42 +118,6 @@ def test_chunks_are_only_where_something_is_judged(flown):
     assert (
         np.diff(lead_in[:, :5], axis=0) == 1
     ).all()  # flown for real, also where it is not judged
-
-
-def predictions(step, _):
-    """Return the body rates, specific force and acceleration after a step."""
-    return tuple(map(jnp.stack, (step.after.rates_b, step.moved.context.force_b, step.after.acc_w)))
-
-
-def test_chunks_agree_with_one_long_replay(flown, chunks):
-    truth, log = flown
-    model = model_of(truth).with_effects(
-        CommandDelay(0.013), SecondOrderRates(0.01, 0.01, 0.01), LinearDrag(0.3, 0.3, 0.1)
-    )
-    with jax.enable_x64(True):
-        problem = Problem.of(chunks, model)
-        left = problem.residuals(problem.start[None])[0]
-        like = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
-        record = make_record(log)
-        no_gyro = np.full(record.pos_w.shape, np.nan)
-        begin = start_replay(like, jax.tree.map(operator.itemgetter(0), record))
-        later = jax.jit(lambda: replay(like, begin, record, no_gyro, predictions))()[1]
-        rates_b, force_b, acc_w = (np.roll(np.asarray(one), 1, axis=0) for one in later)
-    before = Rotation.from_quat(np.roll(record.quat, 1, axis=0), scalar_first=True)
-    source = record.source_row
-    expected = {
-        (0, 0): before.apply(log["w"][source] - rates_b),
-        (3, 0): before.apply(log["f"][source] - force_b),
-        (3, 1): np.diff(record.vel_w, axis=0, prepend=record.vel_w[:1])
-        - acc_w * np.roll(record.step_s, 1)[:, None],
-    }
-    for (axis, channel), one in expected.items():
-        axes = slice(axis, axis + 3)
-        counts = chunks.counts[..., axes, channel]
-        # In multiples of the noise; what came before the lead-in is forgotten to a millionth of
-        # full stick.
-        error = (left[..., axes, channel] - one[chunks.row]) / (DIRECT, LEVEL)[channel][axes]
-        assert counts[LEAD_IN_S * RATE].any() and np.abs(error[counts]).max() < 1e-3
 
 
 def test_many_models_on_few_chunks_are_as_each_alone_on_all(state):
@@ -325,20 +260,6 @@ def test_a_cause_matters_if_another_value_is_wrong_without_it(state):
     assert not is_bent(factor, problem, problem.start, problem.start)
 
 
-@pytest.mark.parametrize("factor", [1.0, 1.2])
-def test_a_hover_carries_the_weight_and_more_thrust_lifts_more(state, factor):
-    problem = state.problem
-    vector = problem.start.copy()
-    vector[problem.names.index("thrust_scale.factor")] = factor
-    ratio, hover = lift_of(problem, vector)
-    like, battery = problem.like, problem.like.battery
-    middle_v = 0.5 * (float(battery.empty_v) + float(battery.full_v))
-    coeffs = factor * problem.start[problem.parameter_indices(THRUST_COEFFS)]
-    weight_n = float(like.m) * float(like.g)
-    assert float(collective_thrust(hover, middle_v, coeffs)) == pytest.approx(weight_n, rel=1e-3)
-    assert ratio == pytest.approx(factor * lift_of(problem, problem.start)[0])
-
-
 @pytest.mark.slow
 def test_a_force_may_be_a_law_whose_channels_the_log_lacks():
     """Without velocity and attitude, drag of forward flight would look like a tilted thrust."""
@@ -375,31 +296,6 @@ def test_what_may_be_something_unknown_is_told_with_its_size_and_not_named(state
         and "thrust or your mass by +14.6% in the mean" in thrust
     )
     assert lag.startswith("tau_yaw differs in the extended model, but is not named")
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "is_warned_of"),
-    [
-        ("rate_scale.yaw", 0.9, False),
-        ("rate_scale.yaw", None, True),
-        ("tau_roll", 0.1, False),
-        ("tau_roll", None, True),
-        ("rate_saturation.softness", 0.0, False),  # a limit may well be hard
-    ],
-)
-def test_values_at_the_end_of_their_range_are_beyond_the_list(state, field, value, is_warned_of):
-    problem = state.problem
-    value = problem.low[problem.names.index(field)] if value is None else value
-    vector = problem.start.copy()
-    vector[problem.names.index(field)] = value
-    effect, _, name = field.rpartition(".")
-    cause = replace(
-        CAUSE, effect=effect or name, parameters={name: Estimated(value, (value, value), "1")}
-    )
-    found = with_refined_values([cause], Refined((), None, None, (), {}, problem, None), vector)
-    assert found[0].beyond.startswith(f"{name} at most {value:g}" if is_warned_of else "")
-    warned = [one for one in collect_warnings(problem, found, []) if "beyond the list" in one]
-    assert len(warned) == is_warned_of and bool(found[0].beyond) == is_warned_of
 
 
 def test_a_value_that_no_flight_depends_on_is_not_told(state):
