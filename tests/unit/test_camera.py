@@ -1,6 +1,6 @@
 """What the camera shows: corners and masks against rays cast apart; the detector; gradients."""
 
-from functools import cache, partial
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -229,11 +229,6 @@ def test_cameras_that_show_nothing_are_refused_by_the_name_of_the_field(message)
 def test_images_too_small_or_too_large_are_refused(size):
     with pytest.raises(ValueError, match=r"size: (width|height)_px: found"):
         GateMask(FlyTrack(), size=size)
-    wide = partial(GateMask, FlyTrack())
-    env = wide()
-    with pytest.raises(ValueError, match="field_of_view_deg: found 180"):
-        own = env.own_defaults()._replace(field_of_view_deg=180.0)
-        env.check_params(env.with_own_params(env.default_params, own))
 
 
 # --- Around the detector ------------------------------------------------------------------------

@@ -35,6 +35,7 @@ from flytrack_sysid.check.thrust import motor_changes, thrust_changes
 from flytrack_sysid.log import FlightLog
 from tests.support.compiling import programs
 from tests.support.slow import slow_but
+from tests.support.written_logs import with_channels
 
 KINDS = ("race", "excitation", "gentle", "hover")
 FRD, NED = "x -y -z", "y x -z"
@@ -63,11 +64,6 @@ def turned_gyro(flights):
 def changed(flight, *changes):
     """Return a flight with changes of its log."""
     return inject(np.random.default_rng(1), flight, frozenset(changes))
-
-
-def with_channels(log, **channels):
-    """Return a log with some channels replaced."""
-    return replace(log, channels={**log.channels, **channels})
 
 
 def model_of(craft):

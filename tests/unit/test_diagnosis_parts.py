@@ -41,6 +41,7 @@ from flytrack_sysid.inference.search import SearchState
 from flytrack_sysid.log_file import save_log
 from tests.support.compiling import programs
 from tests.support.hidden_flights import scripted
+from tests.support.written_logs import with_channels
 
 SECONDS, DT_S = 40.0, 0.01
 RATE = 100  # rows a second
@@ -273,8 +274,7 @@ def test_a_force_may_be_a_law_whose_channels_the_log_lacks():
 @pytest.mark.slow
 def test_a_sensor_farther_off_than_any_on_the_list_is_told_and_not_named():
     truth, log = scripted(6, 20.0)
-    off = log["f"] + np.array([2.5, 0.0, 0.0])
-    found = diagnose(replace(log, channels={**log.channels, "f": off}), model_of(truth))
+    found = diagnose(with_channels(log, f=log["f"] + [2.5, 0.0, 0.0]), model_of(truth))
     (cause,) = found.beyond
     assert (
         found.causes == () and found.verdict == "unexplained" and found.unexplained.depends_on == ()

@@ -34,6 +34,7 @@ from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, Verdict,
 from tests.contract.test_effects import inside_ranges
 from tests.support.hidden_flights import scripted
 from tests.support.slow import slow_but
+from tests.support.written_logs import with_channels
 
 SECONDS, DT_S = 12.0, 0.01
 SETTLED = 150  # rows until a start is forgotten
@@ -138,7 +139,7 @@ def test_every_cause_has_a_plot_in_which_it_shows(flown, are_settings):
     base = model.with_effects(*(effect.parameters() for effect in effects))
     # Some effects act near the ground only.
     low = log["p"] - [0.0, 0.0, log["p"][:, 2].min() - 0.1]
-    log = replace(log, channels={**log.channels, "p": low})
+    log = with_channels(log, p=low)
     causes = [effect.name for effect in effects]
     if not are_settings:
         causes += BASE_CAUSES
@@ -237,25 +238,25 @@ def test_page_says_all_and_loads_nothing(tmp_path, diagnosis, measured):
     assert len(text) < 3e6
 
 
-def test_what_refitting_alone_or_a_guess_reaches_is_no_gain_of_effects(diagnosis):
-    errors = {
-        name: Errors({}, {"1": size}) for name, size in (("nominal", 8.7), ("refitted_base", 0.404))
-    }
-    blind = Prediction({"placebo": {"position_m": {"1": 0.27}}})
-    found = replace(
-        diagnosis, error={**errors, "extended": Errors({}, {"1": 0.403})}, prediction=blind
-    )
-    text = report.text_of(found)
-    assert "by the refitted base 95 %, the named effects 0 %; " in text
-    assert "a guess that ignores the commands, 0.27 m)" in text
+BLIND = Prediction({"placebo": {"position_m": {"1": 0.27}}})
+GAINS = {
+    "by the refitted base 95 %, the named effects 0 %; "
+    "a guess that ignores the commands, 0.27 m)": (
+        {"nominal": 8.7, "refitted_base": 0.404, "extended": 0.403},
+        {"prediction": BLIND},
+    ),
+    "by the refitted base 40 %, the named effects 10 %, the learnt law 30 %": (
+        {"nominal": 1.0, "refitted_base": 0.6, "without_learned": 0.5, "extended": 0.2},
+        {"learned": SimpleNamespace(text=lambda: "a law")},
+    ),
+}
 
 
-def test_what_a_learnt_law_gains_is_not_told_of_the_names(diagnosis):
-    sizes = {"nominal": 1.0, "refitted_base": 0.6, "without_learned": 0.5, "extended": 0.2}
+@pytest.mark.parametrize("expected", GAINS)
+def test_what_refitting_a_guess_or_a_learnt_law_reaches_is_no_gain_of_effects(diagnosis, expected):
+    sizes, changes = GAINS[expected]
     errors = {name: Errors({}, {"1": size}) for name, size in sizes.items()}
-    law = SimpleNamespace(text=lambda: "a law")
-    text = report.text_of(replace(diagnosis, error=errors, learned=law))
-    assert "by the refitted base 40 %, the named effects 10 %, the learnt law 30 %" in text
+    assert expected in report.text_of(replace(diagnosis, error=errors, **changes))
 
 
 def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):

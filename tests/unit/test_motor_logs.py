@@ -22,6 +22,7 @@ from flytrack_sysid.plausibility import find_problems
 from flytrack_sysid.validate import validate
 from tests.support.motor_flights import COLUMNS, flown, write_csv
 from tests.support.motor_models import crafts, model_of
+from tests.support.written_logs import with_channels
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +109,7 @@ def test_what_no_quadcopter_has_is_refused(log, tmp_path, columns, frame, expect
 
 
 def test_a_motor_that_stands_still_is_named(log, tmp_path):
-    still = replace(log, channels={**log.channels, "u": log["u"] * [1.0, 1.0, 0.0, 1.0]})
+    still = with_channels(log, u=log["u"] * [1.0, 1.0, 0.0, 1.0])
     path, map_file = write_csv(tmp_path, still)
     with pytest.raises(LogError, match=r"motor rear_left: found 0\.5 of its range in every row"):
         import_log(path, "csv", map_file)
@@ -118,7 +119,7 @@ def test_a_motor_that_stands_still_is_named(log, tmp_path):
 @pytest.mark.parametrize("order", [(0, 1, 2, 3), (1, 0, 2, 3), (3, 1, 2, 0), (2, 3, 0, 1)])
 def test_the_order_of_motors_is_found_and_corrected(log, tmp_path, order):
     columns = [COLUMNS[motor] for motor in order]
-    swapped = replace(log, channels={**log.channels, "u": log["u"][:, list(order)]})
+    swapped = with_channels(log, u=log["u"][:, list(order)])
     found = check_log(swapped)
     if order == (0, 1, 2, 3):
         assert not found.contradicts

@@ -34,6 +34,17 @@ def build_problem(truth, log):
     return Problem.of(cut_chunks(log, ~held_out_rows(log), model), model)
 
 
+def refined(problem, log, vector, candidates, values, doubted=()):
+    """Return the refinement of a model with these values in place of a vector's."""
+    vector = vector.copy()
+    for name, value in values.items():
+        vector[problem.names.index(name)] = value
+    base = FittedModel((), problem.start, 0.0, ())
+    model = base._replace(candidates=candidates, vector=vector)
+    with jax.enable_x64(True):
+        return refine(SearchState(problem), base, model, log, held_out_rows(log), False, doubted)
+
+
 @pytest.fixture(scope="module")
 def dragged():
     """A plant with drag, and a refined model that began with half of it and a bias nobody flew."""
@@ -41,13 +52,8 @@ def dragged():
     values = {f"linear_drag.{name}": 0.5 * value for name, value in TRUE_DRAG.items()}
     with jax.enable_x64(True):
         problem = build_problem(truth, log)
-        vector = problem.start.copy()
-        for name, value in (values | {"accelerometer_bias.x": 0.3}).items():
-            vector[problem.names.index(name)] = value
-        base = FittedModel((), problem.start, 0.0, ())
-        model = base._replace(candidates=(DRAG, BIAS), vector=vector)
-        found = refine(SearchState(problem), base, model, log, held_out_rows(log), False)
-    return truth, log, problem, found
+    values |= {"accelerometer_bias.x": 0.3}
+    return truth, log, problem, refined(problem, log, problem.start, (DRAG, BIAS), values)
 
 
 def test_values_are_refined_by_flights(dragged):
@@ -71,29 +77,18 @@ def test_values_are_refined_by_flights(dragged):
     assert found.flight_test.worst_ratio(found.fit.vector) < 1.0
 
 
-def test_an_effect_that_no_block_of_flights_needs_is_removed(dragged):
+@pytest.mark.parametrize(
+    ("candidate", "values", "doubted"),
+    [
+        (SCALE, {"rate_scale.roll": 1.02}, ()),  # no block of flights needs it
+        (BIAS, {}, ("linear_drag", "accelerometer_bias")),  # no flight depends on the second
+    ],
+)
+def test_what_flights_do_not_show_is_removed(dragged, candidate, values, doubted):
     _, log, problem, earlier = dragged
-    vector = earlier.fit.vector.copy()
-    vector[problem.names.index("rate_scale.roll")] = 1.02
-    with jax.enable_x64(True):
-        base = FittedModel((), problem.start, 0.0, ())
-        model = base._replace(candidates=(DRAG, SCALE), vector=vector)
-        found = refine(SearchState(problem), base, model, log, held_out_rows(log), False)
-    assert [one.effect for one in found.kept] == ["linear_drag"] and found.removed == (
-        "rate_scale",
-    )
-
-
-def test_doubted_effects_stay_only_where_flights_show_them(dragged):
-    _, log, problem, earlier = dragged
-    with jax.enable_x64(True):
-        base = FittedModel((), problem.start, 0.0, ())
-        model = base._replace(candidates=(DRAG, BIAS), vector=earlier.fit.vector)
-        doubted = ("linear_drag", "accelerometer_bias")  # no flight depends on the second
-        rows = held_out_rows(log)
-        found = refine(SearchState(problem), base, model, log, rows, False, doubted)
+    found = refined(problem, log, earlier.fit.vector, (DRAG, candidate), values, doubted)
     assert [one.effect for one in found.kept] == ["linear_drag"]
-    assert found.removed == ("accelerometer_bias",)
+    assert found.removed == (candidate.effect,)
 
 
 def test_what_changes_no_flight_at_a_bound_goes_back(dragged):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.repeatability import agree, compare, is_same_class, overlaps
+from benchmarks.repeatability import agree, compare, is_same_class
 
 
 @pytest.mark.parametrize(
@@ -26,11 +26,6 @@ def test_flights_agree_where_one_leaves_open_what_the_other_names():
     other = {"causes": {}, "unsettled": ["wind", "linear_drag"]}
     assert agree(one, other) and agree(other, one) and not is_same_class(one, other)
     assert not agree(one, {"causes": {}, "unsettled": []})
-
-
-def test_intervals_overlap_where_they_share_a_value():
-    assert overlaps([1.0, 0.5, 1.5], [2.0, 1.5, 2.5])
-    assert not overlaps([1.0, 0.5, 1.4], [2.0, 1.5, 2.5])
 
 
 def test_a_craft_counts_pairs_values_and_widths():
