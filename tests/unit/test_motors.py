@@ -137,32 +137,6 @@ def test_a_flown_minute_part_is_that_of_the_independent_craft_to_second_order():
     assert 3.0 < coarse / fine < 5.0
 
 
-@pytest.mark.slow
-def test_gradients_and_batches():
-    model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model_of(WHOLE))
-    start = begun(model, hovering(WHOLE))
-    commands = np.tile(held(HOVER + 0.1, HOVER, HOVER - 0.05, HOVER, steps=1) * 2.0 - 1.0, (5, 1))
-    motors = jax.tree.map(jnp.asarray, model.effect("motors"))
-
-    def last(motors):
-        return _flight(model.with_effects(motors), start, commands, DT)[-1, 13:16].sum()
-
-    value_and_slopes = quick_jit(jax.vmap(jax.value_and_grad(last)))
-    names = ("radius_x", "yaw_arm", "up_s", "rear_left", "center_x", "damping_y", "product_xy")
-    moved = [motors]
-    sizes = [1e-6 * max(abs(float(getattr(motors, name))), 1e-3) for name in names]
-    for name, size in zip(names, sizes, strict=True):
-        moved += [
-            motors._replace(**{name: getattr(motors, name) + sign * size}) for sign in (1.0, -1.0)
-        ]
-    values, slopes = value_and_slopes(jax.tree.map(lambda *each: jnp.stack(each), *moved))
-    for index, (name, size) in enumerate(zip(names, sizes, strict=True)):
-        measured = (values[1 + 2 * index] - values[2 + 2 * index]) / (2.0 * size)
-        np.testing.assert_allclose(getattr(slopes, name)[0], measured, rtol=1e-4)
-    alone = _flown(model, start, commands)[-1, 13:16].sum()
-    np.testing.assert_allclose(values[0], alone, rtol=1e-9)
-
-
 def test_a_scale_of_the_force_alone_is_not_looked_for():
     of_motors, of_sticks = (
         SimpleNamespace(like=model, given_effects=given)
