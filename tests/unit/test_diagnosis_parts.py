@@ -41,6 +41,7 @@ from flytrack_sysid.inference.search import SearchState
 from flytrack_sysid.log_file import save_log
 from tests.support.compiling import programs
 from tests.support.hidden_flights import scripted
+from tests.support.tables import table
 from tests.support.written_logs import with_channels
 
 SECONDS, DT_S = 40.0, 0.01
@@ -361,15 +362,7 @@ def test_a_long_log_is_thinned_with_a_warning_that_counts_judged_rows(state, mon
 
 
 @pytest.mark.parametrize(
-    ("ratio", "lost", "acts_there", "expected"),
-    [
-        ((0.7, 0.9), (-5.0, -5.0), True, True),
-        ((0.994, 1.003), (-5.0, 1.0), True, False),  # takes too little off
-        ((0.994, 1.003), (-5.0, 1.0), False, True),  # cannot show there
-        ((0.7, 1.1), (-5.0, 3.0), True, False),  # worse at one horizon
-        ((0.7, 1.1), (-5.0, 1.5), True, True),  # which may be chance
-        ((1.0, 1.1), (0.0, 1.5), False, False),  # and is less likely where nothing gets better
-    ],
+    ("ratio", "lost", "acts_there", "expected"), table("diagnoses")["improvements"]
 )
 def test_what_is_learnt_has_to_improve_held_out_flights(ratio, lost, acts_there, expected):
     assert improves_flights(np.array(ratio), np.array(lost), acts_there) is expected

@@ -32,14 +32,7 @@ from tests.support.written_logs import with_channels
 SLACK_S = 0.6  # two blocks and the one beside them
 
 
-# What is measured, and whether that can show the ground.
-SENSORS = {
-    "no accelerometer": (("f",), True),
-    "no gyroscope": (("w",), True),
-    "no velocity": (("v",), True),
-    "attitude and gyroscope": (("f", "v"), False),
-    "accelerometer only": (("w", "q"), False),
-}
+SENSORS = table("ground_sensors")
 
 
 @pytest.mark.parametrize("name", SENSORS)

@@ -3,18 +3,10 @@
 import pytest
 
 from benchmarks.repeatability import agree, compare, is_same_class
+from tests.support.tables import table
 
 
-@pytest.mark.parametrize(
-    ("one", "other", "expected"),
-    [
-        ({"wind": []}, {"wind": []}, True),
-        ({"wind": ["thrust_tilt"]}, {"thrust_tilt": ["wind"]}, True),
-        ({"wind": ["thrust_tilt"]}, {"thrust_tilt": []}, False),
-        ({"wind": []}, {"wind": [], "linear_drag": []}, False),
-        ({}, {}, True),
-    ],
-)
+@pytest.mark.parametrize(("one", "other", "expected"), table("diagnoses")["classes"])
 def test_causes_are_of_one_class_if_each_is_an_equivalent_of_the_other(one, other, expected):
     one, other = ({"causes": causes, "unsettled": []} for causes in (one, other))
     assert is_same_class(one, other) is expected and is_same_class(other, one) is expected
