@@ -189,6 +189,18 @@ def test_fault_gives_its_change_and_no_other(flights, fault):
     assert len(right) == 1, found.explanations
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        *(Change("u_rates", "curve", curve) for curve in ("actual", "betaflight", "quick")),
+        *(Change("q", "order", order) for order in ("xyzw", "zwxy")),
+        *(Change("q", "world", world) for world in (FRD, NED)),
+    ],
+)
+def test_every_value_of_a_change_is_named(flights, change):
+    assert (change,) in check_log(changed(flights["race"], change).log).explanations
+
+
 @pytest.mark.parametrize("faults", [("w in deg/s", "v frame"), ("q order", "u_rates sign")])
 def test_two_faults_give_both_changes(flights, faults):
     rng = np.random.default_rng(2)
