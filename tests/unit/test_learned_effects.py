@@ -33,7 +33,7 @@ FLAP = Term(
 )
 WARM = Term("force", "world", (Factor("time", "saturation", (0.05,)),), (0.0, 0.0, 3.0), NO)
 LAW = Law((DRAG, FLAP, WARM))
-NUM_STEPS = 20
+NUM_STEPS = 8
 
 
 def flown(effects, commands, drone=None):

@@ -34,8 +34,7 @@ def _float64():
 def _flight(model, start, commands, dt):
     def one(state, command):
         moved = move(*state, unpack_action(command), dt, model)
-        reading = jnp.stack(moved.context.force_b)
-        return moved[:2], jnp.concatenate([pack(moved.after), reading])
+        return moved[:2], pack(moved.after)
 
     return jax.lax.scan(one, start, commands)[1]
 

@@ -141,20 +141,18 @@ def circle():
     """Return a level flight on one circle, always the same, whatever the commands say."""
     rng = np.random.default_rng(7)
     time = np.arange(0.0, 10.0 * CIRCLE_S, 0.01)
-    phase = 2.0 * np.pi * time / CIRCLE_S
-    speed = 2.0 * np.pi * RADIUS_M / CIRCLE_S
-    zero = np.zeros_like(phase)
-    pos_w = RADIUS_M * np.stack([np.cos(phase), np.sin(phase), zero + 1.0], axis=1)
-    vel_w = speed * np.stack([-np.sin(phase), np.cos(phase), zero], axis=1)
-    quat = Rotation.from_rotvec(phase[:, None] * np.array([0.0, 0.0, 1.0])).as_quat(
-        scalar_first=True
-    )
-    rates_b = np.stack([zero, zero, zero + 2.0 * np.pi / CIRCLE_S], axis=1)
-    commands = np.clip(0.3 * rng.standard_normal((len(time), 4)), -1.0, 1.0)
-    channels = {"u": commands, "p": pos_w, "v": vel_w, "q": quat, "w": rates_b}
+    yaw_rate = 2.0 * np.pi / CIRCLE_S
+    attitude = Rotation.from_rotvec(np.outer(time, [0.0, 0.0, yaw_rate]))
+    channels = {
+        "p": attitude.apply([RADIUS_M, 0.0, 1.0]),
+        "v": attitude.apply([0.0, RADIUS_M * yaw_rate, 0.0]),
+        "q": attitude.as_quat(scalar_first=True),
+        "w": np.tile([0.0, 0.0, yaw_rate], (len(time), 1)),
+    }
     noisy = {
         name: values + 1e-3 * rng.standard_normal(values.shape) for name, values in channels.items()
     }
+    commands = np.clip(0.3 * rng.standard_normal((len(time), 4)), -1.0, 1.0)
     return FlightLog(time, noisy | {"u": commands}, np.zeros(len(time), int))
 
 
