@@ -15,6 +15,8 @@ from flytrack_sysid.inference.parameters import (
     TAUS,
     THRUST_COEFFS,
     to_vector,
+    with_neutral_effects,
+    with_values,
 )
 from flytrack_sysid.sensors import measure
 from flytrack_sysid.split import held_out_rows
@@ -192,3 +194,14 @@ def test_a_log_that_measured_nothing_is_refused_by_its_name(exact):
         FitError, match=r"^handout\.npz: tau_roll, .* nothing that the log measured"
     ):
         fit(short.without("uprev"))
+
+
+def test_replacing_values_changes_those_alone_and_refuses_unknown_names():
+    model = PLANT.model()
+    changed = dict(zip(BASE, to_vector(with_values(model, {"tau_yaw": 0.07})), strict=True))
+    assert changed == {**TRUTH, "tau_yaw": 0.07}
+    for name in ("tau_jaw", "linear_drag.d_x", ""):
+        with pytest.raises(KeyError, match=f"{name}: unknown; expected of tau_roll"):
+            with_values(model, {name: 1.0})
+    with pytest.raises(KeyError, match="rag"):
+        with_neutral_effects(model, ["rag"])
