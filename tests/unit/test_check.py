@@ -177,7 +177,7 @@ VALUES = {  # of faults that draw one of them
 }
 ALIKE = REPRESENTATIVE | dict.fromkeys(VALUES, 1) | {f"{curve} rates": 3 for curve in CURVES}
 FAST = ("w in deg/s", "f frame", "v swapped", "q conjugate", "u delay", "w held", "v_bat rises")
-FAST += ("all NED and FRD", "q zwxy", "quick rates")
+FAST += ("all NED and FRD", "q zwxy", "quick rates", "q delay", "v delay", "f in g", "v_bat in mV")
 
 
 @pytest.mark.parametrize("fault", slow_but(FAST, ALIKE))

@@ -21,7 +21,7 @@ from flytrack_sysid.diagnosis.refinement import Refined
 from flytrack_sysid.diagnosis.report import describe_verdict
 from flytrack_sysid.diagnosis.result import Cause, Estimated
 from flytrack_sysid.diagnosis.size import is_bent
-from flytrack_sysid.diagnosis.summary import stand_in_notes, with_refined_values
+from flytrack_sysid.diagnosis.summary import collect_warnings, stand_in_notes, with_refined_values
 from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.inference import noise as noises
 from flytrack_sysid.inference.chunks import (
@@ -297,6 +297,31 @@ def test_what_may_be_something_unknown_is_told_with_its_size_and_not_named(state
         and "thrust or your mass by +14.6% in the mean" in thrust
     )
     assert lag.startswith("tau_yaw differs in the extended model, but is not named")
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "is_warned_of"),
+    [
+        ("rate_scale.yaw", 0.9, False),
+        ("rate_scale.yaw", None, True),
+        ("tau_roll", 0.1, False),
+        ("tau_roll", None, True),
+        ("rate_saturation.softness", 0.0, False),  # a limit may well be hard
+    ],
+)
+def test_values_at_the_end_of_their_range_are_beyond_the_list(state, field, value, is_warned_of):
+    problem = state.problem
+    value = problem.low[problem.names.index(field)] if value is None else value
+    vector = problem.start.copy()
+    vector[problem.names.index(field)] = value
+    effect, _, name = field.rpartition(".")
+    cause = replace(
+        CAUSE, effect=effect or name, parameters={name: Estimated(value, (value, value), "1")}
+    )
+    found = with_refined_values([cause], Refined((), None, None, (), {}, problem, None), vector)
+    assert found[0].beyond.startswith(f"{name} at most {value:g}" if is_warned_of else "")
+    warned = [one for one in collect_warnings(problem, found, []) if "beyond the list" in one]
+    assert len(warned) == is_warned_of and bool(found[0].beyond) == is_warned_of
 
 
 def test_a_value_that_no_flight_depends_on_is_not_told(state):

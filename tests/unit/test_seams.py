@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.seams.faults import Change, draw_pair, is_shown
+from benchmarks.seams.faults import FAULTS, Change, draw_pair, inject, is_shown
 from benchmarks.seams.flight import KINDS, Flight, make_flight
 from benchmarks.seams.simulators import SIMULATORS, Simulator
 from flytrack_sysid.log import FlightLog
@@ -46,6 +46,22 @@ def test_hover_shows_little() -> None:
     hover = make_flight(SEED, seconds=5.0, kind="hover")
     assert not is_shown(hover, frozenset({Change("w", "axes", "x -y z")}))
     assert is_shown(hover, frozenset({Change("v_bat", "scale", 1000.0)}))
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_fault_changes_only_its_channels(flight: Flight, name: str) -> None:
+    truth = FAULTS[name](np.random.default_rng(1), flight.log.time[1])
+    faulty = inject(np.random.default_rng(1), flight, truth)
+    named = {change.channel for change in truth}
+    channels = {name.removesuffix("_rates").removesuffix("_thrust") for name in named}
+    changed = {name for name in flight.log.channels if np.any(faulty.log[name] != flight.log[name])}
+    if not np.array_equal(faulty.motors, flight.motors):
+        changed.add("motors")
+    assert changed == ({*flight.log.channels, "motors"} if "rows" in channels else channels)
+    if "u_rates" in named and "u_thrust" not in named:
+        np.testing.assert_array_equal(faulty.log["u"][:, 3], flight.log["u"][:, 3])
+    np.testing.assert_array_equal(faulty.log.time, flight.log.time)
+    assert isinstance(is_shown(flight, truth), bool)
 
 
 def test_pairs_have_two_faults() -> None:
