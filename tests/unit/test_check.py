@@ -120,15 +120,6 @@ def test_sign_of_an_axis_without_motion_is_unseen(planar):
     assert sum(is_allowed) == 2
 
 
-@pytest.mark.parametrize("axis", [0, 1])
-def test_mirrored_axis_is_excluded(planar, axis):
-    signs = np.where(np.arange(3) == axis, -1.0, 1.0)
-    pair, is_allowed = position_pair(with_channels(planar, v=signs * planar["v"]))
-    assert pair.verdict == CONTRADICTS and pair.evidence > 10.0 and pair.margin > 10.0
-    assert not is_allowed[IDENTITY] and is_allowed[number_of(np.diag(signs))]
-    assert pair.correlations[axis] < -0.9
-
-
 def test_without_any_motion_nothing_is_compared(planar):
     rng = np.random.default_rng(4)
     noise = {name: rng.normal(0.0, 0.005, planar[name].shape) for name in ("p", "v")}
