@@ -322,3 +322,10 @@ def test_a_race_begins_on_the_grid_and_is_over_for_all_at_once():
         states = flown[1]
         num_over += over[:, 0].sum()
     assert num_over >= RACES
+
+
+def test_observations_at_the_start_are_those_of_the_drones_that_begin():
+    observations, states = RACE.reset(jax.random.key(8))
+    drones, gates = states.inner.plant.drone, states.inner.race.gate_index
+    assert_allclose(observations, RACE.begin(drones, gates, PARAMS)[0], atol=2e-5)
+    assert observations.shape == (DRONES, *RACE.observation_space().shape)
