@@ -3,7 +3,6 @@
 import os
 import re
 import shlex
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from tests.support.pages import ROOT
 from tests.support.recordings import make_sequence
 from tests.support.refusals import refused
 from tests.support.tables import table
+from tests.support.written_logs import with_channels
 
 CASES = table("refused_commands")
 OWN = """
@@ -52,7 +52,7 @@ def folder(tmp_path_factory):
     save_rollout(folder / "flight.npy", states, actions)
     np.save(folder / "pickled.npy", np.array([[None, None]] * 3, object), allow_pickle=True)
     log = excited(HandoutPlant())
-    wrong = replace(log, channels={**log.channels, "w": np.rad2deg(log["w"])})
+    wrong = with_channels(log, w=np.rad2deg(log["w"]))
     for name, content in (("log", log), ("degrees", wrong), ("short", log.select(slice(50)))):
         save_log(folder / f"{name}.npz", content)
     save_model(folder / "model.json", nominal_parameters(), {})

@@ -23,6 +23,7 @@ from flytrack_sysid.script_file import (
 )
 from tests.support.black_boxes import SHIPPED
 from tests.support.handout_plant import HandoutPlant
+from tests.support.tables import table
 
 HOVER = hover_action(HandoutPlant().model())
 
@@ -116,18 +117,7 @@ def test_a_diagnosis_asks_for_flights(tmp_path):
     assert "spins: to settle gyro_scale, imu_offset" in text and MANOEUVRES["spins"].how in text
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ({"schema": 9, "not_identifiable": []}, "schema: found 9, expected 1"),
-        ({"schema": 1}, "not_identifiable: found NoneType, expected a list"),
-        (asked(), "not_identifiable: found nothing that another flight would settle"),
-        (
-            asked(("wind", "headings"), ("wind", "loop")),
-            r"not_identifiable\[1\]: fly: found 'loop'",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("content", "message"), table("scripts")["refused"])
 def test_what_is_no_diagnosis_is_refused(tmp_path, content, message):
     path = tmp_path / "diagnosis.json"
     path.write_text(json.dumps(content))

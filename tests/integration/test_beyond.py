@@ -1,7 +1,5 @@
 """What a diagnosis learns beyond its list: a law with its numbers, or nothing."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -12,6 +10,7 @@ from flytrack_env.effects import LearnedLaw
 from flytrack_env.effects.grammar import Factor, Law, Term
 from flytrack_env.model_file import load_model
 from flytrack_sysid.diagnosis import diagnose, text_of, write_diagnosis
+from tests.support.hidden_flights import scripted
 
 pytestmark = pytest.mark.slow
 
@@ -28,10 +27,8 @@ def flights(seed, law=PEAK, seconds=SECONDS):
 
     By default the law is drag that peaks at an airspeed.
     """
-    rng = np.random.default_rng(seed)
-    truth = replace(hidden.draw_base(rng), outside=law, motion="fine")
-    log = hidden.measure(hidden.fly(truth, seconds, rng), "sensors", rng)
-    return truth, log, hidden.fly(truth, seconds, rng)
+    truth, log = scripted(seed, seconds, outside=law, motion="fine")
+    return truth, log, hidden.fly(truth, seconds, np.random.default_rng(seed + 1))
 
 
 def share_removed(found, clean):
@@ -92,10 +89,8 @@ def test_a_load_on_a_string_stays_unexplained():
 def test_a_thrust_curve_says_where_it_could_be_motors_that_warm_up():
     truth, log, _ = beyond.flown_plant(beyond.Trial("heating", 1, seed=59))
     warm = diagnose(log, model_of(truth))
-    rng = np.random.default_rng(74)
-    truth = replace(hidden.draw_base(rng), motion="handout")
+    truth, log = scripted(74, SECONDS, motion="handout")
     nominal = model_of(truth)
-    log = hidden.measure(hidden.fly(truth, SECONDS, rng), "sensors", rng)
     of_stick = np.array([1.0, 1.0, 1.5, 1.0, 1.0, 1.0])
     curved = diagnose(log, nominal._replace(thrust_coeffs=nominal.thrust_coeffs * of_stick))
     for found, alike in ((warm, ("thrust_drift",)), (curved, ())):

@@ -48,7 +48,6 @@ ULOG_TYPES = {"uint64_t": "Q", "float": "f", "bool": "?"}
 PX4_FULL_STICK_DEG_S = (720.0, 360.0, 180.0)
 PX4_PARAMETERS = {"MC_ACRO_R_MAX": 720.0, "MC_ROLLRATE_MAX": 220.0, "MC_ACRO_P_MAX": 360.0}
 PX4_PARAMETERS |= {"MC_ACRO_Y_MAX": 90.0, "MC_YAWRATE_MAX": 180.0}
-Topics = dict[str, tuple[Any, ...]]
 
 
 def ulog_message(kind, content):

@@ -5,6 +5,7 @@ from scipy.signal import lfilter
 
 from flytrack_sysid import FlightLog
 from tests.support.handout_plant import GRAVITY
+from tests.support.written_logs import with_channels
 
 STEP_S = 0.01
 TAKE_OFF_S, LANDING_S, END_S = 5.0, 15.0, 20.0
@@ -78,4 +79,4 @@ def with_pose(log):
     is_flying = (log.time >= TAKE_OFF_S) & (log.time < LANDING_S)
     velocity = np.cumsum(acc * STEP_S * is_flying[:, None], axis=0) * is_flying[:, None]
     quat = np.tile([1.0, 0.0, 0.0, 0.0], (len(log), 1))
-    return FlightLog(log.time, {**log.channels, "v": velocity, "q": quat}, log.segment)
+    return with_channels(log, v=velocity, q=quat)

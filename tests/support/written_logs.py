@@ -1,5 +1,6 @@
 """Random logs, and their columns in files, right or wrong."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,11 @@ def make_log(seed=0, num_rows=NUM_ROWS, names=tuple(CHANNELS)):
         channels["q"] /= np.linalg.norm(channels["q"], axis=1, keepdims=True)
     segment = np.where(np.arange(num_rows) < num_rows // 2, 7, -2)
     return FlightLog(np.cumsum(rng.uniform(1e-3, 0.1, num_rows)), channels, segment)
+
+
+def with_channels(log, **channels):
+    """Return a log with some channels replaced."""
+    return replace(log, channels={**log.channels, **channels})
 
 
 def columns_of(log):

@@ -26,6 +26,7 @@ from flytrack_sysid.inference.parameters import THRUST_COEFFS, names_of, to_vect
 from flytrack_sysid.inference.problem import split_blocks
 from tests.support.evaluated import write_checkpoint
 from tests.support.handout_plant import HandoutPlant, excited
+from tests.support.written_logs import with_channels
 
 NOMINAL = nominal_parameters()
 DRAG = NOMINAL.with_effects(LinearDrag(0.3, 0.2, 0.1))
@@ -130,24 +131,15 @@ def log():
     return log.select(log.segment < 6)
 
 
-def with_channel(log, name, values):
-    return replace(log, channels={**log.channels, name: values})
-
-
 BAD_LOGS = {
     "a hover": (
-        lambda log: with_channel(log, "u", log["u"] * [0.05, 0.05, 1.0, 1.0]),
+        lambda log: with_channels(log, u=log["u"] * [0.05, 0.05, 1.0, 1.0]),
         "u_roll, u_pitch: found at most 0.0.* expected 0.1 or more.*hover",
     ),
-    "crashes": (
-        lambda log: replace(log, segment=np.arange(len(log)) // 45),
-        "found .* flights of 0.45 s at most, 0 s in all .* expected 3 s or more: crashes",
-    ),
     "another craft": (
-        lambda log: with_channel(log, "v_bat", log["v_bat"] * 0.6),
+        lambda log: with_channels(log, v_bat=log["v_bat"] * 0.6),
         "another craft than the policy's: .*; the battery has 13.* V in this log, the model's 22",
     ),
-    "degrees": (lambda log: with_channel(log, "w", np.rad2deg(log["w"])), "deg/s"),
 }
 
 
@@ -159,17 +151,11 @@ def test_a_log_of_no_race_of_this_craft_is_refused_before_work(kind, log, monkey
         adapt(change(log), load_checkpoint("champion"))
 
 
-def test_a_policy_of_another_observation_or_without_its_model_is_refused(
-    log, tmp_path, monkeypatch
-):
+def test_a_policy_of_another_observation_is_refused(log, tmp_path, monkeypatch):
     monkeypatch.setattr(adapting, "diagnose", pytest.fail)
     other = write_checkpoint(tmp_path / "history.safetensors", "FlyTrackActionHistory-v0")
     with pytest.raises(CheckpointError, match="a policy of FlyTrackActionHistory-v0, expected one"):
         adapt(log, load_checkpoint(other))
-    champion = load_checkpoint("champion")
-    meta = {name: value for name, value in champion.meta.items() if name != "model"}
-    with pytest.raises(CheckpointError, match="model: found none"):
-        adapt(log, champion._replace(meta=meta))
 
 
 def test_a_log_that_agrees_leaves_the_policy_as_it_is(log, monkeypatch):
@@ -229,8 +215,6 @@ def test_shipped_policies_have_names_and_a_file_of_the_name_comes_first(tmp_path
     write_checkpoint(tmp_path / "robust")
     monkeypatch.chdir(tmp_path)
     assert load_checkpoint("robust").config.hidden_sizes == (8,)
-    with pytest.raises(CheckpointError, match="cannot be read"):
-        load_checkpoint("winner")
 
 
 def test_blocks_of_nothing_are_blocks():
@@ -240,5 +224,5 @@ def test_blocks_of_nothing_are_blocks():
 def test_a_race_at_full_thrust_is_no_other_range_of_the_stick(log):
     high = np.clip(log["u"][:, 3], 0.9, 1.0)
     force = np.tile([[0.0, 0.0, 1.0]], (len(log), 1)) * (30.0 * high**2)[:, None]
-    flown = with_channel(log, "u", np.column_stack([log["u"][:, :3], high]))
-    assert thrust_changes(with_channel(flown, "f", force)) == []
+    flown = with_channels(log, u=np.column_stack([log["u"][:, :3], high]), f=force)
+    assert thrust_changes(flown) == []

@@ -8,22 +8,9 @@ from flytrack_sysid.check import Change, check_log
 from flytrack_sysid.check.fix import fix_mapping
 from flytrack_sysid.log import LogError
 from tests.support.slow import slow_but
+from tests.support.tables import table
 
-WRONG = {  # words of the mapping that are wrong
-    "order": [('order = "wxyz"  #', 'order = "xyzw"  #')],
-    "columns of the quaternion": [('["q_w", "q_x", "q_y", "q_z"]', '["q_z", "q_w", "q_x", "q_y"]')],
-    "body": [('body = "flu"', 'body = "frd"')],
-    "direction": [('order = "wxyz"', 'order = "wxyz"\ndirection = "world_to_body"')],
-    "gyro in deg/s": [('unit = "rad/s"', 'unit = "deg/s"')],
-    "gyro frd": [
-        ('"w_z"]\nunit = "rad/s"\nframe = "flu"', '"w_z"]\nunit = "rad/s"\nframe = "frd"')
-    ],
-    "force in g": [('unit = "m/s^2"', 'unit = "g"')],
-    "velocity swapped": [('["v_x", "v_y", "v_z"]', '["v_y", "v_x", "v_z"]')],
-    "position sign": [('unit = "m"\nframe', 'unit = "m"\nsigns = [1, -1, 1]\nframe')],
-    "pitch stick": [('"u_thrust"]', '"u_thrust"]\nlow = [-1, 1, -1, -1]\nhigh = [1, -1, 1, 1]')],
-    "gyro and velocity": [('unit = "rad/s"', 'unit = "deg/s"'), ('["v_x", "v_y"', '["v_y", "v_x"')],
-}
+WRONG = table("wrong_mappings")
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """Clocks of sensors and commands: offsets are found and corrected; the plant's lag is not one."""
 
-from dataclasses import replace
-
 import jax
 import numpy as np
 import pytest
@@ -11,10 +9,10 @@ from flytrack_env.motion import Motion
 from flytrack_sysid import clocks, sensors
 from flytrack_sysid.clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis.motion_choice import MotionEstimate, estimate_motion
-from flytrack_sysid.log import FlightLog
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 from tests.support.hidden_flights import scripted
 from tests.support.made_flight import TIME_S, flight, noisy
+from tests.support.written_logs import with_channels
 
 
 def rms(errors):
@@ -55,9 +53,7 @@ def test_standard_errors_are_those_of_other_draws_of_the_noise(truth):
 
 
 def test_clocks_that_agree_are_left_and_lag_of_the_plant_is_no_offset(truth):
-    later = FlightLog(
-        truth.time, {**truth.channels, "u": np.roll(truth["u"], 20, axis=0)}, truth.segment
-    )
+    later = with_channels(truth, u=np.roll(truth["u"], 20, axis=0))
     aligned, offsets = clocks.align_clocks(truth)
     assert {offset.verdict for offset in offsets} == {"not significant, left"}
     assert max(abs(offset.offset_s) for offset in offsets) < 1e-3
@@ -66,7 +62,7 @@ def test_clocks_that_agree_are_left_and_lag_of_the_plant_is_no_offset(truth):
 
 
 def test_clocks_of_a_drone_at_rest_or_too_short_are_not_compared(truth):
-    rest = FlightLog(truth.time, {**truth.channels, "w": 0.0 * truth["w"] + 0.1}, truth.segment)
+    rest = with_channels(truth, w=0.0 * truth["w"] + 0.1)
     assert clocks.align_clocks(rest)[1][0].verdict.startswith("offset unknown: correlation")
     short = clocks.align_clocks(truth.select(slice(500)))[1]
     assert [one.verdict for one in short] == ["not compared: less than 10 s without a gap"] * 3
@@ -92,7 +88,7 @@ def test_commands_stamped_after_the_turns_they_cause_are_put_before_them():
     for rows in (0, 3, 20):  # of which 3 are less than the plant's lag
         starts = np.cumsum(truth.is_start())
         source = np.maximum(np.arange(len(truth)) - rows, np.searchsorted(starts, starts))
-        late = replace(truth, channels={**truth.channels, "u": truth["u"][source]})
+        late = with_channels(truth, u=truth["u"][source])
         log, is_kept, notes = with_causal_commands(late, plant.model())
         assert len(log) == is_kept.sum() and len(notes) == (rows == 20)
         if notes:

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
@@ -34,6 +33,7 @@ from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, Verdict,
 from tests.contract.test_effects import inside_ranges
 from tests.support.hidden_flights import scripted
 from tests.support.slow import slow_but
+from tests.support.written_logs import with_channels
 
 SECONDS, DT_S = 12.0, 0.01
 SETTLED = 150  # rows until a start is forgotten
@@ -78,44 +78,25 @@ def test_pictures_of_a_cause_that_begins_in_flight_show_the_part_in_which_it_act
 
 def test_residuals_are_measured_minus_modelled(flown):
     base, log = flown
-    wrong = base._replace(tau=1.3 * base.tau, battery_drain_v_per_min=0.5).with_effects(
-        LinearDrag(0.1, 0.2, 0.0)
-    )
+    wrong = base._replace(max_rate=1.1 * base.max_rate, battery_drain_v_per_min=0.5)
+    wrong = wrong.with_effects(LinearDrag(0.1, 0.2, 0.0))
     found = traces(log, {"right": base.with_effects(DRAG), "wrong": wrong}, like="wrong")
-    columns = zip(np.exp(-DT_S / wrong.tau), log["u"].T, strict=True)
-    applied = np.stack([lfilter([0.0, 1.0 - keep], [1.0, -keep], u) for keep, u in columns], axis=1)
-    quat = Rotation.from_quat(log["q"], scalar_first=True)
-    airspeed_b = quat.inv().apply(log["v"])[:-1]
-    stick, volt, coeffs = applied[1:, 3], log["v_bat"][:-1, 0], wrong.thrust_coeffs
-    thrust = np.polyval(coeffs[3::-1], stick) + volt * (coeffs[4] + stick * coeffs[5])
-    modelled = (
-        np.array([0.0, 0.0, 1.0]) * thrust[:, None] / wrong.m
-        - np.array([0.1, 0.2, 0.0]) * airspeed_b
-    )
-    rates = log["w"] - applied[:, :3] * np.deg2rad(wrong.max_rate)
-    later, own = slice(SETTLED, None), found.residuals["wrong"]
-    np.testing.assert_allclose(own["rates"][later], rates[later], atol=1e-5)
-    np.testing.assert_allclose(
-        own["force"][later], (log["f"][1:] - modelled)[SETTLED - 1 :], atol=1e-4
-    )
-    gravity_w = np.array([0.0, 0.0, wrong.g])
-    moved = quat[:-1].inv().apply(np.diff(log["v"], axis=0) / DT_S + gravity_w) - modelled
-    np.testing.assert_allclose(own["velocity"][later], moved[SETTLED - 1 :], atol=1e-3)
-    turned = (quat[:-1].inv() * quat[1:]).as_rotvec() / DT_S - applied[1:, :3] * np.deg2rad(
-        wrong.max_rate
-    )
-    np.testing.assert_allclose(
-        own["attitude"][later], turned[SETTLED - 1 :], atol=0.05
-    )  # of steps, not angles
+    to_body = Rotation.from_quat(log["q"], scalar_first=True).inv()
+    airspeed_b = to_body.apply(log["v"])[SETTLED - 1 : -1]
+    lacking = (np.array([0.1, 0.2, 0.0]) - DRAG) * airspeed_b
+    turned = -0.1 * log["w"][SETTLED:]
+    for name, expected, tolerance in (
+        ("rates", turned, 1e-5),
+        ("attitude", turned, 0.05),  # of steps, not angles
+        ("force", lacking, 1e-4),
+        ("velocity", lacking, 1e-3),
+    ):
+        assert np.abs(expected).max() > 0.1
+        for model, values in (("wrong", expected), ("right", 0.0)):
+            residuals = found.residuals[model][name][SETTLED:]
+            np.testing.assert_allclose(residuals - values, 0.0, atol=tolerance, err_msg=name)
     drained = log["v_bat"][:, 0] - log["v_bat"][0, 0] + 0.5 / 60.0 * log.time
-    np.testing.assert_allclose(own["battery"][:, 0], drained, atol=1e-6)
-    for name in (
-        "rates",
-        "force",
-        "velocity",
-    ):  # what is there is seen, and gone with the right model
-        assert np.abs(own[name][later]).max() > 0.1
-        assert np.abs(found.residuals["right"][name][later]).max() < 1e-3
+    np.testing.assert_allclose(found.residuals["wrong"]["battery"][:, 0], drained, atol=1e-6)
 
 
 def shown(model, cause):
@@ -138,7 +119,7 @@ def test_every_cause_has_a_plot_in_which_it_shows(flown, are_settings):
     base = model.with_effects(*(effect.parameters() for effect in effects))
     # Some effects act near the ground only.
     low = log["p"] - [0.0, 0.0, log["p"][:, 2].min() - 0.1]
-    log = replace(log, channels={**log.channels, "p": low})
+    log = with_channels(log, p=low)
     causes = [effect.name for effect in effects]
     if not are_settings:
         causes += BASE_CAUSES
@@ -237,25 +218,25 @@ def test_page_says_all_and_loads_nothing(tmp_path, diagnosis, measured):
     assert len(text) < 3e6
 
 
-def test_what_refitting_alone_or_a_guess_reaches_is_no_gain_of_effects(diagnosis):
-    errors = {
-        name: Errors({}, {"1": size}) for name, size in (("nominal", 8.7), ("refitted_base", 0.404))
-    }
-    blind = Prediction({"placebo": {"position_m": {"1": 0.27}}})
-    found = replace(
-        diagnosis, error={**errors, "extended": Errors({}, {"1": 0.403})}, prediction=blind
-    )
-    text = report.text_of(found)
-    assert "by the refitted base 95 %, the named effects 0 %; " in text
-    assert "a guess that ignores the commands, 0.27 m)" in text
+BLIND = Prediction({"placebo": {"position_m": {"1": 0.27}}})
+GAINS = {
+    "by the refitted base 95 %, the named effects 0 %; "
+    "a guess that ignores the commands, 0.27 m)": (
+        {"nominal": 8.7, "refitted_base": 0.404, "extended": 0.403},
+        {"prediction": BLIND},
+    ),
+    "by the refitted base 40 %, the named effects 10 %, the learnt law 30 %": (
+        {"nominal": 1.0, "refitted_base": 0.6, "without_learned": 0.5, "extended": 0.2},
+        {"learned": SimpleNamespace(text=lambda: "a law")},
+    ),
+}
 
 
-def test_what_a_learnt_law_gains_is_not_told_of_the_names(diagnosis):
-    sizes = {"nominal": 1.0, "refitted_base": 0.6, "without_learned": 0.5, "extended": 0.2}
+@pytest.mark.parametrize("expected", GAINS)
+def test_what_refitting_a_guess_or_a_learnt_law_reaches_is_no_gain_of_effects(diagnosis, expected):
+    sizes, changes = GAINS[expected]
     errors = {name: Errors({}, {"1": size}) for name, size in sizes.items()}
-    law = SimpleNamespace(text=lambda: "a law")
-    text = report.text_of(replace(diagnosis, error=errors, learned=law))
-    assert "by the refitted base 40 %, the named effects 10 %, the learnt law 30 %" in text
+    assert expected in report.text_of(replace(diagnosis, error=errors, **changes))
 
 
 def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):

@@ -64,20 +64,6 @@ def test_info_belongs_to_the_step_not_to_the_reset(env, flight):
     assert_allclose(info["gate_distance_m"][~done], distance[~done], atol=1e-4)
 
 
-def test_parameters_can_differ_between_environments(env, params):
-    state = env.begin(drone_at((15.0, 2.0, 1.35), quat=(0.9, 0.3, 0.3, 0.1)), 0, params)
-
-    @jax.jit
-    @jax.vmap
-    def sideways_force(mass):
-        changed = params.replace(model=params.model._replace(m=mass))
-        return mass * env.drone(env.step_env(None, state, jnp.zeros(4), changed)[1]).acc_w.x
-
-    forces = sideways_force(jnp.array([0.5, 1.0, 2.0]))
-    assert abs(forces[0]) > 0.1
-    assert_allclose(forces, np.full(3, forces[0]), rtol=1e-4)
-
-
 # --- Ends of episodes ---------------------------------------------------------------------------
 
 

@@ -22,6 +22,7 @@ from flytrack_sysid.sensors import measure
 from flytrack_sysid.split import held_out_rows
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 from tests.support.slow import slow_but
+from tests.support.written_logs import with_channels
 
 PLANT = HandoutPlant()
 DRAG = (0.3, 0.5, 0.2)
@@ -132,10 +133,6 @@ def test_drag_is_found(dragged):
     assert tau_error(found) < 1e-4 and map_error(found) < 1e-4 and not found.warnings
 
 
-def scaled(log, channel, factors):
-    return replace(log, channels={**log.channels, channel: log[channel] * factors})
-
-
 def at_rest(log):
     """Return what a drone on the ground measures while its commands move."""
     rng = np.random.default_rng(0)
@@ -149,7 +146,11 @@ def at_rest(log):
 
 EVERYTHING = dict.fromkeys((*TAUS, *THRUST_COEFFS, DRAIN), 0.1)
 REFUSED = {
-    "yaw stuck": (lambda log: scaled(log, "u", (1, 1, 0, 1)), {}, "u_yaw: stuck at 0; tau_yaw"),
+    "yaw stuck": (
+        lambda log: with_channels(log, u=log["u"] * (1, 1, 0, 1)),
+        {},
+        "u_yaw: stuck at 0; tau_yaw",
+    ),
     "no rates": (lambda log: log.without("w", "q"), {}, "w and q are absent"),
     "no force": (lambda log: log.without("f", "v", "p"), {}, "f, or q with one of a, v and p"),
     "unknown name": (None, {"fixed": {"tau_jaw": 0.1}}, "fixed: tau_jaw: unknown; expected"),
@@ -157,7 +158,7 @@ REFUSED = {
     "unknown effect": (None, {"effects": ("rag",)}, "effects: rag: no effect of that name"),
     "nothing left": (None, {"fixed": EVERYTHING}, "fixed: found every parameter"),
     "wrong sign": (
-        lambda log: scaled(log, "w", (-1, 1, 1)),
+        lambda log: with_channels(log, w=log["w"] * (-1, 1, 1)),
         {"accept": True},
         "w_x: .* sign and order of u_roll and w_x",
     ),

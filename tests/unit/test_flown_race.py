@@ -14,6 +14,7 @@ from flytrack_env.plants import Plant
 from flytrack_env.references import ghost_rollout, shipped_references
 from flytrack_env.state import BATTERY, POSITION, VELOCITY, Action, pack, unpack
 from tests.support.coasting import drone_at, track_of_row
+from tests.support.tables import table
 
 TRACK = load_track("flytrack")
 REFERENCES = shipped_references(TRACK, ("nominal",))
@@ -91,12 +92,7 @@ def test_step_after_the_last_state_is_extrapolated():
         assert_array_equal(field, expected)
 
 
-ENDS = {  # the first gate, at (12.5, 2, 1.35), is flown towards -x
-    "ground": ((15.0, 2.0, 1.35), (0.0, 0.0, -2.0)),
-    "out of bounds": ((15.0, 2.0, 1.35), (0.0, 0.0, 20.0)),
-    "crash": ((15.0, 3.0, 1.35), (-8.0, 0.0, 0.0)),
-    "missed gate": ((15.0, 4.0, 1.35), (-8.0, 0.0, 0.0)),
-}
+ENDS = table("flown_ends")
 
 
 @pytest.mark.parametrize("end", ENDS)

@@ -27,18 +27,12 @@ from tests.support.handout_plant import GRAVITY
 from tests.support.real_logs import shared
 from tests.support.slow import slow_but
 from tests.support.tables import table
+from tests.support.written_logs import with_channels
 
 SLACK_S = 0.6  # two blocks and the one beside them
 
 
-# What is measured, and whether that can show the ground.
-SENSORS = {
-    "no accelerometer": (("f",), True),
-    "no gyroscope": (("w",), True),
-    "no velocity": (("v",), True),
-    "attitude and gyroscope": (("f", "v"), False),
-    "accelerometer only": (("w", "q"), False),
-}
+SENSORS = table("ground_sensors")
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -70,7 +64,7 @@ def test_a_low_drop_onto_the_ground_is_a_landing():
     force, is_drop = log["f"].copy(), (log.time >= LANDING_S) & (log.time < LANDING_S + 0.9)
     force[is_drop] = 0.0  # 4 m, and a hit that the accelerometer cannot measure in full
     force[np.flatnonzero(is_drop)[-1] + 1] = [0.0, 0.0, 16.0 * GRAVITY]
-    is_ground = find_ground([replace(log, channels={**log.channels, "f": force})])[0]
+    is_ground = find_ground([with_channels(log, f=force)])[0]
     assert is_ground[log.time > LANDING_S + 0.9 + SLACK_S].all()
     assert not is_ground[(log.time > LANDING_S - 2.0) & (log.time < LANDING_S + 0.5)].any()
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_sysid import LogError, import_log
 from tests.support.foreign_logs import save_messages
+from tests.support.tables import table
 from tests.support.written_logs import read_mapping
 
 pytest.importorskip("mcap", reason="mcap is not installed: pip install 'flytrack[bags]'")
@@ -126,18 +127,7 @@ def test_what_was_written_is_read_back(tmp_path, mapping, kind):
     assert is_noted == (kind == "MCAP of JSON")
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        (
-            "/twist:twist.angular.x",
-            "/gyro:x",
-            "topic /gyro: no messages; found /pose, /sticks, /tw",
-        ),
-        ("twist.angular.x", "rate", "topic /twist: field rate: not a number in messages of type"),
-        ("/sticks:axes[0]", "roll", r"map\.toml: command: found roll, expected topic:field"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "message"), table("bags")["refused"])
 def test_what_lacks_a_topic_or_a_field_is_refused(tmp_path, mapping, old, new, message):
     mapping.write_text(MAPPING.replace(old, new, 1))
     with pytest.raises(LogError, match=message):

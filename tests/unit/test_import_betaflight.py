@@ -167,15 +167,6 @@ def test_one_bad_log_of_many_is_left_out_with_its_reason(read):
     assert "rc_rates: missing" in left_out[0] and "nothing flies" in left_out[1]
 
 
-@pytest.mark.parametrize("num_missing", [1, 13, 14, 15, 16, 200])
-def test_a_log_cut_off_is_used_up_to_its_last_whole_frame(read, num_missing):
-    whole, cut_off = read(log_with()).log, read(log_with()[:-num_missing]).log
-    for name in whole.channels:
-        np.testing.assert_array_equal(cut_off[name], whole[name][: len(cut_off)])
-    frame_size = len(log_with()) - len(log_with(frames()[:-1]))
-    assert 0 <= 200 - len(cut_off) <= num_missing // frame_size + 1
-
-
 def test_a_voltage_of_0_was_not_measured(read):
     rows = frames()
     rows[50:60, 6] = 0

@@ -21,6 +21,7 @@ from tests.support.grounded_flights import (
     TAKE_OFF_S,
     stands_flies_and_lands,
 )
+from tests.support.tables import table
 
 ATTITUDE_AND_PLACE = {"ULog": set("pvq"), "DataFlash": set("pvq")}
 # Whole numbers of 0.001 of the throttle or deg/s, 0.01 V, and 1/2048 g.
@@ -77,15 +78,7 @@ def test_ground_is_left_out_and_counted(kind, tmp_path):
 # --- Logs without their last tenth, as when the battery was pulled --------------------------------
 
 NUM_ROWS = 1000
-# The fewest rows that are used, and a note; PX4's topics end one after the other.
-USED = {
-    "ULog": (550, "cut off: used up to the last whole message"),
-    "blackbox": (890, "cut off: found no end-of-log event; 8.. whole frames used"),
-    "DataFlash": (750, "cut off: used up to the last whole message"),
-    "uSD": (890, "damaged or cut off: .* bytes are used"),
-}
-PART_OF_A_ROW = r"row \d+ \(line \d+\): found 1 cells, expected \d+ as in the header"
-REFUSED = {"bag": "damaged, cannot be decoded", "CSV": PART_OF_A_ROW, "CSV files": PART_OF_A_ROW}
+CUT_OFF = table("cut_off_logs")
 
 
 @pytest.mark.parametrize("kind", WRITERS)
@@ -100,12 +93,12 @@ def test_whole_rows_of_a_log_that_is_cut_off_are_used_or_it_is_refused(kind, tmp
     if form == "csv":
         end = content.rindex(b"\n", 0, end) + 4  # within the first cell of a row
     largest.write_bytes(content[:end])
-    if kind in REFUSED:
-        with pytest.raises(LogError, match=REFUSED[kind]):
+    if kind in CUT_OFF["refused"]:
+        with pytest.raises(LogError, match=CUT_OFF["refused"][kind]):
             import_log(path, form, mapping)
         return
     imported = import_log(path, form, mapping, align=False)
-    min_rows, note = USED[kind]
+    min_rows, note = CUT_OFF["used"][kind]
     assert min_rows <= len(imported.log) < NUM_ROWS
     assert re.search(note, " ".join(imported.notes))
 

@@ -10,7 +10,7 @@ import pytest
 
 from flytrack_env import make
 from flytrack_env.effects import LearnedLaw
-from flytrack_env.effects.grammar import QUANTITIES, SHAPES, Factor, Law, Term
+from flytrack_env.effects.grammar import Factor, Law, Term
 from flytrack_env.model_file import ModelFileError, load_model, save_model
 from flytrack_env.params import EnvParams
 from flytrack_env.state import Action
@@ -33,7 +33,7 @@ FLAP = Term(
 )
 WARM = Term("force", "world", (Factor("time", "saturation", (0.05,)),), (0.0, 0.0, 3.0), NO)
 LAW = Law((DRAG, FLAP, WARM))
-NUM_STEPS = 20
+NUM_STEPS = 8
 
 
 def flown(effects, commands, drone=None):
@@ -121,19 +121,6 @@ def test_its_spread_can_be_drawn():
     drawn = draw(words).effect("learned_law")
     assert drawn.spread.min() < -0.2 and drawn.spread.max() > 0.2
     assert (drawn.scale == 1.0).all()
-
-
-def test_every_quantity_has_a_value_and_every_shape_a_formula():
-    law = Law(
-        tuple(
-            Term("force", "body", (Factor(name, "power", (1.0, 0.0)),), (0.1, 0.1, 0.1), NO)
-            for name in QUANTITIES
-        )
-    )
-    assert np.isfinite(acceleration(LearnedLaw(1.0, 0.0, law), vel_w=(1.0, 2.0, 3.0))).all()
-    for name, shape in SHAPES.items():
-        numbers = tuple(float(place + 1) for place in range(len(shape.numbers)))
-        assert shape.quantities[0] in Factor(shape.quantities[0], name, numbers).text()
 
 
 @pytest.mark.parametrize(("where", "value", "expected"), table("learned_effects")["refused"])

@@ -16,6 +16,7 @@ from tests.support.written_logs import (
     assert_same_log,
     columns_of,
     make_log,
+    with_channels,
     write,
 )
 
@@ -63,10 +64,7 @@ def test_files_of_other_writers(tmp_path):
 def test_quaternions_drift_a_little_and_may_flip(tmp_path):
     log = make_log(names=("q",))
     factors = np.array([1.0, -1.0, 1.005, -0.995, 1.0, 1.0])[:, None]
-    write(
-        tmp_path / "flight.csv",
-        columns_of(replace(log, channels={**log.channels, "q": factors * log["q"]})),
-    )
+    write(tmp_path / "flight.csv", columns_of(with_channels(log, q=factors * log["q"])))
     found = load_log(tmp_path / "flight.csv")["q"]
     np.testing.assert_allclose(found, np.sign(factors) * log["q"], atol=1e-12)
 

@@ -28,7 +28,14 @@ from flytrack_sysid.log_voltage import (
 from flytrack_sysid.sensors import measure
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 from tests.support.tables import table
-from tests.support.written_logs import NUM_ROWS, SUFFIXES, columns_of, make_log, write
+from tests.support.written_logs import (
+    NUM_ROWS,
+    SUFFIXES,
+    columns_of,
+    make_log,
+    with_channels,
+    write,
+)
 
 FOUR_CELLS, MIDDLE_V = (14.0, 16.8), 15.4
 CRAFT = Craft((343.775, 343.775, 343.775), 0.7, FOUR_CELLS)
@@ -221,7 +228,7 @@ def test_batteries_follow_the_voltages_of_a_log(logged, stated, given, of_craft,
     if logged:
         volts = np.repeat(logged, 500)[:, None]
         volts[3] = 0.1  # a wrong sample is no range
-        log = replace(log, channels={**log.channels, "v_bat": volts})
+        log = with_channels(log, v_bat=volts)
         assert flown_voltages(log) == tuple(logged)
     known = replace(log, stated_voltage_v=tuple(stated) or (given.empty_v, given.full_v))
     assert battery_of_craft(known, given) == Battery(*of_craft)

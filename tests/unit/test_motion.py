@@ -67,7 +67,7 @@ def flown(model, dt, start=START):
 def reference(model):
     """Return position, velocity, attitude and specific force, body, at every 20 ms.
 
-    Those of a hidden plant in parts of 0.1 ms; its motion is that of SciPy's integrator.
+    Those of a hidden plant in parts of 0.1 ms, which shares no code with the package.
     """
     laws = {effects.effect_of(law).name: law._asdict() for law in model.effects}
     arrays = (tuple(map(float, values)) for values in (TAU, COEFFS, FULL_RATES))

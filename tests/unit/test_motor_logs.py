@@ -22,6 +22,10 @@ from flytrack_sysid.plausibility import find_problems
 from flytrack_sysid.validate import validate
 from tests.support.motor_flights import COLUMNS, flown, write_csv
 from tests.support.motor_models import crafts, model_of
+from tests.support.tables import table
+from tests.support.written_logs import with_channels
+
+CASES = table("motor_mappings")
 
 
 @pytest.fixture(scope="module")
@@ -65,18 +69,7 @@ def test_stated_numbers_replace_those_of_a_known_craft_whatever_they_are(monkeyp
     assert (motors.up_s, motors.down_s, motors.rotor_momentum) == (0.03, 0.03, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
-        (
-            "as_command = true",
-            "as_command = true\nas_thrust = true",
-            r"as_thrust: found together",
-        ),
-        ("as_command = true", "", r"frame: expected motors\.as_command = true"),
-        ("[craft]", "[craft]\nmass_kg = 0.7", r"frame\.mass_kg: found 0\.8, and 0\.7 in \[craft\]"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "expected"), CASES["tables"])
 def test_tables_that_contradict_each_other_are_refused(log, tmp_path, old, new, expected):
     path, map_file = write_csv(tmp_path, log)
     map_file.write_text(map_file.read_text().replace(old, new))
@@ -92,15 +85,7 @@ def test_a_craft_of_motors_names_what_it_lacks():
         craft._replace(motors=None).nominal_model("a")
 
 
-@pytest.mark.parametrize(
-    ("columns", "frame", "expected"),
-    [
-        (COLUMNS[:3], "", r"motors\.columns: found 3 motors, expected the 4 of a quadcopter"),
-        ([*COLUMNS, "w0", "w1"], "", r"found 6 motors, expected the 4 of a quadcopter"),
-        (COLUMNS, 'craft = "boat"', r"frame\.craft: found 'boat', expected one of crazyflie_2"),
-        (COLUMNS, "rotor_momentum = 5.0", r"frame\.rotor_momentum: found 6.25, expected -0.5 to"),
-    ],
-)
+@pytest.mark.parametrize(("columns", "frame", "expected"), CASES["frames"])
 def test_what_no_quadcopter_has_is_refused(log, tmp_path, columns, frame, expected):
     path, map_file = write_csv(tmp_path, log, columns, frame)
     with pytest.raises(LogError, match=expected):
@@ -108,7 +93,7 @@ def test_what_no_quadcopter_has_is_refused(log, tmp_path, columns, frame, expect
 
 
 def test_a_motor_that_stands_still_is_named(log, tmp_path):
-    still = replace(log, channels={**log.channels, "u": log["u"] * [1.0, 1.0, 0.0, 1.0]})
+    still = with_channels(log, u=log["u"] * [1.0, 1.0, 0.0, 1.0])
     path, map_file = write_csv(tmp_path, still)
     with pytest.raises(LogError, match=r"motor rear_left: found 0\.5 of its range in every row"):
         import_log(path, "csv", map_file)
@@ -118,7 +103,7 @@ def test_a_motor_that_stands_still_is_named(log, tmp_path):
 @pytest.mark.parametrize("order", [(0, 1, 2, 3), (1, 0, 2, 3), (3, 1, 2, 0), (2, 3, 0, 1)])
 def test_the_order_of_motors_is_found_and_corrected(log, tmp_path, order):
     columns = [COLUMNS[motor] for motor in order]
-    swapped = replace(log, channels={**log.channels, "u": log["u"][:, list(order)]})
+    swapped = with_channels(log, u=log["u"][:, list(order)])
     found = check_log(swapped)
     if order == (0, 1, 2, 3):
         assert not found.contradicts

@@ -185,9 +185,14 @@ def test_ranks_are_by_progress_and_those_that_are_out_come_last():
     assert ranks == [2, 3, 1, 4]
 
 
-def test_a_ghost_flies_its_line_and_stops_for_nobody():
-    env = gymnax.make("FlyTrackDuel-v0")[0]
-    ghost = env.race.ghosts[1]
+@pytest.fixture(scope="module")
+def duel():
+    """The id of a drone and a ghost."""
+    return gymnax.make("FlyTrackDuel-v0")[0]
+
+
+def test_a_ghost_flies_its_line_and_stops_for_nobody(duel):
+    env, ghost = duel, duel.race.ghosts[1]
     ghost_w, progress = np.stack(ghost.pos_w, axis=-1), np.asarray(ghost.progress)
     lap_s = 0.01 * np.argmax(progress >= env.race.env.default_params.course.num_gates)
     assert abs(lap_s - shipped_reference("flytrack", "standing").time_s) < 0.03
@@ -212,10 +217,9 @@ def test_a_ghost_flies_its_line_and_stops_for_nobody():
     assert info["race_over"] and terminated and not truncated and reward == 0.0
 
 
-def test_a_duel_can_be_pickled():
-    env = gymnax.make("FlyTrackDuel-v0")[0]
-    copy = pickle.loads(pickle.dumps(env))
-    start, observation = env.reset(jax.random.key(0)), copy.reset(jax.random.key(0))
+def test_a_duel_can_be_pickled(duel):
+    copy = pickle.loads(pickle.dumps(duel))
+    start, observation = duel.reset(jax.random.key(0)), copy.reset(jax.random.key(0))
     jax.tree.map(assert_array_equal, start, observation)
 
 
@@ -251,7 +255,6 @@ REFUSALS = {
     "expected 2 to 8": lambda: flytrack_env.make_race("FlyTrackRace-v0", 9),
     "race_id": lambda: flytrack_env.make_race("FlyTrackRelay-v0"),
     "found 0, expected 1 to 8": lambda: MultiDroneRace(RACE.env, 0),
-    "found 9, expected 1 to 8": lambda: MultiDroneRace(RACE.env, 9),
     "found 2.0, expected 1 to 8": lambda: MultiDroneRace(RACE.env, 2.0),
     "ghosts": lambda: MultiDroneRace(RACE.env, 2, ghosts={2: None}),
     "start inside each other": lambda: check_rules(RaceRules(column_spacing=0.3), 2),

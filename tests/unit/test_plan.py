@@ -17,6 +17,7 @@ from flytrack_sysid.inference.score_test import Linearization
 from flytrack_sysid.inference.search import FittedModel, SearchState
 from flytrack_sysid.manoeuvres import MANOEUVRES, flights_of, hover_action
 from flytrack_sysid.script_file import build_script
+from tests.support.tables import table
 
 MODEL = nominal_parameters()
 GYRO, FORCE, ATTITUDE, VELOCITY, VOLTAGE = 0.1, 1.5, 0.009, 0.05, 0.01  # rad/s, m/s^2, rad, m/s, V
@@ -25,17 +26,7 @@ DIRECT, LEVEL = [GYRO] * 3 + [FORCE] * 3 + [1.0], [ATTITUDE] * 3 + [VELOCITY] * 
 NOISE = np.log(
     [DIRECT, LEVEL, [LITTLE] * 7, [LITTLE] * 7, [SHORT_S] * 7, [1.0] * 7]
 )  # as a problem has it
-WANTED = {
-    "wind": ("thrust_tilt", "accelerometer_bias"),
-    "thrust_tilt": ("wind",),
-    "ground_effect": (),
-    "rate_saturation": (),
-    "rate_expo": ("rate_saturation",),
-    "imu_offset": (),
-    "linear_drag": ("quadratic_drag",),
-    "yaw_reaction": (),
-    "gyro_scale": ("rate_scale",),
-}
+WANTED = table("diagnoses")["hidden_by_hover"]
 
 
 class Logged(NamedTuple):

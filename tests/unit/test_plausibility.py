@@ -14,6 +14,7 @@ from flytrack_sysid.sensors import measure, specific_force_b
 from tests.support.handout_plant import HandoutPlant, excited
 from tests.support.made_flight import noisy
 from tests.support.tables import table
+from tests.support.written_logs import with_channels
 
 NUM_SEGMENTS = 8  # of the excitation, 2.5 s each
 
@@ -23,7 +24,7 @@ def logs():
     """The same flights as they are, and as sensors measure them."""
     exact = excited(HandoutPlant())
     exact = exact.select(exact.segment < NUM_SEGMENTS)
-    clean = replace(exact, channels={**exact.channels, "f": specific_force_b(exact, GRAVITY)})
+    clean = with_channels(exact, f=specific_force_b(exact, GRAVITY))
     return {"clean": clean, "noisy": measure(exact, 1.0, GRAVITY, np.random.default_rng(9))}
 
 
@@ -42,7 +43,7 @@ class Change(NamedTuple):
         if self.channel == "t":
             return replace(log, time=self.scale * log.time)
         values = log[self.channel][:, self.order] * np.array(self.scale) + self.offset
-        return replace(log, channels={**log.channels, self.channel: values})
+        return with_channels(log, **{self.channel: values})
 
     def named(self):
         """Return the columns that the problem names."""

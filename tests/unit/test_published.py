@@ -17,31 +17,9 @@ from benchmarks.published import (
     start_rows,
 )
 from tests.support.motor_models import crafts
+from tests.support.tables import table
 
-NANO = crafts(
-    mass=0.045,
-    inertia=np.diag([2.8e-5, 3.1e-5, 4.6e-5]),
-    places=[[-0.035, -0.035, 0.0], [0.035, -0.035, 0.0], [-0.035, 0.035, 0.0], [0.035, 0.035, 0.0]],
-    thrust=np.full(4, 0.25),
-    linear=0.0,
-    yaw_arm=0.00596,
-    momentum=0.0,
-    up_s=0.03,
-    down_s=0.045,
-    drag=0.045 * np.array([0.3, 0.3, 0.2]),
-)
-BEM = crafts(
-    mass=0.772,
-    inertia=np.diag([0.0028, 0.0024, 0.005]),
-    places=[[-0.075, -0.1, 0.0], [0.075, -0.1, 0.0], [-0.075, 0.1, 0.0], [0.075, 0.1, 0.0]],
-    thrust=np.full(4, 8.0),
-    linear=0.0,
-    yaw_arm=0.022,
-    momentum=0.0,
-    up_s=0.012,
-    down_s=0.012,
-    drag=0.772 * np.array([0.3, 0.4, 0.2]),
-)
+CRAFTS = {name: crafts(**fields) for name, fields in table("crafts").items()}
 BATTERY = 16.0
 
 
@@ -67,13 +45,13 @@ def neurobem_columns(log, t):
 
 
 LAYOUTS = {
-    "idsia_nanodrone": (NANO, idsia_columns, 0.01),
-    "neurobem": (BEM, neurobem_columns, 0.0025),
+    "idsia_nanodrone": (idsia_columns, 0.01),
+    "neurobem": (neurobem_columns, 0.0025),
 }
 
 
 def write(folder, layout, seed, duration_s, noise):
-    craft, columns_of, dt = LAYOUTS[layout]
+    craft, (columns_of, dt) = CRAFTS[layout], LAYOUTS[layout]
     rng = np.random.default_rng(seed)
     flight = fly(craft, Pilot(rng, 1, duration_s, 5.0), duration_s, dt, dt / round(dt / 1.25e-3))
     log = log_of_flight(flight, 0, rng, noise)
@@ -90,7 +68,7 @@ def test_a_layout_is_read_as_it_is_documented(layout, tmp_path):
     path, log = write(tmp_path, layout, 0, 3.0, 0.0)
     found = read_flights([path], layout)
     assert found.log.has_motors and not found.problems
-    rows = np.searchsorted(LAYOUTS[layout][2] * np.arange(len(log)), found.log.time + 1e-9) - 1
+    rows = np.searchsorted(LAYOUTS[layout][1] * np.arange(len(log)), found.log.time + 1e-9) - 1
     for name in found.log.channels:
         if name in log:
             size = max(np.ptp(log[name]), 1.0)
@@ -115,7 +93,7 @@ def test_the_truth_of_a_dry_run_is_found(layout, tmp_path):
         for seed, length in ((1, seconds), (2, 10.0))
     )
     result = predicted(train, test)
-    craft = LAYOUTS[layout][0]
+    craft = CRAFTS[layout]
     radii = np.sqrt(np.diag(craft.inertia[0]) / craft.mass[0])
     expected = dict(zip(("radius_x", "radius_y", "radius_z"), radii, strict=True))
     expected |= {"up_s": craft.up_s[0], "down_s": craft.down_s[0]}

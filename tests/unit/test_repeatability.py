@@ -2,19 +2,11 @@
 
 import pytest
 
-from benchmarks.repeatability import agree, compare, is_same_class, overlaps
+from benchmarks.repeatability import agree, compare, is_same_class
+from tests.support.tables import table
 
 
-@pytest.mark.parametrize(
-    ("one", "other", "expected"),
-    [
-        ({"wind": []}, {"wind": []}, True),
-        ({"wind": ["thrust_tilt"]}, {"thrust_tilt": ["wind"]}, True),
-        ({"wind": ["thrust_tilt"]}, {"thrust_tilt": []}, False),
-        ({"wind": []}, {"wind": [], "linear_drag": []}, False),
-        ({}, {}, True),
-    ],
-)
+@pytest.mark.parametrize(("one", "other", "expected"), table("diagnoses")["classes"])
 def test_causes_are_of_one_class_if_each_is_an_equivalent_of_the_other(one, other, expected):
     one, other = ({"causes": causes, "unsettled": []} for causes in (one, other))
     assert is_same_class(one, other) is expected and is_same_class(other, one) is expected
@@ -26,11 +18,6 @@ def test_flights_agree_where_one_leaves_open_what_the_other_names():
     other = {"causes": {}, "unsettled": ["wind", "linear_drag"]}
     assert agree(one, other) and agree(other, one) and not is_same_class(one, other)
     assert not agree(one, {"causes": {}, "unsettled": []})
-
-
-def test_intervals_overlap_where_they_share_a_value():
-    assert overlaps([1.0, 0.5, 1.5], [2.0, 1.5, 2.5])
-    assert not overlaps([1.0, 0.5, 1.4], [2.0, 1.5, 2.5])
 
 
 def test_a_craft_counts_pairs_values_and_widths():
