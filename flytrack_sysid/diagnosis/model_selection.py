@@ -8,6 +8,7 @@ from scipy import stats
 
 from flytrack_env.dynamics import collective_thrust
 from flytrack_env.effects import takes_motors
+from flytrack_sysid.diagnosis.result import TWO_SIDED_95
 from flytrack_sysid.inference.parameters import TAUS
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import (
@@ -37,6 +38,8 @@ MAX_RIVALS = 3
 NEARLY, NEAR_SHARE, PROBE_SHARE = 60.0, 0.15, 0.25
 DRAGS = ("linear_drag", "quadratic_drag")  # laws of a force of the air, which a wind moves
 MOVING_AIR = next(one for one in CANDIDATES if one.effect == "wind" and "wind.v_x" in one.fields)
+# Degrees of freedom of an interval: with fewer blocks that tell of a parameter, t is unbounded.
+MIN_FREEDOM = 2.0
 CLEARLY_CHEAPER = 0.5  # of cost and price: swaps that save less would go back and forth
 
 
@@ -313,8 +316,10 @@ class Marginal:
         columns = [linearization.column(field) for field in fields]
         given = linearization.columns_at(model.indices, without=columns)
         self.information, share = linearization.projected(columns, given)
-        blocks = linearization.score_by_block
-        self.scores = blocks[:, columns] - blocks[:, given] @ share
+        kept, projection = [*columns, *given], np.vstack([np.eye(len(columns)), -share])
+        self.scores = linearization.score_by_block[:, kept] @ projection
+        blocks = linearization.by_block[:, kept][:, :, kept]
+        self.by_block = projection.T @ blocks @ projection
         self.inflation = estimate_inflation(self.information, self.scores)
 
     def covariance(self) -> np.ndarray:
@@ -324,21 +329,23 @@ class Marginal:
     def half_widths(self, weights: np.ndarray | None = None) -> np.ndarray:
         """Return half of each parameter's 95 % interval, or of weighted sums of parameters.
 
-        The standard deviation is that of the information or, if larger, the sandwich estimate from
-        the scores of blocks. The interval is of Student's t for the number of blocks.
+        The interval is that of ``covariance`` or, if wider, that of the sandwich estimate from the
+        scores of blocks. Blocks differ in what they tell of a parameter: the sandwich is corrected
+        for that, and its interval is of Student's t with Satterthwaite's degrees of freedom (R.
+        Bell and D. McCaffrey, Survey Methodology 28, 2002).
 
         Args:
             weights: of the sums, (num_sums, parameters); each parameter by itself if None.
         """
         weights = np.eye(len(self.information)) if weights is None else weights
-        covariance = solve(self.information, weights.T).T
-        used = self.scores[np.abs(self.scores).sum(axis=1) > 0.0]
-        count = max(len(used), 2)
-        spread = used.T @ used * count / (count - 1)
-        variance = np.maximum(
-            np.diag(covariance @ weights.T), np.diag(covariance @ spread @ covariance.T)
-        )
-        return np.sqrt(variance) * stats.t.ppf(0.975, count - 1)
+        influence = solve(self.information, weights.T)
+        told = np.einsum("ps,bpq,qs->bs", influence, self.by_block, influence, optimize=True)
+        share = told / np.maximum(told.sum(axis=0), 1e-300)
+        largest = np.minimum(np.square(share).sum(axis=0), 1.0 / (1.0 + MIN_FREEDOM))
+        spread = np.square(self.scores @ influence).sum(axis=0) / (1.0 - largest)
+        variance = self.inflation * np.einsum("sp,ps->s", weights, influence)
+        of_blocks = np.sqrt(spread) * stats.t.ppf(0.975, 1.0 / largest - 1.0)
+        return np.asarray(np.maximum(np.sqrt(variance) * TWO_SIDED_95, of_blocks))
 
 
 class BaseChange(NamedTuple):

@@ -59,19 +59,25 @@ def test_only_logs_of_one_clock_can_show_when():
 FREE = ("given", "first", "second")
 
 
-def half_widths(scores, information):
-    """Return half widths of intervals from scores of seconds (BLOCKS, 3) and information."""
+def half_widths(scores, by_block):
+    """Return half widths of intervals from scores (BLOCKS, 3) and information of seconds."""
     seen = object.__new__(Linearization)
-    seen.indices, seen.total, seen.score_by_block = [0, 1, 2], information, scores
+    seen.indices, seen.score_by_block, seen.by_block = [0, 1, 2], scores, by_block
+    seen.total = by_block.sum(axis=0)
     seen.problem = SimpleNamespace(names=FREE)
     return Marginal(seen, SimpleNamespace(indices=(0, 1, 2)), FREE[1:]).half_widths()
 
 
-def test_widths_cover_when_all_parameters_are_noisier_than_said():
+@pytest.mark.parametrize("busy", [BLOCKS, 4])
+def test_widths_cover_when_all_parameters_are_noisier_than_said(busy):
+    """Also where a few seconds tell nearly all that the log tells."""
     rng, truth, root = np.random.default_rng(4), 0, np.random.default_rng(1).normal(size=(3, 3))
     information = 100.0 * (root @ root.T + np.eye(3))
-    for _ in range(300):
-        scores = rng.multivariate_normal(np.zeros(3), 4.0 * information / BLOCKS, BLOCKS)
+    share = np.where(np.arange(BLOCKS) < busy, 1.0, 0.01)
+    share /= share.sum()
+    draws = rng.multivariate_normal(np.zeros(3), 4.0 * information, (300, BLOCKS))
+    for scores in draws * np.sqrt(share)[:, None]:
         error = np.linalg.solve(information, scores.sum(axis=0))[1:]
-        truth += np.sum(np.abs(error) < half_widths(scores, information))
+        at_fit = scores - share[:, None] * scores.sum(axis=0)
+        truth += np.sum(np.abs(error) < half_widths(at_fit, share[:, None, None] * information))
     assert truth / 600 == pytest.approx(0.95, abs=0.03)
