@@ -173,15 +173,15 @@ def figures(lines: list[Line]) -> list[Figure]:
 
 
 def figures_of_motions(lines: list[Line]) -> str:
-    """Return the figures of the usual rate, two columns a motion."""
-    columns = [figures(flown(lines, motion, USUAL_RATE)) for motion in MOTIONS]
-    rows = []
-    for figure, *others in zip(*columns, strict=True):
-        if not any(other.n for other in (figure, *others)):
-            continue  # no such plants; the page counts them
-        rows.append([*figure, *(cell for other in others for cell in (other.measured, other.n))])
-    heads = [head for motion in MOTIONS for head in (motion, "n")]
-    return table(["figure", "target", *heads], rows)
+    """Return the figures of the usual rate: of all motions together, and of each."""
+    of_all = figures([line for line in lines if line["rate"] == USUAL_RATE])
+    by_motion = [figures(flown(lines, motion, USUAL_RATE)) for motion in MOTIONS]
+    rows = [
+        [*figure, *(of_motion.measured.split(" (")[0] for of_motion in of_motions)]
+        for figure, *of_motions in zip(of_all, *by_motion, strict=True)
+        if figure.n  # the page counts plants
+    ]
+    return table(["figure", "target", "all motions (95 % interval)", "n", *MOTIONS], rows)
 
 
 def figures_of_rates(lines: list[Line]) -> str:

@@ -20,12 +20,14 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import tyro
+from scipy.stats import binomtest
 from tqdm import tqdm
 
 Item = TypeVar("Item")
 Line = dict[str, Any]  # what was measured of something, JSON values
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "docs" / "results"
+FEW = 20  # values of which a share would claim more digits than they have
 PACKAGES = ("jax", "jaxlib", "gymnax", "numpy")
 
 
@@ -136,8 +138,15 @@ def share_figure(name: str, target: str, flags: Sequence[bool | int]) -> Figure:
 
 
 def share(flags: Sequence[bool | int]) -> tuple[str, int]:
-    """Return the share of true values as text, "none" of no values, and the number of values."""
-    return f"{100.0 * sum(flags) / len(flags):.1f} %" if len(flags) else "none", len(flags)
+    """Return the share of true values as text, "none" of no values, and the number of values.
+
+    A share of fewer than ``FEW`` is a count, others have their exact 95 % interval.
+    """
+    count, total = sum(map(bool, flags)), len(flags)
+    if total < FEW:
+        return f"{count} of {total}" if total else "none", total
+    low, high = binomtest(count, total).proportion_ci(0.95, method="exact")
+    return f"{count / total:.1%} ({low:.1%} to {high:.1%})".replace("%", " %"), total
 
 
 def spread(values: Sequence[float], digits: str = ",.0f") -> str:
