@@ -14,6 +14,7 @@ from pathlib import Path
 from docs.effect_pages import effect_page, effects_table
 from docs.env_pages import env_page
 from docs.page_pictures import draw_effect, draw_env
+from docs.threshold_pages import thresholds_page
 from docs.track_pages import track_page
 from flytrack_env.effects import EFFECTS
 from flytrack_env.pictures import drawing
@@ -83,6 +84,7 @@ def site_pages() -> dict[str, str]:
     }
     pages = {f"envs/{env_id}.md": env_page(env_id) for env_id in ENVIRONMENTS}
     pages |= {f"effects/{effect.name}.md": effect_page(effect) for effect in EFFECTS}
+    pages["api/thresholds.md"] = thresholds_page()
     pages |= {f"tracks/{name}.md": track_page(name) for name in available_tracks()}
     for notebook in (ROOT / "docs" / "notebooks").glob("*.ipynb"):
         pages[f"notebooks/{notebook.stem}.md"] = notebook_page(notebook.stem)

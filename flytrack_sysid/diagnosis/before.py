@@ -46,7 +46,7 @@ from flytrack_sysid.inference.score_test import (
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_motion import check_same_origin
 
-MAX_EFFECTS = 4
+MAX_EFFECTS = 4  # that changed between two logs
 # Sticks jump if the sum of their distances from their low-pass exceeds JUMP. JUMP_S is the time
 # constant of the low-pass; AFTERMATH_S is how long the rows after a jump do not count.
 JUMP, JUMP_S, AFTERMATH_S = 0.5, 0.05, 0.2

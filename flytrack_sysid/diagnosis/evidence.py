@@ -17,12 +17,12 @@ from flytrack_sysid.inference.parameters import names_of, to_vector, with_values
 from flytrack_sysid.inference.score_test import ALL_BASE_CAUSES
 from flytrack_sysid.plots import BLUE, GREY, ORANGE, say
 
-WIDTH_IN, ROW_IN, LEGEND_IN = 8.0, 2.5, 0.9
-MAX_COLUMNS = 3
+WIDTH_IN, ROW_IN, LEGEND_IN = 8.0, 2.5, 0.9  # of a picture, inches
+MAX_COLUMNS = 3  # of plots in a picture
 EXTENDED = "extended"  # name of the extended model in traces
 MIN_SHOWN = 50  # rows
 NO_DATA = "not in the log, or too little of it"
-NUM_BINS = 15
+NUM_BINS = 15  # of a regressor's range
 SHOWN_PERCENTILES = (0.5, 99.5)  # of the regressor: outliers would compress all other rows
 # Numbers in a bin: rows or pieces that are wanted, and rows without which there is no scatter.
 WANTED_ROWS, WANTED_PIECES, MIN_ROWS = 20, 5, 2

@@ -28,7 +28,7 @@ from flytrack_sysid.inference.trace_cache import keep_trace
 from flytrack_sysid.log import FlightLog
 
 BATCH = 8  # models that are evaluated at once
-SPACING_S, SHORT_SPACING_S = 0.25, 0.05
+SPACING_S, SHORT_SPACING_S = 0.25, 0.05  # between starts of windows, of a usual and a short log
 # Limits for the fit and for the held-out score. Windows overlap, so that fewer windows contain
 # nearly as much information, and a fit replays them often.
 MAX_FITTED_WINDOWS, MAX_SCORED_WINDOWS = WINDOWS_PER_BATCH, 3 * WINDOWS_PER_BATCH

@@ -16,6 +16,7 @@ from flytrack_sysid.inference.score_test import prior_information, solve, step_i
 OUTLIER = 3.0  # Huber loss: linear beyond this multiple of the base model's RMS error
 MIN_GAIN = 1e-3  # smallest relative decrease of the cost in an iteration
 LAG_STEP = 0.5  # of the time between rows: the least step of a lag for intervals
+# Levenberg's, of the diagonal of the information; all are tried at once.
 DAMPINGS = np.array([1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0])[:BATCH]
 
 

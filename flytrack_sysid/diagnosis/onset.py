@@ -48,7 +48,7 @@ NEAR, MAX_NEAR = (
     5,
 )  # of the largest gain: the search chooses among effects with such gains
 CLEAR = 10.0  # of minus twice the log likelihood: an end has to be likelier than an onset by this
-MAX_CHANGES = 3
+MAX_CHANGES = 3  # of one log: an effect that begins and ends has two
 ALWAYS, NEVER = Window("").start, Window("").end
 RIDGE = 1e-7  # of a column's own information
 # 95 % quantile of the likelihood ratio of a time of change. Its distribution is that of the maximum

@@ -37,7 +37,7 @@ from flytrack_sysid.plots import WIDTH_IN, png_of
 
 JSON_NAME, MODEL_NAME, REPORT_NAME = "diagnosis.json", "extended_model.json", "report.html"
 MAX_PICTURED = 6  # causes with the largest gain that have a picture: nobody reads more pictures
-BARS_HEIGHT_IN = 2.6
+BARS_HEIGHT_IN = 2.6  # of the picture of errors, inches
 MAX_LISTED = 3  # names in one cell
 # More says only that a sensor has hardly any noise of its own: rates derived from an attitude.
 MAX_TIMES_NOISE = 100.0

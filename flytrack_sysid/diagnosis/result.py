@@ -11,7 +11,7 @@ from flytrack_sysid.diagnosis.beyond import Learned
 from flytrack_sysid.inference.chunks import AXES
 
 TWO_SIDED_95 = 1.959964  # standard deviations of a normal distribution: half of its 95 % interval
-SCHEMA = 1
+SCHEMA = 1  # version of diagnosis.json
 TO_LOG = "log "  # begins the recommendation where a channel is missing, in place of a manoeuvre
 CONSISTENT, CAUSES_FOUND, UNEXPLAINED = "consistent", "causes_found", "unexplained"
 # Not an effect: an equivalent of a thrust curve that depends on the voltage, which falls with the

@@ -20,7 +20,7 @@ from flytrack_sysid.inference.score_test import ALL_BASE_CAUSES
 
 MIN_ERROR_FRACTION = 0.02  # of the error of free flight, held out
 NOTABLE_LAG_S = 0.005  # as of the effects that delay
-CENTER, NOTABLE_CENTER_M = ALL_BASE_CAUSES["center_of_mass"], 0.002
+NOTABLE_CENTER_M = 0.002  # of the centre of mass
 NOTABLE_RADIUS = 0.02  # of a radius of gyration: 4 % of the inertia
 NOTABLE_THRUST = 0.02  # of the weight, as of a scale of thrust
 NOTABLE_DRAIN_PER_MIN = 0.1  # of the battery, from full to empty: 0.2 V/min of the handout's
@@ -112,7 +112,7 @@ def _is_base_notable(fields: Sequence[str], problem: Problem, vector: np.ndarray
             field: NOTABLE_LAG_S if range_of(field).unit == "s" else NOTABLE_RADIUS * radius_m
             for field, radius_m in zip(fields, radii_m, strict=True)
         },
-        **dict.fromkeys(CENTER, NOTABLE_CENTER_M),
+        **dict.fromkeys(ALL_BASE_CAUSES["center_of_mass"], NOTABLE_CENTER_M),
         DRAIN: notable_drain,
     }
     changes = _change(problem, vector, fields)

@@ -22,9 +22,9 @@ from flytrack_sysid.inference.record import (
 from flytrack_sysid.log import FlightLog, usual_step
 from flytrack_sysid.log_voltage import with_voltage
 
-LEAD_IN_S, CHUNK_S = 1, 5
+LEAD_IN_S, CHUNK_S = 1, 5  # lags forget within the lead-in; noise is fitted to chunks
 PIECES = LEAD_IN_S + CHUNK_S  # of a chunk, of a second each; the lead-in is first
-MIN_ROWS_PER_S = 20
+MIN_ROWS_PER_S = 20  # of a log: with fewer, the slowest rate loop is over within a row
 # A rate loop takes 10 to 50 ms. Chosen for cost: the effect of a lower rate was not measured.
 MAX_RATE_HZ = 250.0
 # Rows of all chunks, without lead-ins: all their slopes are in memory at once, some 50 kB a row.

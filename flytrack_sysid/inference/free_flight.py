@@ -24,7 +24,7 @@ from flytrack_sysid.inference.trace_cache import fast_jit
 from flytrack_sysid.log import FlightLog, usual_step
 from flytrack_sysid.log_voltage import with_voltage
 
-HORIZONS_S = (0.1, 0.25, 0.5, 1.0, 2.0)
+HORIZONS_S = (0.1, 0.25, 0.5, 1.0, 2.0)  # from a rate loop's response to a manoeuvre
 # Quantities of an error, three components each, in this order, and the channels that measure them.
 CHANNEL_OF = {"attitude": "q", "rates": "w", "velocity": "v", "position": "p"}
 QUANTITIES = tuple(CHANNEL_OF)

@@ -35,7 +35,7 @@ UNIFORM = 12.0**-0.5  # standard deviation of rounding, over the last digit
 MIN_DISTURBANCE_RATIO = (
     1e-3  # of a disturbance and of a wander, over the noise: smaller ones are neglected
 )
-TAU_RANGE_S = (0.02, 5.0)
+TAU_RANGE_S = (0.02, 5.0)  # of a disturbance: from a few rows to a chunk
 # Levenberg damping: the first, its factor after a bad step, and its factor after a good step.
 FIRST_DAMPING, MORE, LESS = 1e-2, 10.0, 0.2
 MAX_ROUNDS = 12

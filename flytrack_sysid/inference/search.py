@@ -21,7 +21,7 @@ from flytrack_sysid.inference.score_test import (
 from flytrack_sysid.log import FlightLog
 
 PER_PARAMETER = 4.0  # of chi2: the gain that one more parameter needs to be preferred
-MAX_EFFECTS = 6
+MAX_EFFECTS = 6  # of a model
 # of the best gain: candidates this close to first order are refitted before one is chosen
 CLOSE = 0.6
 MAX_REFITTED = 4
