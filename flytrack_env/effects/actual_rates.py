@@ -37,5 +37,5 @@ ACTUAL_RATES = Effect(
     r"\left( e_i u_i^4 + 1 - e_i \right) \right)",
     source="applyActualRates in Betaflight 4.6, src/main/fc/rc.c, over the rate at full stick",
     hooks={"command": on_rate_sticks(_curve)},
-    search=Search(shapes=ActualRates._fields[3:], is_setting=True),
+    search=Search(shapes=ActualRates._fields[3:], follows_sticks=True, is_setting=True),
 )

@@ -263,6 +263,7 @@ class Search:
             all parameters are tried together, then the second ones.
         groups: parameters that are looked for together; all of them if empty.
         shapes: parameters that change nothing while the others are neutral.
+        follows_sticks: a law of the rate sticks without memory, neutral while they are centred.
         is_setting: comes with the settings of a craft, so that a model has it from the start or not
             at all; fits free only the parameters in ``fitted``.
         fitted: parameters that a fit of the craft frees.
@@ -274,6 +275,7 @@ class Search:
     probes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     groups: tuple[tuple[str, ...], ...] = ()
     shapes: tuple[str, ...] = ()
+    follows_sticks: bool = False
     is_setting: bool = False
     fitted: tuple[str, ...] = ()
     base_causes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)

@@ -34,5 +34,5 @@ BETAFLIGHT_RATES = Effect(
     r"\frac{1 - s_i}{1 - s_i |u_i|}",
     source="applyBetaflightRates in Betaflight 4.6, src/main/fc/rc.c, over the rate at full stick",
     hooks={"command": on_rate_sticks(_curve)},
-    search=Search(is_setting=True),
+    search=Search(follows_sticks=True, is_setting=True),
 )

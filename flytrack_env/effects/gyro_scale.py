@@ -23,5 +23,5 @@ GYRO_SCALE = Effect(
     r"\operatorname{diag}(x, y, z)\, \boldsymbol{\omega}",
     source="assumption: linear up to the fastest turn, no leak between the axes",
     hooks={"gyro": scaled},
-    search=Search(needs=("w",)),
+    search=Search(follows_sticks=True, needs=("w",)),
 )

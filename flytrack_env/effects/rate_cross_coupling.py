@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, RatesContext
+from flytrack_env.effects.base import Effect, Range, RatesContext, Search
 from flytrack_env.quaternion import Scalar, Vec3
 
 
@@ -27,4 +27,5 @@ RATE_CROSS_COUPLING = Effect(
     r"+ \text{from pitch} \cdot \omega_y",
     source="assumption: in proportion, and into yaw only, the axis with the least authority",
     hooks={"rates": _rates},
+    search=Search(follows_sticks=True),
 )

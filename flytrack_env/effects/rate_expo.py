@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, on_rate_sticks
+from flytrack_env.effects.base import Effect, Range, Search, on_rate_sticks
 from flytrack_env.quaternion import Scalar
 
 
@@ -27,4 +27,5 @@ RATE_EXPO = Effect(
     source='the "expo" of radio transmitters, and of KISS and RaceFlight rates in Betaflight '
     "(src/main/fc/rc.c): the curve makes the setpoint of the rate loop, before any lag",
     hooks={"command": on_rate_sticks(_curve)},
+    search=Search(follows_sticks=True),
 )

@@ -55,5 +55,7 @@ RATE_SATURATION = Effect(
     "that the stick's curve makes; "
     "assumption: gradual limits give full stick as much as the corner does",
     hooks={"command": _command},
-    search=Search(shapes=("softness",), probes={axis: (0.03, 0.1, 0.3) for axis in AXES}),
+    search=Search(
+        follows_sticks=True, shapes=("softness",), probes={axis: (0.03, 0.1, 0.3) for axis in AXES}
+    ),
 )

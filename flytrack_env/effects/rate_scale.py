@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from flytrack_env.effects.base import Effect, Range, scaled
+from flytrack_env.effects.base import Effect, Range, Search, scaled
 from flytrack_env.quaternion import Scalar
 
 
@@ -23,4 +23,5 @@ RATE_SCALE = Effect(
     r"\operatorname{diag}(\text{roll}, \text{pitch}, \text{yaw})\, \boldsymbol{\omega}",
     source="assumption: the stick's curve stays linear",
     hooks={"rates": scaled},
+    search=Search(follows_sticks=True),
 )

@@ -15,7 +15,9 @@ from flytrack_env.effects import BY_NAME
 from flytrack_sysid.diagnosis import model_selection
 from flytrack_sysid.diagnosis import unexplained as unknown
 from flytrack_sysid.diagnosis.result import Unexplained
+from flytrack_sysid.inference.chunks import AXES
 from flytrack_sysid.inference.problem import Problem, split_blocks
+from flytrack_sysid.inference.record import Record
 from flytrack_sysid.inference.score_test import ALL_BASE_CAUSES, change_threshold, threshold
 from flytrack_sysid.inference.search import FittedModel, SearchState
 
@@ -25,6 +27,9 @@ from flytrack_sysid.inference.search import FittedModel, SearchState
 HELD_OUT_SIGMAS, HELD_OUT_SHARE = 4.0, 0.35
 HELD_OUT_SHOWN = 20.0  # of chi2: held-out rows with a lower expected gain contradict nothing
 LOSS_SIGMAS = 2.5  # instead of both, where held-out rows are likelier without the cause
+# Commands are at rest if, for this long, they changed by no more than this share of the largest
+# stick.
+REST_S, REST_SHARE = 0.1, 0.05
 # A choice among many effects can fit the noise of one log. So an effect that gains less than this
 # many thresholds has to gain on held-out rows, too, if at least this chi2 is expected there.
 BARELY, BARELY_SHOWN = 2.0, 1.0
@@ -237,6 +242,57 @@ def contradicted_on_held_out(selection: Selection, test: Problem) -> list[str]:
     return [effect for effect, ablation in selection.ablations.items() if is_rejected(ablation)]
 
 
+def rests(record: Record) -> np.ndarray:
+    """Return where the rate commands have rested for ``REST_S``, (rows, chunks) bool.
+
+    Args:
+        record: in chunks.
+    """
+    sticks = record.command[..., :3]
+    rows = max(round(REST_S / float(np.median(record.step_s))), 1)
+    padded = np.pad(sticks, ((rows, 0), (0, 0), (0, 0)), mode="edge")
+    moved = np.ptp(np.lib.stride_tricks.sliding_window_view(padded, rows + 1, axis=0), axis=-1)
+    return np.asarray(moved.max(axis=-1) <= REST_SHARE * np.abs(sticks).max(axis=-1))
+
+
+def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
+    """Reject laws of the sticks that do not hold while these rest, each or all together.
+
+    A law that holds in transients only stands for dynamics that are not in the list of effects. For
+    example, feedforward turns faster than commanded on the way to full stick, as a scale and a
+    saturation would, but not while the stick stays there. Where turns are left unexplained, laws
+    that this log never shows at rest are rejected, too.
+    """
+    state, model = selection.state, selection.model
+    laws = [name for name in selection.ablations if BY_NAME[name].search.follows_sticks]
+    if state.problem.counts[..., AXES[0], 1].any():  # attitude tells a gyro from any rate loop
+        laws = [name for name in laws if "gyro" not in BY_NAME[name].hooks]
+    if not laws:
+        return []
+    at_rest = rests(state.problem.chunks.record)
+
+    def gain_at_rest(without: np.ndarray) -> tuple[float, float]:
+        white = state.problem.whitened_residuals(without, model.vector)
+        less, full = white[:, at_rest][..., AXES[0], :]
+        return float(np.sum(less**2) - np.sum(full**2)), float(np.sum((less - full) ** 2))
+
+    ablations = [selection.ablations[name] for name in laws]
+    contradicted = [
+        is_contradicted(*gain_at_rest(ablation.without.vector), ablation.inflation)
+        for ablation in ablations
+    ]
+    if any(contradicted):
+        return [name for name, is_false in zip(laws, contradicted, strict=True) if is_false]
+    without = ablations[0].without
+    for name in laws[1:]:  # a scale needs the saturation that undoes it, and vice versa
+        without = model_selection.without_effect(state, without, name)
+    gain, expected = gain_at_rest(without.vector)
+    inflation = max(ablation.inflation for ablation in ablations)
+    are_turns_unexplained = any(name.startswith("rate:") for name in selection.unexplained.shares)
+    is_unseen = expected < HELD_OUT_SHOWN * inflation and are_turns_unexplained
+    return laws if is_unseen or is_contradicted(gain, expected, inflation) else []
+
+
 def is_force_law(effect: str) -> bool:
     """Return whether an effect is a law of a force, which may have the wrong form.
 
@@ -267,6 +323,7 @@ def seen_once(selection: Selection, test: Problem) -> list[str]:
 VETOES: tuple[Veto, ...] = (
     stands_in_for_unknown,
     contradicted_on_held_out,
+    not_seen_at_rest,
     seen_once,
 )
 CONTRADICTED, EXPLAINED_BY_CHANGE = contradicted_on_held_out.__name__, "explained_by_change"
@@ -276,5 +333,9 @@ CONTRADICTED, EXPLAINED_BY_CHANGE = contradicted_on_held_out.__name__, "explaine
 REASONS = {
     EXPLAINED_BY_CHANGE: "held-out rows contradict it, and a change within the log explains more",
     "stands_in_for_unknown": "what remains unexplained could pass for it",
+    "not_seen_at_rest": (
+        "dynamics of the rate loop that no list has would look the same while sticks move; fly "
+        "stick_amplitudes, and hold each stick for a second"
+    ),
     "seen_once": "it gains barely enough where it was fitted, and nothing on held-out rows",
 }

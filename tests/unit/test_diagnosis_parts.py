@@ -1,6 +1,7 @@
 """Parts of the diagnosis: its noise filter, chunks, messages, and logs that say too little."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -14,6 +15,7 @@ from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, vetoes
 from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
 from flytrack_sysid.diagnosis.flight_fit import Fit
 from flytrack_sysid.diagnosis.learned import improves_flights
+from flytrack_sysid.diagnosis.model_selection import Ablation
 from flytrack_sysid.diagnosis.onset import windowed
 from flytrack_sysid.diagnosis.refinement import Refined
 from flytrack_sysid.diagnosis.report import describe_verdict
@@ -351,6 +353,19 @@ def test_a_cause_lists_all_that_was_fitted_and_goes_where_flights_show_none_of_i
     late[indices[1]] = 0.039
     (found,) = with_refined_values([cause], refined, late)
     assert list(found.parameters) == list(names)
+
+
+@pytest.mark.parametrize(("effect", "is_law"), [("rate_scale", True), ("command_delay", False)])
+def test_a_law_without_memory_has_to_hold_while_commands_rest(state, effect, is_law):
+    """Rows at rest contradict a rate scale that the flight lacks, not a true one or a delay."""
+    problem = state.problem
+    vector = problem.start.copy()
+    field, size = {"rate_scale": ("roll", 0.3), "command_delay": ("delay_s", 0.02)}[effect]
+    vector[problem.names.index(f"{effect}.{field}")] += size
+    for less, full, is_false in ((problem.start, vector, True), (vector, problem.start, False)):
+        own = Ablation(1e4, 1.0, 1, {}, {}, SimpleNamespace(vector=less))
+        found = Selection(state, None, SimpleNamespace(vector=full), {effect: own})
+        assert vetoes.not_seen_at_rest(found, None) == ([effect] if is_false and is_law else [])
 
 
 def test_a_long_log_is_thinned_with_a_warning_that_counts_judged_rows(state, monkeypatch):
