@@ -1,7 +1,5 @@
 """Models driven by motors, of the crafts in ``benchmarks.motor_craft``, which share no code."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from benchmarks.motor_craft import Crafts
@@ -39,7 +37,7 @@ def crafts(count=1, **changes):
 def model_of(crafts):
     """Return the model of the first of these crafts, with all that its nominal one lacks."""
     mass, inertia, full = crafts.mass[0], crafts.inertia[0], crafts.thrust[0]
-    model = nominal_model(replace(crafts, thrust=np.full((1, 4), full.max())))
+    model = nominal_model(crafts._replace(thrust=np.full((1, 4), full.max())))
     radii = np.sqrt(np.diag(inertia) / mass)
     products = -inertia / mass / np.outer(radii, radii)
     damping = crafts.damping[0] / np.diag(inertia)
