@@ -12,6 +12,7 @@ from benchmarks.motor_craft import Pilot, State, advance, fly, hovering, speed_f
 from flytrack_env import effects, nominal_parameters
 from flytrack_env.dynamics import move
 from flytrack_env.effects.motors import Spinning
+from flytrack_env.motors import NAMES
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone, pack, unpack_action
 from flytrack_sysid.inference.score_test import candidates_for, searched_in
@@ -111,6 +112,33 @@ def test_a_hover_with_delayed_commands_stays_level():
     assert stick_past == (turning.applied,) * 4
 
 
+@pytest.mark.parametrize("motor", range(4), ids=NAMES)
+def test_each_motor_turns_the_craft_as_it_should(motor):
+    commands = held(*[HOVER] * 4)
+    commands[:, motor] += 0.2
+    truth, flown = both(BALANCED, hovering(BALANCED), commands)
+    np.testing.assert_array_equal(
+        np.sign(flown[-1, 10:]),
+        [(-1, -1, 1, 1)[motor], (1, -1, 1, -1)[motor], (1, -1, -1, 1)[motor]],
+    )
+    np.testing.assert_allclose(flown, truth, atol=4e-4)
+
+
+def test_rotors_push_yaw_before_their_torque_and_precess():
+    spun = crafts(momentum=0.05, yaw_arm=0.0)
+    commands = held(HOVER + 0.2, HOVER - 0.2, HOVER - 0.2, HOVER + 0.2)
+    truth, flown = both(spun, hovering(spun), commands)
+    assert flown[-1, 12] > 0.1  # reaction of rotors that spin up, with no torque of the air at all
+    np.testing.assert_allclose(flown, truth, atol=2e-4)
+    rolling = hovering(spun)._replace(
+        rates=np.array([[5.0, 0.0, 0.0]]), speeds=np.array([[HOVER, 0.0, 0.0, HOVER]])
+    )
+    truth, flown = both(spun, rolling, held(HOVER, 0.0, 0.0, HOVER))
+    np.testing.assert_allclose(flown, truth, atol=2e-4)
+    without = both(crafts(momentum=0.0, yaw_arm=0.0), rolling, held(HOVER, 0.0, 0.0, HOVER))[1]
+    assert np.abs(flown - without)[-1, 11] > 0.1  # net momentum turns roll into pitch
+
+
 def test_a_body_without_torque_keeps_momentum_and_energy():
     free = crafts(inertia=TILTED, thrust=[1e-9] * 4, momentum=0.0)
     start = hovering(free)._replace(rates=np.array([[4.0, 3.0, 2.0]]), speeds=np.zeros((1, 4)))
@@ -122,6 +150,18 @@ def test_a_body_without_torque_keeps_momentum_and_energy():
     momentum = turn.apply(flown[:, 10:] @ TILTED)
     np.testing.assert_allclose(momentum, np.tile(TILTED @ [4.0, 3.0, 2.0], (200, 1)), atol=2e-4)
     np.testing.assert_allclose(flown[-1, 10:], truth[-1, 10:], atol=2e-3)
+
+
+def test_motors_are_slower_down_than_up():
+    model = model_of(crafts(up_s=0.02, down_s=0.08))
+    start = begun(model, hovering(crafts()))
+    up, down = (
+        _flown(model, start, 2.0 * held(*[end] * 4) - 1.0)[-1, 19]
+        for end in (HOVER + 0.2, HOVER - 0.2)
+    )
+    base = 2.0 * HOVER - 1.0
+    np.testing.assert_allclose(up - base, 0.4 * (1.0 - np.exp(-0.05 / 0.02)), rtol=1e-6)
+    np.testing.assert_allclose(down - base, -0.4 * (1.0 - np.exp(-0.05 / 0.08)), rtol=1e-6)
 
 
 def test_a_flown_minute_part_is_that_of_the_independent_craft_to_second_order():
