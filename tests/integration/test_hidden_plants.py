@@ -1,28 +1,38 @@
 """Plants with hidden effects: equations, motion, flights and logs. A diagnosis is graded on them.
 
-The package's continuous motion, which shares no code with them, converges to their fine motion
-(tests/unit/test_motion.py); the plants that a policy races on, in JAX, fly as those in plain
-floats.
+Fine motion is that of SciPy's integrator on the same differential equations, and the package's
+continuous motion converges to it (tests/unit/test_motion.py); the plants that a policy races on, in
+JAX, fly as those in plain floats.
 """
 
 from dataclasses import replace
+from itertools import pairwise
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
 from benchmarks import hidden
 from benchmarks.loop.plants import EFFECTS, draw_plant_with_law
-from flytrack_bench.hidden import HiddenDrone, HiddenPlant, Start
+from flytrack_bench.hidden import HiddenDrone, HiddenPlant, Start, drone
 from flytrack_bench.hidden.laws import STATELESS_KINDS
 from flytrack_bench.hidden.noise import COLOURS, LOST_ROWS, STD
 from flytrack_env import nominal_parameters
 from tests.support.hidden_flights import LOW_START, flown_in_floats, random_sticks, state_of
 from tests.support.simulated_flights import flown_by
 from tests.support.slow import slow_but
+from tests.support.tables import table
 
 START = Start((1.0, -2.0, 6.0), 0.7, 23.8, -0.2)
 LOOP_STEPS = 120
+STEP_S, STEPS = 0.01, 100
+MOVING_EFFECTS = table("moving_effects")
+DELAY_S = MOVING_EFFECTS["command_delay"]["delay_s"]
+LATENCY_S, MOCAP_S = MOVING_EFFECTS["imu_latency"]["latency_s"], 0.0246
+# A thousandth of the sensors' noise or less (slopes: of 140 rad/s^2, times an arm of 0.06 m).
+FINE_ERRORS = {"p": 1e-4, "v": 1e-4, "q": 5e-5, "f": 1e-3, "w": 1e-3, "slope": 0.1}
 MINUTE_S = 60.0
 ARM = {"x": 0.03, "y": -0.02, "z": 0.01}
 
@@ -126,6 +136,78 @@ def test_the_accelerometer_feels_gusts():
         # Thrust has no part in body x and y.
         assert np.std(seen["f"][:, :2]) == pytest.approx(std, rel=0.15)
         assert 0.04 < np.std(seen["w"] - calm["w"]) < 0.06
+
+
+def derivative(own, time_s, x, stick):
+    """Return dx/dt of position, velocity, attitude, lagged sticks, rates, slopes; and the force."""
+    _, vel_w, quat, applied, rates, slopes = np.split(x, [3, 6, 10, 14, 17])
+    change = (stick - applied) / np.array(own.tau)
+    volt = START.open_v - own.drain * time_s / 60.0 - 0.8 * (0.5 + 0.5 * applied[3]) ** 2
+    u = applied[3]
+    thrust = np.dot(own.coeffs, [1.0, u, u * u, u**3, volt, u * volt]) / own.mass
+    asked = np.radians(own.max_rate) * applied[:3]
+    asked += np.array([0.01 * thrust, -0.005 * thrust, 0.05 * change[3]])
+    attitude = Rotation.from_quat(quat, scalar_first=True)
+    air_b = attitude.inv().apply(vel_w)
+    force_b = (
+        [0.0, 0.0, thrust]
+        - np.array([0.3, 0.2, 0.1]) * air_b
+        - 0.02 * thrust * air_b * [1.0, 1.0, 0.0]
+    )
+    w, axis = quat[0], quat[1:]
+    spin = 0.5 * np.concatenate([[-axis @ rates], w * rates + np.cross(axis, rates)])
+    damping, lag_s = np.array([0.6, 0.8, 0.5]), np.array([0.02, 0.025, 0.015])
+    bend = (2.0 * damping / lag_s) ** 2 * (asked - rates - lag_s * slopes)
+    acc_w = attitude.apply(force_b) - [0.0, 0.0, own.gravity]
+    return np.concatenate([vel_w, acc_w, spin, change, slopes, bend]), force_b
+
+
+def integrated(own):
+    """Return the same from DOP853, between the times of arriving commands and sensor readings."""
+    sticks, rows = random_sticks(STEPS), np.arange(STEPS + 1) * STEP_S
+    felt_s, tracked_s = rows[1:] - LATENCY_S % STEP_S, rows[1:] - MOCAP_S % STEP_S
+    times = np.unique(np.round([0.0, *rows, *(rows + DELAY_S), *felt_s, *tracked_s], 9))
+    times = times[times <= rows[-1] + 1e-9]
+    quat = [np.cos(0.35), 0.0, 0.0, np.sin(0.35)]
+    x = np.concatenate(
+        [START.pos_w, np.zeros(3), quat, np.zeros(3), [START.thrust_stick], np.zeros(6)]
+    )
+    found: dict[str, list] = {name: [] for name in FINE_ERRORS}
+    for begin, end in pairwise(times):
+        number = int(np.floor((0.5 * (begin + end) - DELAY_S) / STEP_S))
+        acting = sticks[max(number, 0)]
+
+        def slope(time_s, x, acting=acting):
+            return derivative(own, time_s, x, acting)[0]
+
+        x = solve_ivp(slope, (begin, end), x, "DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
+        if np.abs(felt_s - end).min() < 1e-8:
+            for name, value in zip(
+                "fw", (derivative(own, end, x, acting)[1], x[14:17]), strict=True
+            ):
+                found[name].append(value)
+            found["slope"].append(x[17:])
+        if np.abs(tracked_s - end).min() < 1e-8:
+            for name, value in zip("pvq", np.split(x[:10], [3, 6]), strict=True):
+                found[name].append(value)
+    return {name: np.array(values) for name, values in found.items()}
+
+
+@pytest.mark.slow
+def test_fine_motion_obeys_the_differential_equations(monkeypatch):
+    own = replace(base(**MOVING_EFFECTS), motion="fine", mocap_late_s=MOCAP_S)
+    exact = integrated(own)
+
+    def errors():
+        seen = open_loop(own, STEPS)
+        assert np.abs(np.linalg.norm(seen["q"], axis=1) - 1.0).max() < 1e-12
+        return {name: float(np.abs(seen[name] - values).max()) for name, values in exact.items()}
+
+    found = errors()
+    assert all(found[name] < bound for name, bound in FINE_ERRORS.items()), found
+    monkeypatch.setattr(drone, "MAX_SUBSTEP_S", 0.5 * drone.MAX_SUBSTEP_S)
+    halved = errors()
+    assert all(found[name] > 3.0 * halved[name] for name in exact), (found, halved)
 
 
 @pytest.mark.parametrize("motion", hidden.MOTIONS)
