@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.seams.craft import GRAVITY
 from benchmarks.seams.faults import FAULTS, Change, draw_pair, inject, is_shown
 from benchmarks.seams.flight import KINDS, Flight, make_flight
 from benchmarks.seams.simulators import SIMULATORS, Simulator
@@ -19,6 +20,24 @@ def flight() -> Flight:
 
 def attitude(log: FlightLog) -> Rotation:
     return Rotation.from_quat(log["q"][:, [1, 2, 3, 0]])
+
+
+def means(values: np.ndarray) -> np.ndarray:
+    return 0.5 * (values[1:] + values[:-1])
+
+
+def test_rates_integrate_to_attitude(flight: Flight) -> None:
+    truth, dt = flight.truth, flight.truth.time[1]
+    q = attitude(truth)
+    steps = (q[:-1].inv() * q[1:]).as_rotvec()
+    assert np.abs(steps - dt * means(truth["w"])).mean() < 1e-4
+
+
+def test_specific_force_integrates_to_velocity(flight: Flight) -> None:
+    truth, dt = flight.truth, flight.truth.time[1]
+    a = attitude(truth).apply(truth["f"]) - [0.0, 0.0, GRAVITY]
+    flown = truth["v"][0] + np.cumsum(dt * means(a), axis=0)
+    assert np.abs(flown - truth["v"][1:]).max() < 0.1
 
 
 def test_sensors_have_noise_of_stated_size(flight: Flight) -> None:
