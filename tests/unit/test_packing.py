@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from flytrack_env.gymnasium_adapter.packing import HOST_DTYPES, WORD, from_words, pack
+from flytrack_env.gymnasium_adapter.packing import HOST_DTYPES, WORD, from_words, make_reader, pack
 
 QUIET_NAN = np.uint32(0x7FC01234)  # with a payload
 BATCH = {
@@ -36,3 +36,21 @@ def test_every_bit_comes_back(batch):
         expected = batch[name].astype(HOST_DTYPES[batch[name].dtype.kind])
         assert leaf.flags.writeable and leaf.dtype == expected.dtype
         assert_array_equal(leaf, expected)
+
+
+@pytest.mark.parametrize("batch", [BATCH, WIDE], ids=["32 bits", "64 bits"])
+@pytest.mark.parametrize("index", range(3))
+def test_scalars_are_read_as_pythons_own(batch, index):
+    scalars = {name: leaf[index : index + 1] for name, leaf in batch.items() if leaf.ndim == 1}
+    with jax.enable_x64(batch is WIDE):
+        packed = jax.jit(pack)(scalars)
+    column = np.concatenate([np.zeros(5, WORD), np.asarray(packed.words)[:, 0]])
+    numbers = make_reader(packed.layout, 5)(column)
+    expected = [scalars[name].item() for name in sorted(scalars)]
+    assert list(numbers) == expected
+    assert list(map(type, numbers)) == list(map(type, expected))
+
+
+def test_only_scalars_are_read():
+    with pytest.raises(ValueError, match=r"layout: found leaves of shapes \[\(\), .*\(2,\)"):
+        make_reader(pack(BATCH).layout, 0)
