@@ -6,11 +6,14 @@ import sys
 import numpy as np
 import pytest
 
+from flytrack_env.sandbox import ResourceLimits
 from flytrack_sysid import LogError, import_log
+from flytrack_sysid.importing import decoding
 from tests.support.foreign_logs import (
     PX4_PARAMETERS,
     flying,
     ulog,
+    ulog_message,
     ulog_topics,
 )
 from tests.support.real_logs import import_shared
@@ -114,6 +117,17 @@ def test_a_missing_package_is_named(topics, read, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyulog", None)
     with pytest.raises(LogError, match=r"a\.ulg: ulog logs need pyulog.*flytrack\[logs\]"):
         read(topics)
+
+
+@pytest.mark.slow
+def test_topics_of_arrays_of_arrays_are_refused_in_time(read, monkeypatch):
+    formats = ("vehicle_attitude:b[60000] q;", "b:c[60000] q;", "c:float[60000] q;")
+    definitions = b"".join(ulog_message("F", text.encode()) for text in formats)
+    subscription = ulog_message("A", b"\x00\x00\x00vehicle_attitude")
+    limits = ResourceLimits(cpu_s=2, memory_bytes=2**27)
+    monkeypatch.setattr(decoding, "limits_of", lambda num_bytes: limits)
+    with pytest.raises(LogError, match=r"a\.ulg: cannot be decoded: (took|needs) more than"):
+        read(b"ULog\x01\x12\x35" + bytes(9) + definitions + subscription)
 
 
 def test_damage_is_noted_and_the_rest_is_read(topics, read, capsys):
