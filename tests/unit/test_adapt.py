@@ -136,6 +136,10 @@ BAD_LOGS = {
         lambda log: with_channels(log, u=log["u"] * [0.05, 0.05, 1.0, 1.0]),
         "u_roll, u_pitch: found at most 0.0.* expected 0.1 or more.*hover",
     ),
+    "crashes": (
+        lambda log: replace(log, segment=np.arange(len(log)) // 45),
+        "found .* flights of 0.45 s at most, 0 s in all .* expected 3 s or more: crashes",
+    ),
     "another craft": (
         lambda log: with_channels(log, v_bat=log["v_bat"] * 0.6),
         "another craft than the policy's: .*; the battery has 13.* V in this log, the model's 22",
