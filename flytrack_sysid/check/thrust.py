@@ -20,7 +20,6 @@ MIN_SPREAD = 0.5  # m/s^2, rms of the force about its mean: less is drag and noi
 PWM = (900.0, 2200.0)  # us, all that flight controllers use
 # Commands span less in races at full thrust, 0.12 in one that passed for 0..1: no curve shows.
 MIN_SPAN = 0.15
-MIN_TORQUE = 0.3  # correlation of the rotation with a motor's torque
 MOTOR_LAG_S = 0.03
 UP = np.array([0.0, 0.0, 1.0])
 # Signs of the moments of motors 1 to 4 of Betaflight's "Quad X". Yaw is not compared: propellers
