@@ -9,6 +9,7 @@ writes the page and the chart beside such records.
 """
 
 import os
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
@@ -47,8 +48,11 @@ def main(
 
     plants: with hidden effects, beside the shipped one. laws: plants with a law outside the list,
     instead. seed: of plants, trainings, logs and evaluations. steps: of every training. out: folder
-    of all runs. page: by default loop.md in it. redraw: records to write the page of, instead.
+    of all runs. page: by default loop.md in it. redraw: records to write the page of, instead,
+    beside them.
     """
+    if redraw is not None and page is not None:
+        sys.exit("--page: found together with --redraw, which writes the page beside the records")
     if redraw is not None:
         about, results = read_records(redraw)
         path = redraw.with_suffix(".md")

@@ -96,9 +96,8 @@ def false_names(results: list[dict[str, Any]]) -> str:
     """Return the effects that were named and are not in the plant, by plant."""
     by_plant = []
     for result in results:
-        names = [
-            name for name in result["causes"] if name in BY_NAME and name not in result["hidden"]
-        ]
+        true_names = re.findall(r"\w+", _names(result["hidden"]))
+        names = [name for name in result["causes"] if name in BY_NAME and name not in true_names]
         if names and result["job"] != "shipped":  # of which no truth is published
             by_plant.append(f"{result['job']}: {', '.join(names)}")
     return "; ".join(by_plant) or "none"

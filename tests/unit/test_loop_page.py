@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from benchmarks.loop.page import read_records, write_page, write_records
+from benchmarks.loop.__main__ import main
+from benchmarks.loop.page import false_names, read_records, write_page, write_records
 from benchmarks.report import RESULTS
 
 
@@ -23,3 +24,15 @@ def test_records_come_back(tmp_path):
     assert read_records(tmp_path / "loop.jsonl") == (about, results)
     with (tmp_path / "loop.jsonl").open() as lines:
         assert all(json.loads(line) for line in lines)
+
+
+def test_a_part_of_a_true_name_is_a_false_name():
+    result = {"job": "1", "hidden": "windmill(gain 0.2) + rate_scale(roll 1.1)"}
+    assert false_names([{**result, "causes": ["wind", "rate_scale", "tau_roll"]}]) == "1: wind"
+    assert false_names([{**result, "causes": ["rate_scale"]}]) == "none"
+
+
+def test_a_page_of_records_is_written_beside_them_only(tmp_path):
+    records = RESULTS / "loop.jsonl"
+    with pytest.raises(SystemExit, match="--page: found together with --redraw"):
+        main(redraw=records, page=tmp_path / "other.md")
