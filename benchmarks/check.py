@@ -228,12 +228,13 @@ def count_outcomes(
 
 
 def split_rows(rows: list[list[Any]]) -> tuple[list[list[Any]], list[str]]:
-    """Return the rows in which a log was not right, and the names of the others.
+    """Return the rows in which a log was not right or no log shows the fault, and the other names.
 
     A row: name, how many logs show the fault, how many of these are right, and the wrong ones.
     """
-    imperfect = [row for row in rows if row[2] < row[1]]
-    return imperfect, [row[0] for row in rows if row[2] == row[1]]
+    is_perfect = [0 < row[1] == row[2] for row in rows]
+    imperfect = [row for row, perfect in zip(rows, is_perfect, strict=True) if not perfect]
+    return imperfect, [row[0] for row, perfect in zip(rows, is_perfect, strict=True) if perfect]
 
 
 def describe(changes: Iterable[Iterable[Any]]) -> str:

@@ -224,6 +224,8 @@ def effect_costs(repeats: int) -> str:
     shown = [row for row in rows if float(row[2]) > SMALL_COST]
     small = [row for row in rows if float(row[2]) <= SMALL_COST]
     table = report.table("figure | target | measured | n | lowest to highest", shown)
+    if not small:
+        return table
     names = ", ".join(str(row[0]) for row in small)
     costs_of_small = report.spread([float(row[2]) for row in small], ".2f")
     return f"{table}\n\nThe medians of the other {len(small)} are {costs_of_small}: {names}."
