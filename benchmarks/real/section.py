@@ -3,6 +3,7 @@
 The section has sentences for pilots, a picture and tables.
 """
 
+import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -38,7 +39,8 @@ SHOWN_HORIZON_S = "0.5"
 SHOWN_MODELS = ("nominal", "refitted_base", "extended", "placebo")
 # They trade off against each other, so that their mean over the log says more.
 THRUST_COEFFICIENTS = ("c0", "c1", "c2", "c3", "c4", "c5")
-UNSHOWN_WARNINGS = ("outliers, beyond", "v_bat is absent", "of ")  # counts; the record has all
+# Counts of rows; the record has all.
+UNSHOWN_WARNING = re.compile(r"outliers, beyond|of \S+ rows a second, one in \d+ was used")
 
 
 def diagnose_log(
@@ -181,7 +183,7 @@ def format_section(measured: Record, picture: str) -> str:
     ]
     small = ", ".join(f"`{cause['effect']}`" for cause in diagnosis["negligible"])
     learned = diagnosis.get("learned")
-    warnings = [text for text in diagnosis["warnings"] if not text.startswith(UNSHOWN_WARNINGS)]
+    warnings = [text for text in diagnosis["warnings"] if not UNSHOWN_WARNING.match(text)]
     cost = f"{measured['cpu_s']:.0f} CPU s, compilation included; commit {measured['commit']}"
     has_flights = diagnosis["prediction"]["errors"]
     # Else the sentence has the error of position.
