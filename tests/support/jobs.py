@@ -1,6 +1,7 @@
 """Jobs that end in other ways, in a module that a worker's process imports quickly."""
 
 import os
+import subprocess
 import time
 
 
@@ -13,3 +14,10 @@ def end_as(kind):
     if kind == "raise":
         raise ValueError("no such thing")
     return kind
+
+
+def start_child(path):
+    """Print, start a process, write its id, and hang."""
+    print("a job may print", flush=True)
+    path.write_text(str(subprocess.Popen(["sleep", "600"]).pid))
+    time.sleep(600)
