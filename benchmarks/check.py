@@ -18,7 +18,16 @@ import numpy as np
 from scipy.stats import beta
 
 from benchmarks.real.crazyflie import DATA
-from benchmarks.report import RESULTS, command, fill_page, lines_of_commit, record_trials, table
+from benchmarks.report import (
+    IN_THIS_PROCESS,
+    RESULTS,
+    JobFlags,
+    command,
+    fill_page,
+    lines_of_commit,
+    record_trials,
+    table,
+)
 from benchmarks.seams.faults import FAULTS, UNITS, Change, Truth, draw_pair, inject, is_shown
 from benchmarks.seams.flight import Flight, make_flight
 from benchmarks.seams.mapped import MAPPING, import_csv, is_equal, write_csv
@@ -323,6 +332,7 @@ def main(
     seed: int = 53,
     model: bool = False,
     page: bool = False,
+    jobs: JobFlags = IN_THIS_PROCESS,
 ) -> None:
     """Check logs and plants.
 
@@ -336,7 +346,10 @@ def main(
         write_page()
         return
     record_trials(
-        LINES, plan_trials(PARTS if part is None else (part,), logs, seed, model), measure
+        LINES,
+        plan_trials(PARTS if part is None else (part,), logs, seed, model),
+        measure,
+        jobs=jobs,
     )
 
 

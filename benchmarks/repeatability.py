@@ -21,7 +21,16 @@ from benchmarks import hidden
 from benchmarks.diagnosis import AMPLITUDES, SECONDS, model_of
 from benchmarks.hidden.oracle import known
 from benchmarks.real.crazyflie import DATA
-from benchmarks.report import RESULTS, command, fill_page, lines_of_commit, record_trials, table
+from benchmarks.report import (
+    IN_THIS_PROCESS,
+    RESULTS,
+    JobFlags,
+    command,
+    fill_page,
+    lines_of_commit,
+    record_trials,
+    table,
+)
 from benchmarks.seams.measured import measured_flights
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
@@ -270,7 +279,7 @@ def write_page() -> None:
     )
 
 
-def main(page: bool = False, plants: int = 10) -> None:
+def main(page: bool = False, plants: int = 10, jobs: JobFlags = IN_THIS_PROCESS) -> None:
     """Diagnose flights.
 
     page: write the page from the lines instead. plants: the number of simulated craft.
@@ -278,7 +287,7 @@ def main(page: bool = False, plants: int = 10) -> None:
     if page:
         write_page()
         return
-    record_trials(LINES, trials(plants), measure)
+    record_trials(LINES, trials(plants), measure, jobs=jobs)
 
 
 if __name__ == "__main__":

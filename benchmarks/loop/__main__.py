@@ -3,34 +3,44 @@
 Closes the loop (``flytrack_loop.close_loop``) on the shipped black box and on plants with hidden
 effects drawn from the seed, or on plants with a law outside the package's list, and trains three
 alternatives with as many steps: on the nominal model, on the refitted base model, and on randomised
-models without any identification. One process per core. Writes a page and a chart; finished jobs
-are not run again.
+models without any identification. One process per core, or tasks of a Ray cluster. Writes a page
+and a chart; finished jobs are not run again.
 """
 
 import os
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
-from multiprocessing import get_context
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from baselines.purejaxrl_ppo import Config
-from benchmarks.loop.jobs import LAW, SHARED, pin, run_job
+from benchmarks.loop.jobs import LAW, SHARED, run_job
 from benchmarks.loop.page import write_page
 from benchmarks.report import command, progress
+from flytrack_env.jobs import run_jobs
+
+LIMIT_S = 86_400.0  # of a job, with its trainings
 
 
-def run_all(plants: list[str], out: Path, steps: int, seed: int) -> list[dict[str, Any]]:
+def run_all(
+    plants: list[str], out: Path, steps: int, seed: int, address: str | None
+) -> list[dict[str, Any]]:
     """Return the results of all plants; the first error of a job ends all of them."""
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
-    context = get_context("spawn")
-    free_cores = context.Queue()
-    for core in cores:
-        free_cores.put(core)
-    run = partial(run_job, out=out.resolve(), steps=steps, seed=seed)
-    with ProcessPoolExecutor(len(cores), context, initializer=pin, initargs=(free_cores,)) as pool:
-        list(progress(pool.map(run, SHARED), "jobs"))  # every plant needs both shared policies
-        return list(progress(pool.map(run, plants), "jobs"))
+    has_affinity = hasattr(os, "sched_getaffinity")
+    workers = len(os.sched_getaffinity(0)) if has_affinity else 1
+
+    def run(names: Iterable[str]) -> dict[str, Any]:
+        jobs = {name: (name, out.resolve(), steps, seed) for name in names}
+        results = {}
+        outcomes = run_jobs(run_job, jobs, LIMIT_S, address, workers)
+        for name, outcome in progress(outcomes, "jobs", len(jobs)):
+            if outcome.error:
+                raise RuntimeError(f"job {name}: {outcome.error}; more in {out / name}")
+            results[name] = outcome.value
+        return results
+
+    run(SHARED)  # every plant needs both shared policies
+    results = run(plants)
+    return [results[name] for name in plants]
 
 
 def main(
@@ -40,15 +50,17 @@ def main(
     steps: int = Config.total_timesteps,
     out: Path = Path("runs/loop"),
     page: Path | None = None,
+    address: str | None = None,
 ) -> None:
     """Run what is missing, print and write the page; exit 1 on a missed target.
 
     plants: with hidden effects, beside the shipped one. laws: plants with a law outside the list,
     instead. seed: of plants, trainings, logs and evaluations. steps: of every training. out: folder
-    of all runs. page: by default loop.md in it.
+    of all runs. page: by default loop.md in it. address: of a Ray cluster, whose nodes see this
+    checkout and the folder of runs under the same paths; by default processes of this machine.
     """
     jobs = [f"{LAW}{number}" for number in range(laws)] or ["shipped", *map(str, range(plants))]
-    if not write_page(page or out / "loop.md", run_all(jobs, out, steps, seed), steps):
+    if not write_page(page or out / "loop.md", run_all(jobs, out, steps, seed, address), steps):
         raise SystemExit(1)
 
 
