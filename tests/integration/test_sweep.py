@@ -1,7 +1,8 @@
-"""Sweeps: which settings are accepted, and a whole sweep on this machine."""
+"""Sweeps: which settings are accepted, and a sweep on this machine that is killed."""
 
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -68,16 +69,29 @@ def test_what_no_trial_could_use_is_refused_before_any(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # deprecations in MLflow's own dependencies
-def test_a_sweep_here(tmp_path):
+def test_a_sweep_that_was_killed_goes_on(tmp_path):
     from mlflow import MlflowClient
 
     out = tmp_path / "sweep"
     command = [sys.executable, "-m", "flytrack", "sweep", str(written(tmp_path, GRID))]
     command += ["--trials", "1", "--out", str(out)]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as killed:
+        deadline_s = time.monotonic() + 600.0
+        while not list(out.glob("trial*/step_*")):
+            assert killed.poll() is None and time.monotonic() < deadline_s
+            time.sleep(0.2)
+        killed.kill()
+    stored = {path: path.stat().st_mtime_ns for path in out.glob("trial*/step_*")}
+    refused = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert "found a sweep: --resume goes on with it" in refused.stderr
+    command += ["--resume"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stderr
     assert "best: " in done.stdout
+    assert {path: path.stat().st_mtime_ns for path in stored} == stored, "a trial began anew"
+    rows = (out / "sweep.csv").read_text().splitlines()
     folders = sorted(out.glob("trial*"))
+    assert len(rows) == 1 + len(folders) == 3
     paths = [next(iter(sorted(folder.glob("step_0*")))) for folder in folders]
     assert sorted(load_checkpoint(path).config.learning_rate for path in paths) == [1e-3, 3e-3]
     finals = [folder / "final.safetensors" for folder in folders]
@@ -89,5 +103,3 @@ def test_a_sweep_here(tmp_path):
     assert len(runs) == 3
     assert sorted(run.data.params["config.learning_rate"] for run in trials) == ["0.001", "0.003"]
     assert {run.info.status for run in runs} <= {"FINISHED", "KILLED"}
-    refused = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    assert "found a sweep: --resume goes on with it" in refused.stderr
