@@ -69,7 +69,6 @@ CHANGES = (1e-7, 2e-7, -1e-7, -2e-7)  # one or two of a float32's last bits
 # 160 gradient steps in 20 updates.
 FEW = Config(total_timesteps=COMPARED * 64 * 32, num_envs=64, num_steps=32, num_minibatches=8)
 CLUSTER_CRAFT = 4
-START_WAIT = "RAY_raylet_start_wait_time_s"  # of Ray, whose 30 s are too few on a busy machine
 TRIALS, TRIAL_UPDATES = 12, 64  # of a sweep; a core's work of seconds, beside a minute to begin
 
 
@@ -265,7 +264,6 @@ def losing_a_node(has_begun: Callable[[], bool]) -> Iterator[list[float]]:
 
     Yields a list, to which the time of the loss is added (s, of ``time.perf_counter``).
     """
-    os.environ.setdefault(START_WAIT, "300")
     import ray
     from ray.cluster_utils import Cluster
 

@@ -1,7 +1,6 @@
 """Commands and benchmarks on a Ray cluster of two nodes, simulated on this machine."""
 
 import json
-import os
 
 import pytest
 
@@ -16,13 +15,9 @@ from tests.support.small_suite import CENTRED, write_small_suite
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default")]
 
 
-START_WAIT = "RAY_raylet_start_wait_time_s"  # whose 30 s are too few on a busy machine
-
-
 @pytest.fixture(scope="module")
 def address():
     """The address of a cluster of two nodes of a core each."""
-    os.environ[START_WAIT] = "300"
     from ray.cluster_utils import Cluster
 
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
