@@ -77,11 +77,12 @@ def test_a_sweep_that_was_killed_goes_on(tmp_path):
     command += ["--trials", "1", "--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as killed:
         deadline_s = time.monotonic() + 600.0
-        while not list(out.glob("trial*/step_*")):
+        while not list(out.glob("trial*/step_[1-9]*")):
             assert killed.poll() is None and time.monotonic() < deadline_s
             time.sleep(0.2)
         killed.kill()
-    stored = {path: path.stat().st_mtime_ns for path in out.glob("trial*/step_*")}
+    starts = [path.with_name("step_0.safetensors") for path in out.glob("trial*/step_[1-9]*")]
+    stored = {path: path.stat().st_mtime_ns for path in starts}
     refused = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert "found a sweep: --resume goes on with it" in refused.stderr
     command += ["--resume"]
