@@ -1,5 +1,6 @@
 """Sweeps: which settings are accepted, and a sweep on this machine that is killed."""
 
+import csv
 import subprocess
 import sys
 import time
@@ -90,13 +91,11 @@ def test_a_sweep_that_was_killed_goes_on(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "best: " in done.stdout
     assert {path: path.stat().st_mtime_ns for path in stored} == stored, "a trial began anew"
-    rows = (out / "sweep.csv").read_text().splitlines()
+    rows = list(csv.DictReader((out / "sweep.csv").read_text().splitlines()))
     folders = sorted(out.glob("trial*"))
-    assert len(rows) == 1 + len(folders) == 3
+    assert [row["done"] for row in rows] == ["True", "True"] and len(folders) == 2
     paths = [next(iter(sorted(folder.glob("step_0*")))) for folder in folders]
     assert sorted(load_checkpoint(path).config.learning_rate for path in paths) == [1e-3, 3e-3]
-    finals = [folder / "final.safetensors" for folder in folders]
-    assert any(path.exists() and load_checkpoint(path).steps == 64 * BATCH for path in finals)
     client = MlflowClient(tracking_uri=f"sqlite:///{out / 'mlflow.db'}")
     runs = client.search_runs([client.get_experiment_by_name("flytrack").experiment_id])
     (sweep,) = [run for run in runs if "mlflow.parentRunId" not in run.data.tags]
