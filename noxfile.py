@@ -193,7 +193,7 @@ def versions(session: nox.Session, resolution: str) -> None:
     """Run the unit tests with the newest versions, and on the oldest Python with the oldest."""
     if resolution == "lowest-direct" and session.python != "3.11":
         session.skip("the oldest versions are tried on the oldest Python alone")
-    session.install(".[train,sysid,viz]", *TEST_TOOLS, "--resolution", resolution)
+    session.install(".[train,sysid,viz,cluster]", *TEST_TOOLS, "--resolution", resolution)
     lenient = ("-W", "default::DeprecationWarning") if resolution == "lowest-direct" else ()
     session.run(
         "python", "-m", "pytest", "-q", "-m", "not slow", *lenient, "tests/unit", env=HEADLESS

@@ -77,6 +77,8 @@ class Rule(NamedTuple):
 RULES = (
     *(Rule(vetoes, rule.__name__, empty) for rule in vetoes.VETOES),
     Rule(model_selection, "with_lags_anew", empty),
+    Rule(model_selection, "with_moving_air", empty),
+    Rule(onset, "gain_of_other_dependence", lambda *_: 0.0),
     Rule(onset, "with_changes", lambda selection, *_: selection),
     Rule(summary, "causes_at_end", lambda *_: ()),
     Rule(summary, "_is_remainder", lambda *_: False),

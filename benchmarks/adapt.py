@@ -268,7 +268,12 @@ def measure_unchanged(trial: Trial) -> Line:
     return {**about(adapted), "cpu_s": round(time.process_time() - begun_s, 1)}
 
 
-def main(seconds: float = 10.0, seed: int = 0, page: bool = False) -> None:
+def main(
+    seconds: float = 10.0,
+    seed: int = 0,
+    page: bool = False,
+    jobs: report.JobFlags = report.IN_THIS_PROCESS,
+) -> None:
     """Run the trials that are missing, or write the page of those that are there.
 
     seconds: of flight in a log. seed: of flights, draws and starts. page: write the page only.
@@ -276,7 +281,7 @@ def main(seconds: float = 10.0, seed: int = 0, page: bool = False) -> None:
     if page:
         write_page(report.lines_of_commit(LINES))
     else:
-        report.record_trials(LINES, list_trials(seconds, seed), measure_trial, 1)
+        report.record_trials(LINES, list_trials(seconds, seed), measure_trial, 1, jobs)
 
 
 if __name__ == "__main__":

@@ -207,6 +207,7 @@ def main(
     listed: int = 10,
     kinds: tuple[str, ...] = KINDS,
     page: bool = False,
+    jobs: report.JobFlags = report.IN_THIS_PROCESS,
 ) -> None:
     """Diagnose the plants, or write the page.
 
@@ -224,7 +225,7 @@ def main(
         for row, count in counts.items()
         if number < count
     ]
-    report.record_trials(LINES, trials, plant, PLANTS_A_CACHE)
+    report.record_trials(LINES, trials, plant, PLANTS_A_CACHE, jobs)
 
 
 if __name__ == "__main__":

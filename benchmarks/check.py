@@ -19,7 +19,9 @@ from scipy.stats import beta
 
 from benchmarks.real.crazyflie import DATA
 from benchmarks.report import (
+    IN_THIS_PROCESS,
     RESULTS,
+    JobFlags,
     Line,
     command,
     fill_page,
@@ -349,6 +351,7 @@ def main(
     seed: int = 53,
     model: bool = False,
     page: bool = False,
+    jobs: JobFlags = IN_THIS_PROCESS,
 ) -> None:
     """Check logs and plants.
 
@@ -362,7 +365,10 @@ def main(
         write_page()
         return
     record_trials(
-        LINES, plan_trials(PARTS if part is None else (part,), logs, seed, model), measure
+        LINES,
+        plan_trials(PARTS if part is None else (part,), logs, seed, model),
+        measure,
+        jobs=jobs,
     )
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks import hidden
 from benchmarks.hidden.oracle import known, removed, signal_to_noise
-from benchmarks.report import RESULTS, Line, command, record_trials
+from benchmarks.report import IN_THIS_PROCESS, RESULTS, JobFlags, Line, command, record_trials
 from flytrack_bench.misspec.suite import nominal_model
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
@@ -160,6 +160,7 @@ def main(
     motion: str = ",".join(hidden.MOTIONS),
     rate: str = "100",
     seed: int = SEED,
+    jobs: JobFlags = IN_THIS_PROCESS,
 ) -> None:
     """Diagnose plants.
 
@@ -170,7 +171,7 @@ def main(
         range(first, plants), rows.split(","), motion.split(","), map(int, rate.split(","))
     )
     trials = [Trial(row, number, seed, moved, per_s) for number, row, moved, per_s in every]
-    record_trials(LINES, trials, plant)
+    record_trials(LINES, trials, plant, jobs=jobs)
 
 
 if __name__ == "__main__":

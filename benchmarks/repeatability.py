@@ -22,7 +22,9 @@ from benchmarks.diagnosis import AMPLITUDES, SECONDS, model_of
 from benchmarks.hidden.oracle import known
 from benchmarks.real.crazyflie import DATA
 from benchmarks.report import (
+    IN_THIS_PROCESS,
     RESULTS,
+    JobFlags,
     Line,
     command,
     fill_page,
@@ -273,7 +275,7 @@ def write_page() -> None:
     )
 
 
-def main(page: bool = False, plants: int = 10) -> None:
+def main(page: bool = False, plants: int = 10, jobs: JobFlags = IN_THIS_PROCESS) -> None:
     """Diagnose flights.
 
     page: write the page from the lines instead. plants: the number of simulated craft.
@@ -281,7 +283,7 @@ def main(page: bool = False, plants: int = 10) -> None:
     if page:
         write_page()
         return
-    record_trials(LINES, trials(plants), measure)
+    record_trials(LINES, trials(plants), measure, jobs=jobs)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,8 @@ Nothing here imports JAX at the top, so that ``pin_to_one_core`` can run before 
 threads.
 """
 
+import importlib
+import itertools
 import json
 import os
 import platform
@@ -14,10 +16,11 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from datetime import date
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import tyro
 from scipy.stats import binomtest
@@ -29,10 +32,32 @@ ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "docs" / "results"
 FEW = 20  # values of which a share would claim more digits than they have
 PACKAGES = ("jax", "jaxlib", "gymnax", "numpy")
+_num_measured = itertools.count()  # trials, by this process
+
+
+@dataclass(frozen=True)
+class Jobs:
+    """Where trials are measured."""
+
+    workers: int = 0
+    """Processes of this machine that measure trials; 0: this process does, one after the other."""
+    address: str | None = None
+    """A Ray cluster that measures them, HOST:PORT, "auto" for the one that runs here, or "local"
+    for one that is begun; its nodes need this checkout at the same path."""
+    limit_s: float = 7200.0
+    """Longest time of a trial (s), with --workers or --address."""
+
+
+JobFlags = Annotated[Jobs, tyro.conf.arg(name="")]
+IN_THIS_PROCESS = Jobs()
 
 
 def command(main: Callable[..., None]) -> None:
     """Call a benchmark's ``main`` with the flags of the command line, which are its arguments."""
+    spec = sys.modules["__main__"].__spec__
+    if main.__module__ == "__main__" and spec is not None:
+        # Jobs in other processes find nothing by that name.
+        main = getattr(importlib.import_module(spec.name), main.__name__)
     text = f"{sys.modules['__main__'].__doc__}\n{main.__doc__}"
     tyro.cli(main, description=text, config=(tyro.conf.FlagCreatePairsOff,))
 
@@ -159,9 +184,15 @@ def list_settings(values: dict[str, float]) -> str:
     return ", ".join(f"{name} {value:g}" for name, value in values.items())
 
 
-def progress(items: Iterable[Item], unit: str) -> Iterable[Item]:
-    """Return items with a progress bar, shown on a terminal only; unit: what is counted."""
-    return tqdm(items, unit=f" {unit}", disable=None)
+def progress(items: Iterable[Item], unit: str, total: int | None = None) -> Iterable[Item]:
+    """Return items with a progress bar, shown on a terminal only.
+
+    Args:
+        items: any.
+        unit: what is counted.
+        total: number of items; None: their length, if they have one.
+    """
+    return tqdm(items, unit=f" {unit}", total=total, disable=None)
 
 
 def filled(name: str, /, **values: Any) -> str:
@@ -209,19 +240,26 @@ def record_trials(
     trials: Iterable[Any],
     measure: Callable[[Any], Line],
     programs_kept: int | None = None,
+    jobs: Jobs = IN_THIS_PROCESS,
 ) -> None:
     """Measure what has no line of this commit yet, and append a line of JSON for each trial.
 
     A line has the trial's fields, the commit, date and machine, and what was measured, or the
-    error: a crash is a result too, and the others go on.
+    error: a crash is a result too, and the others go on. This process alone writes to the file.
 
     Args:
         path: file of lines.
         trials: named tuples.
-        measure: returns what is measured of a trial.
-        programs_kept: trials after which compiled programs are dropped, None for never; the system
-            limits how many memory mappings a process may have.
+        measure: returns what is measured of a trial; a function of a module.
+        programs_kept: trials after which a process drops its compiled programs, None for never; the
+            system limits how many memory mappings a process may have.
+        jobs: where trials are measured.
+
+    Raises:
+        OSError: no such cluster.
     """
+    from flytrack_env.jobs import run_jobs  # not at the top: it imports JAX
+
     machine = f"{platform.machine()}, {os.cpu_count()} cores, jax {version('jax')}"
     stamp = {"commit": commit_of_checkout(), "date": str(date.today()), "machine": machine}
     done = lines_of_commit(path, stamp["commit"])
@@ -230,17 +268,35 @@ def record_trials(
         fields = json.loads(json.dumps(trial._asdict()))
         return any(fields.items() <= line.items() for line in done)
 
-    remaining = [trial for trial in trials if not is_done(trial)]
-    for number, trial in enumerate(progress(remaining, "trials")):
-        if programs_kept and number % programs_kept == 0:
-            import jax
+    remaining = {_name_of(trial): trial for trial in trials if not is_done(trial)}
+    arguments = {name: (measure, trial, programs_kept) for name, trial in remaining.items()}
+    results: Iterable[tuple[str, dict[str, Any]]]
+    if jobs.workers or jobs.address is not None:
+        outcomes = run_jobs(measure_trial, arguments, jobs.limit_s, jobs.address, jobs.workers)
+        results = ((name, outcome.value or {"error": outcome.error}) for name, outcome in outcomes)
+    else:
+        results = ((name, measure_trial(*values)) for name, values in arguments.items())
+    for name, result in progress(results, "trials", len(remaining)):
+        append_line(path, {**remaining[name]._asdict(), **stamp, **result})
 
-            jax.clear_caches()
-        try:
-            result = measure(trial)
-        except Exception as error:
-            result = {"error": f"{type(error).__name__}: {error}"}
-        append_line(path, {**trial._asdict(), **stamp, **result})
+
+def _name_of(trial: Any) -> str:
+    """Return a trial's values as text: the name of its job."""
+    return " ".join(map(str, trial))
+
+
+def measure_trial(
+    measure: Callable[[Any], dict[str, Any]], trial: Any, programs_kept: int | None
+) -> dict[str, Any]:
+    """Return what is measured of a trial, or the error; called in any process."""
+    if programs_kept and next(_num_measured) % programs_kept == 0:
+        import jax
+
+        jax.clear_caches()
+    try:
+        return measure(trial)
+    except Exception as error:
+        return {"error": f"{type(error).__name__}: {error}"}
 
 
 def lines_of_commit(path: Path, commit: str | None = None) -> list[Line]:

@@ -2,11 +2,12 @@
 
 ``devices`` trains on one device, on several, and in two processes. ``fleet`` flies craft whose
 equations share no code with the package (benchmarks.hidden), and lets the fleet's diagnosis say
-which cause began when. ``fleet_on_cluster`` kills a node of a simulated Ray cluster. ``overhead``
-compares Ray with a plain loop. Each appends its record to docs/results/scaling.jsonl; ``page``
-writes docs/results/scaling.md from the last of each.
+which cause began when. ``fleet_on_cluster`` and ``sweep_on_cluster`` kill a node of a simulated Ray
+cluster. ``overhead`` compares Ray with a plain loop. Each appends its record to
+docs/results/scaling.jsonl; ``page`` writes docs/results/scaling.md from the last of each.
 """
 
+import csv
 import logging
 import math
 import os
@@ -26,8 +27,8 @@ import jax
 import numpy as np
 from jax.extend.backend import clear_backends
 
-from baselines.purejaxrl_ppo import Config, devices, load_checkpoint
-from baselines.purejaxrl_ppo.checkpoint import as_named_arrays
+from baselines.purejaxrl_ppo import Config, devices, load_checkpoint, sweep
+from baselines.purejaxrl_ppo.checkpoint import FINAL, as_named_arrays
 from baselines.purejaxrl_ppo.config import RECIPES
 from baselines.purejaxrl_ppo.training import Trainer
 from benchmarks import hidden
@@ -57,7 +58,7 @@ SEED = 61  # no rule was made on it
 BEGINS_IN = 12  # flight
 WITH_CAUSE = 3  # craft
 LIMIT_S = 900.0
-PARTS = ("devices", "rounding", "fleet", "fleet_on_cluster", "overhead")
+PARTS = ("devices", "rounding", "fleet", "fleet_on_cluster", "sweep_on_cluster", "overhead")
 JOB_S, JOBS = 10.0, 8
 # On paper: docs/results/gpu.md, recipe gpu on an H200; numbers of a row beside the observation; and
 # what is assumed, a network card of 400 Gbit/s for each GPU and 50 us for a message between them.
@@ -68,6 +69,7 @@ CHANGES = (1e-7, 2e-7, -1e-7, -2e-7)  # one or two of a float32's last bits
 # 160 gradient steps in 20 updates.
 FEW = Config(total_timesteps=COMPARED * 64 * 32, num_envs=64, num_steps=32, num_minibatches=8)
 CLUSTER_CRAFT = 4
+TRIALS, TRIAL_UPDATES = 12, 64  # of a sweep; a core's work of seconds, beside a minute to begin
 
 
 def draw_craft(rng: np.random.Generator, has_cause: bool) -> tuple[hidden.Truth, hidden.Truth]:
@@ -309,6 +311,42 @@ def run_cluster_fleet(flights: int, seconds: float, seed: int) -> dict[str, Any]
     }
 
 
+def run_cluster_sweep(seed: int) -> dict[str, Any]:
+    """Return what became of the trials of a sweep, a node of which was killed."""
+    out = RUNS / f"sweep{seed}"
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    settings = out / "settings.toml"
+    small = Config(num_envs=16, num_steps=24, num_minibatches=4, hidden_sizes=(8,))
+    steps = TRIAL_UPDATES * small.batch_size
+    settings.write_text(
+        f"total_timesteps = {steps}\nnum_envs = {small.num_envs}\nnum_steps = {small.num_steps}\n"
+        f"num_minibatches = {small.num_minibatches}\nhidden_sizes = [{small.hidden_sizes[0]}]\n"
+        "[learning_rate]\nloguniform = [1e-3, 1e-2]\n"
+    )
+
+    def has_begun() -> bool:
+        return len({path.parent for path in out.glob("trial*/step_*")}) >= TRIALS // 3
+
+    flags = sweep.Flags(settings, TRIALS, out, seed=seed, address="auto", tracking_uri="")
+    with losing_a_node(has_begun) as lost:
+        status = sweep.run_sweep(flags)
+    rows = list(csv.DictReader((out / sweep.TABLE).read_text(encoding="utf-8").splitlines()))
+    grace = steps // sweep.GRACE
+    return {
+        "trials": TRIALS,
+        "updates": TRIAL_UPDATES,
+        "seed": seed,
+        "nodes_lost": len(lost),
+        "status": status,
+        "rows": len(rows),
+        "trial_ids": len({row["trial_id"] for row in rows}),
+        "folders": len(list(out.glob("trial*"))),
+        "ended": sum(float(row["steps"] or 0) >= grace for row in rows),
+        "complete": len(list(out.glob(f"trial*/{FINAL}"))),
+    }
+
+
 def pause(seconds: float) -> float:
     """Wait: a job whose own time does not depend on what else the machine does."""
     time.sleep(seconds)
@@ -319,13 +357,11 @@ def run_overhead(jobs: int) -> dict[str, Any]:
     """Return how much longer jobs of ten seconds take by Ray, one after the other, than alone."""
     import ray
 
-    from benchmarks import scaling  # a name that a worker can import
-
     started = time.perf_counter()
     ray.init("local", num_cpus=1, log_to_driver=False, logging_level=logging.ERROR)
     ready = time.perf_counter()
     every = {str(number): (JOB_S,) for number in range(jobs)}
-    ends = [time.perf_counter() for _ in run_jobs(scaling.pause, every, LIMIT_S, "auto")]
+    ends = [time.perf_counter() for _ in run_jobs(pause, every, LIMIT_S, "auto")]
     ray.shutdown()
     plain = JOB_S * jobs
     return {
@@ -412,6 +448,10 @@ def figures() -> Iterator[Figure]:
     if one := last_of("fleet_on_cluster"):
         text = f"{one['files']} of {one['logs']}, {one['diagnosed']} diagnosed"
         yield Figure("fleet, a node of three killed: logs present once", "all", text, one["logs"])
+    if one := last_of("sweep_on_cluster"):
+        text = f"{one['trial_ids']} of {one['trials']}, {one['ended']} ended by ASHA or complete"
+        title = "sweep, a node of three killed: trials present once"
+        yield Figure(title, "all", text, one["trials"])
     if one := last_of("overhead"):
         title = f"overhead of Ray over a plain loop, jobs of {one['job_s']:g} s"
         text = f"{100.0 * one['overhead']:.2f} %; {100.0 * one['overhead_with_first']:.1f} %"
@@ -441,16 +481,19 @@ def write_results() -> None:
         commits=commits,
         machine=source.get("machine", ""),
         seed=SEED,
-        seconds=fleet.get("seconds", ""),
+        **{name: fleet.get(name, 0) for name in ("craft", "flights", "seconds")},
+        logs=fleet.get("craft", 0) * fleet.get("flights", 0),
         **values,
     )
     write_page(RESULTS / "scaling.md", text)
 
 
 def main(
-    part: Literal["devices", "rounding", "fleet", "fleet_on_cluster", "overhead", "page"],
-    craft: int = 8,
-    flights: int = 15,
+    part: Literal[
+        "devices", "rounding", "fleet", "fleet_on_cluster", "sweep_on_cluster", "overhead", "page"
+    ],
+    craft: int = 10,
+    flights: int = 20,
     seconds: float = 20.0,
     updates: int = 60,
     workers: int = 1,
@@ -472,6 +515,7 @@ def main(
         "rounding": lambda: run_rounding(updates, seed),
         "fleet": lambda: run_fleet(craft, flights, seconds, seed, workers),
         "fleet_on_cluster": lambda: run_cluster_fleet(flights, seconds, seed),
+        "sweep_on_cluster": lambda: run_cluster_sweep(seed),
         "overhead": lambda: run_overhead(JOBS),
     }
     if part == "page":

@@ -1,4 +1,4 @@
-"""The page of the constants of the diagnosis, read from its source and the comments beside it."""
+"""The page of the numeric constants of the diagnosis: its source, and the comments in that."""
 
 import ast
 import inspect
@@ -11,8 +11,9 @@ from typing import NamedTuple
 from docs.markdown import one_line, render
 from flytrack_sysid import diagnosis, inference
 
-CONSTANT = re.compile(r"[A-Z]\w*( =|,|: )")
-NUMBERS = re.compile(r"(np\.array|float)?[-+*/.,\d\s()\[\]e]+(\[:\w+\])?")
+CONSTANT = re.compile(r"[A-Z]\w*( =|,)")
+# Numbers, also in NumPy's calls and beside names of other constants.
+NUMBERS = re.compile(r"(?=.*\d)(np\.\w+|float|[A-Z_]+|[-+*/.,:\d\s()\[\]e])+")
 PACKAGES = (diagnosis, inference)
 
 
@@ -27,7 +28,7 @@ class Constant(NamedTuple):
 def constants_of(source: str) -> list[Constant]:
     """Return the statements of a module that assign numbers to constants, with their comments.
 
-    A comment is on the lines of the statement, or above the group of constants that it belongs to.
+    A comment is on the lines of the statement, or directly above it.
     """
     lines = source.splitlines()
     result = []
@@ -36,20 +37,22 @@ def constants_of(source: str) -> list[Constant]:
             continue
         if not NUMBERS.fullmatch(ast.unparse(node.value)):
             continue
-        beside = " ".join(
-            line.partition("  # ")[2] for line in lines[node.lineno - 1 : node.end_lineno]
-        )
-        first = node.lineno - 2
-        while CONSTANT.match(lines[first]):
-            first -= 1
+        beside = [line.partition("# ")[2] for line in lines[node.lineno - 1 : node.end_lineno]]
         above = []
-        while lines[first].startswith("# "):
-            above.insert(0, lines[first].removeprefix("# "))
-            first -= 1
-        names = ", ".join(map(ast.unparse, node.targets)).strip("()")
-        values = one_line(ast.unparse(node.value)).strip("()")
-        result.append(Constant(names, values, beside.strip() or " ".join(above)))
+        for line in reversed(lines[: node.lineno - 1]):
+            if not line.startswith("# "):
+                break
+            above.insert(0, line.removeprefix("# "))
+        comment = " ".join(filter(None, beside)) or " ".join(above)
+        names, values = (shown(one) for one in (node.targets[0], node.value))
+        result.append(Constant(names, values, comment))
     return result
+
+
+def shown(node: ast.expr) -> str:
+    """Return an expression's source, a tuple without its parentheses."""
+    parts = node.elts if isinstance(node, ast.Tuple) else [node]
+    return ", ".join(map(ast.unparse, parts))
 
 
 def modules() -> Iterator[tuple[str, str, list[Constant]]]:

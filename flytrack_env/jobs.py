@@ -5,20 +5,32 @@ of a lost node again on another.
 """
 
 import contextlib
-import multiprocessing
+import os
 import queue
+import signal
 import socket
-from collections.abc import Callable, Iterator, Mapping
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from importlib.metadata import version
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
 from flytrack_env.extras import check_installed
 from flytrack_env.messages import error_text
-from flytrack_env.sources import digest_of_sources
+from flytrack_env.sources import PACKAGES, digest_of_sources
 
 Function = Callable[..., Any]
 KILL_AFTER_S, CONNECT_S = 5.0, 10.0
+STDERR = 2
+LIBRARIES = ("jax", "jaxlib", "numpy", "scipy")  # whose versions change results
+# A worker's process finds modules where the caller does.
+SERVE = (
+    "import sys; sys.path[:] = sys.argv[2:];"
+    "from flytrack_env.jobs import serve; serve(int(sys.argv[1]))"
+)
 _workers: list["Worker"] = []  # idle ones of a Ray process, which runs a task at a time
 
 
@@ -33,8 +45,10 @@ class ClusterError(OSError):
     """A Ray cluster that cannot be used; the message says which, and why."""
 
 
-def serve(connection: Connection) -> None:
-    """Answer calls until the other end is closed; the body of a worker's process."""
+def serve(descriptor: int) -> None:
+    """Answer calls until the other end of a connection is closed: a worker's process does so."""
+    os.set_inheritable(descriptor, False)  # what a job starts may outlive it
+    connection = Connection(descriptor)
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # the caller is gone
         while True:
             function, arguments = connection.recv()
@@ -48,10 +62,17 @@ def serve(connection: Connection) -> None:
 
 
 class Worker:
-    """A process that runs one job at a time, begun anew after one that crashed or hung."""
+    """A process that runs one job at a time, begun anew after one that crashed or hung.
 
-    def __init__(self) -> None:
-        self.process: Any = None
+    What jobs print goes to stderr, as stdout belongs to the caller's own results.
+
+    Args:
+        cores: on which it runs; none: those of the caller.
+    """
+
+    def __init__(self, cores: Sequence[int] = ()) -> None:
+        self.process: subprocess.Popen[bytes] | None = None
+        self._cores = cores
 
     def call(self, function: Function, arguments: tuple[Any, ...], limit_s: float) -> Outcome:
         """Return what a function returns, or that it crashed, raised, or ran longer than allowed.
@@ -61,35 +82,42 @@ class Worker:
             arguments: of it.
             limit_s: longest time (s), with the start of the process.
         """
-        if self.process is None:
-            self._begin()
+        process = self.process or self._begin()
         try:
-            self.connection.send((function, arguments))
-            if not self.connection.poll(limit_s):
+            self._connection.send((function, arguments))
+            if not self._connection.poll(limit_s):
                 self.end()
                 return Outcome(None, f"found no result after {limit_s:g} s, the limit of a job")
-            outcome: Outcome = self.connection.recv()
+            outcome: Outcome = self._connection.recv()
             return outcome
         except (EOFError, OSError):
-            process = self.process
-            process.join(KILL_AFTER_S)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(KILL_AFTER_S)
             self.end()
-            return Outcome(None, f"its process crashed, with exit status {process.exitcode}")
+            return Outcome(None, f"its process crashed, with exit status {process.returncode}")
 
-    def _begin(self) -> None:
-        # Not forked: JAX has threads.
-        context = multiprocessing.get_context("spawn")
-        self.connection, other = context.Pipe()
-        self.process = context.Process(target=serve, args=(other,), daemon=True)
-        self.process.start()
-        other.close()
+    def _begin(self) -> "subprocess.Popen[bytes]":
+        own, other = socket.socketpair()
+        with other:
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", SERVE, str(other.fileno()), *sys.path],
+                stdin=subprocess.DEVNULL,
+                stdout=STDERR,
+                pass_fds=[other.fileno()],
+                start_new_session=True,
+            )
+        if self._cores:  # before JAX starts a thread for each core
+            os.sched_setaffinity(self.process.pid, self._cores)
+        self._connection = Connection(own.detach())
+        return self.process
 
     def end(self) -> None:
-        """End the process, if there is one."""
+        """End the process and what it has started, if there is one."""
         if self.process is not None:
-            self.process.kill()
-            self.process.join()
-            self.connection.close()
+            with contextlib.suppress(ProcessLookupError):  # it has ended, and left nothing behind
+                os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+            self._connection.close()
             self.process = None
 
 
@@ -108,7 +136,8 @@ def run_jobs(
         limit_s: longest time of a job (s).
         address: of a Ray cluster, HOST:PORT, "auto" for the one that runs here, or "local" for one
             that is begun; None: processes of this machine, without Ray.
-        workers: number of processes without Ray; a cluster runs a job per core.
+        workers: number of processes without Ray, which share this machine's cores; a cluster runs a
+            job per core.
 
     Raises:
         ClusterError: no such cluster.
@@ -118,7 +147,7 @@ def run_jobs(
         yield from _run_on_cluster(function, jobs, limit_s, address)
         return
     free: queue.SimpleQueue[Worker] = queue.SimpleQueue()
-    own = [Worker() for _ in range(min(workers, len(jobs)))]
+    own = [Worker(cores) for cores in share_cores(min(workers, len(jobs)))]
     for worker in own:
         free.put(worker)
 
@@ -140,13 +169,28 @@ def run_jobs(
             worker.end()
 
 
+def describe_code(function: Function) -> str:
+    """Return what a job may run, in words: FlyTrack and the job's own package, and libraries."""
+    package = function.__module__.partition(".")[0]
+    digest = digest_of_sources(*PACKAGES, "baselines", package)
+    libraries = ", ".join(f"{name} {version(name)}" for name in LIBRARIES)
+    return f"FlyTrack of code {digest} with {libraries}"
+
+
+def share_cores(count: int) -> list[Sequence[int]]:
+    """Return the cores of each of some processes, so that their threads do not compete."""
+    if not hasattr(os, "sched_getaffinity"):
+        return [()] * count
+    cores = sorted(os.sched_getaffinity(0))
+    return [cores[index::count] or [cores[index % len(cores)]] for index in range(count)]
+
+
 def run_as_task(
     function: Function, arguments: tuple[Any, ...], limit_s: float, expected: str
 ) -> Outcome:
     """Return the outcome of a job in a process below a Ray worker's, which a crash spares."""
-    if expected != (found := digest_of_sources()):
-        node = socket.gethostname()
-        return Outcome(None, f"node {node}: found FlyTrack of code {found}, expected {expected}")
+    if expected != (found := describe_code(function)):
+        return Outcome(None, f"node {socket.gethostname()}: found {found}, expected {expected}")
     if not _workers:
         _workers.append(Worker())
     return _workers[0].call(function, arguments, limit_s)
@@ -172,12 +216,11 @@ def connected(address: str) -> Iterator[Any]:
         if ":" in address:  # Ray itself tries for minutes
             host, _, port = address.rpartition(":")
             socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
-        ray.init(
-            address=address,
-            log_to_driver=False,
-            logging_level=logging.ERROR,
-        )
-    except (OSError, RuntimeError, ValueError, OverflowError) as error:
+        with warnings.catch_warnings():
+            # Ray forks before it executes its programs, of which JAX warns.
+            warnings.filterwarnings("ignore", message=".*fork", category=RuntimeWarning)
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+    except Exception as error:  # Ray raises many types, and Exception itself
         text = f"--address {address}: no Ray cluster that can be used: {error_text(error)}"
         raise ClusterError(text) from error
     try:
@@ -192,8 +235,9 @@ def _run_on_cluster(
     with connected(address) as ray:
         # A lost node costs a retry; a crash of the job itself does not reach Ray.
         task = ray.remote(num_cpus=1, max_retries=-1)(run_as_task)
+        code = describe_code(function)
         names = {
-            task.options(name=name).remote(function, arguments, limit_s, digest_of_sources()): name
+            task.options(name=name).remote(function, arguments, limit_s, code): name
             for name, arguments in jobs.items()
         }
         waiting = list(names)

@@ -12,7 +12,7 @@ def digest_of_sources(*packages: str) -> str:
     """Return a digest of packages that are installed beside this one.
 
     Args:
-        packages: names; none: all of FlyTrack but its baselines.
+        packages: names, or folders in them; none: all of FlyTrack but its baselines.
     """
     digest, root = hashlib.sha256(), Path(__file__).parents[1]
     for package in packages or PACKAGES:

@@ -344,6 +344,9 @@ class Run:
             is_complete = self.update == config.num_updates
             self._store(files.FINAL if is_complete else files.step_file(self.steps))
             status = "FINISHED" if is_complete else "KILLED"
+        except SystemExit:  # as Ray Tune ends a trial that falls behind
+            status = "KILLED"
+            raise
         finally:
             bar.close()
             self.tracker.end(status)

@@ -1,14 +1,13 @@
 """The jobs of the loop's benchmark, each on one core: shared policies, and one job per plant.
 
 A job is ``nominal`` or ``randomised`` (shared policies), ``shipped``, the number of a hidden plant,
-or ``law_`` and that of a plant with a law outside the package's list. JAX is imported by the jobs
-only, because its threads stay on the core to which ``pin`` has moved the process.
+or ``law_`` and that of a plant with a law outside the package's list.
 """
 
 import json
-import os
 import shutil
 import time
+import traceback
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -20,18 +19,11 @@ RESULT, LOG = "result.json", "log.txt"
 LAW = "law_"
 
 
-def pin(free_cores: Any) -> None:
-    """Keep this process on a core taken from a queue."""
-    os.environ["OMP_NUM_THREADS"] = "1"
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {free_cores.get()})
-
-
 def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
     """Return a job's result, from its file if it has finished; an unfinished job starts again.
 
-    What it prints goes to a log in the job's folder. Compiled programs are dropped afterwards: the
-    system limits how many memory mappings a process may have.
+    What it prints goes to a log in the job's folder, and so does where it failed. Compiled programs
+    are dropped afterwards: the system limits how many memory mappings a process may have.
     """
     folder = out / job
     if (folder / RESULT).exists():
@@ -43,7 +35,11 @@ def run_job(job: str, out: Path, steps: int, seed: int) -> dict[str, Any]:
 
     started_s = time.process_time()
     with (folder / LOG).open("w") as log, redirect_stdout(log), redirect_stderr(log):
-        result = (train_shared if job in SHARED else measure_plant)(job, out, steps, seed)
+        try:
+            result = (train_shared if job in SHARED else measure_plant)(job, out, steps, seed)
+        except Exception:
+            traceback.print_exc()
+            raise
     jax.clear_caches()
     result["cpu_s"] = time.process_time() - started_s
     write_json(folder / RESULT, result)

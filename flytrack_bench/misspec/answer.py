@@ -1,6 +1,5 @@
 """What a method says of a log, checked, and as JSON values."""
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,9 +18,7 @@ from flytrack_sysid.log import BETWEEN_S, FlightLog
 # What can be named: an effect of the package's list, or something of the base.
 BASE_NAMES = (*TAUS, "thrust_curve", "thrust_drift", "battery_drain")
 KNOWN = frozenset(BY_NAME) | frozenset(BASE_NAMES)
-# What the door and the process of a method say to each other, and their files.
-READY, DONE = "ready", "done"
-LOG, MODEL, FLIGHTS, ANSWER = "log.npz", "model.json", "flights.npz", "answer.json"
+LOG, MODEL, FLIGHTS = "log.npz", "model.json", "flights.npz"  # what a method's process is given
 Predict = Callable[[Flights], np.ndarray]
 
 
@@ -89,21 +86,6 @@ class Answer:
             )
         # A tenth of a millimetre is nothing, and keeps the file small.
         return np.round(ends_w, 4).tolist()
-
-
-def read_answer(text: str) -> dict[str, Any]:
-    """Return the JSON values of an answer, or of the reason why there is none.
-
-    Raises:
-        AnswerError: something else.
-    """
-    try:
-        found: Any = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise AnswerError(f"answer: not JSON: {error}") from error
-    if not isinstance(found, dict) or not ({"names", "reason"} & found.keys()):
-        raise AnswerError("answer: found other JSON, expected names or a reason")
-    return found
 
 
 def fly_model(model: ModelParameters, flights: Flights) -> np.ndarray:

@@ -1,12 +1,6 @@
 """The door: show a method each log of a suite, in a process of its own, and score what it says."""
 
-import contextlib
 import json
-import os
-import selectors
-import signal
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
@@ -15,19 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from flytrack_bench.misspec.answer import (
-    ANSWER,
-    DONE,
-    FLIGHTS,
-    LOG,
-    MODEL,
-    READY,
-    AnswerError,
-    read_answer,
-)
+from flytrack_bench.misspec.answer import FLIGHTS, LOG, MODEL, AnswerError
 from flytrack_bench.misspec.scores import score, summarize
 from flytrack_bench.misspec.suite import LogSuite, Plant
+from flytrack_bench.misspec.worker import answer_folder, load_method
 from flytrack_env.files import read_at_most, write_atomically
+from flytrack_env.jobs import Worker
 from flytrack_env.model_file import save_model
 from flytrack_env.npz_file import npz_of
 from flytrack_env.sources import digest_of_sources
@@ -40,63 +27,21 @@ LIMIT_S = 1800.0  # of one log
 Report = Callable[[int, int], None]
 
 
-class Silent(RuntimeError):
-    """The process of a method ended, or said nothing within its time."""
+def ask(worker: Worker, method: str, folder: Path, limit_s: float) -> dict[str, Any]:
+    """Return a method's answer for the log in a folder, or the reason why there is none.
 
-
-class Worker:
-    """A process in which a method answers; it is begun again after it ended or hung."""
-
-    def __init__(self, method: str, limit_s: float):
-        """limit_s: wall-clock time for one log."""
-        self._method, self._limit_s = method, limit_s
-        self._process: subprocess.Popen[bytes] | None = None
-
-    def start(self) -> None:
-        """Begin the process; raises AnswerError if the method cannot be imported."""
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "flytrack_bench.misspec.worker", self._method],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            start_new_session=True,
-        )
-        try:
-            self._reply(START_S)
-        except Silent as silent:
-            raise AnswerError(f"--method: {self._method}: cannot be imported: {silent}") from silent
-
-    def ask(self, folder: Path) -> dict[str, Any]:
-        """Return the answer for the log in a folder, or the reason why there is none."""
-        if self._process is None:
-            self.start()
-        assert self._process is not None and self._process.stdin is not None
-        try:
-            self._process.stdin.write(f"{folder}\n".encode())
-            self._process.stdin.flush()
-            self._reply(self._limit_s)
-            return read_answer(read_at_most(folder / ANSWER, MAX_BYTES).decode())
-        except (Silent, AnswerError, OSError) as error:
-            self.stop()
-            return {"reason": str(error)}
-
-    def _reply(self, limit_s: float) -> None:
-        """Wait for a line of the process."""
-        assert self._process is not None and self._process.stdout is not None
-        with selectors.DefaultSelector() as selector:
-            selector.register(self._process.stdout, selectors.EVENT_READ)
-            if not selector.select(limit_s):
-                raise Silent(f"took more than {limit_s:g} s")
-        line = self._process.stdout.readline().decode().strip()
-        if line not in (READY, DONE):
-            raise Silent(f"ended with status {self._process.wait()}")
-
-    def stop(self) -> None:
-        """End the process and what it has started."""
-        if self._process is not None:
-            with contextlib.suppress(ProcessLookupError):  # it has ended, and left nothing behind
-                os.killpg(self._process.pid, signal.SIGKILL)
-            self._process.communicate()
-            self._process = None
+    Raises:
+        AnswerError: the method cannot be imported.
+    """
+    if worker.process is None:  # new, or ended by the last log
+        outcome = worker.call(load_method, (method,), START_S)
+        if outcome.error:
+            raise AnswerError(outcome.error)
+    outcome = worker.call(answer_folder, (method, folder), limit_s)
+    if outcome.error:
+        return {"reason": outcome.error.replace(f"{folder}/", "")}  # it is a temporary one
+    answer: dict[str, Any] = outcome.value
+    return answer
 
 
 def show(plant: Plant, folder: Path) -> None:
@@ -126,24 +71,22 @@ def run_method(
         report: called with logs done and to do.
     """
     found = begun(suite, method, out)
-    worker, lines = Worker(method, limit_s), found["logs"]
+    worker, lines = Worker(), found["logs"]
     remaining = [log_id for log_id in ids if log_id not in lines]
     try:
-        if remaining:
-            worker.start()
         for number, log_id in enumerate(remaining):
             report(number, len(remaining))
             plant = suite.plant(log_id)
             with tempfile.TemporaryDirectory() as name:
                 show(plant, Path(name))
-                lines[log_id] = score(plant, worker.ask(Path(name)))
+                lines[log_id] = score(plant, ask(worker, method, Path(name), limit_s))
             found["logs"] = dict(sorted(lines.items()))
             found["summary"] = summarize(list(found["logs"].values()))
             if out is not None:
                 write_atomically(out, (json.dumps(found, indent=1) + "\n").encode())
         report(len(remaining), len(remaining))
     finally:
-        worker.stop()
+        worker.end()
     return found
 
 

@@ -9,7 +9,7 @@ from scipy import stats
 from flytrack_env.dynamics import collective_thrust
 from flytrack_env.effects import takes_motors
 from flytrack_sysid.diagnosis.result import TWO_SIDED_95
-from flytrack_sysid.inference.parameters import TAUS
+from flytrack_sysid.inference.parameters import TAUS, range_of
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import (
     ALL_BASE_CAUSES,
@@ -32,14 +32,13 @@ from flytrack_sysid.inference.search import (
 EQUIVALENT = 10.0  # of chi2: a rival that explains less by no more than this cannot be told apart
 # Of chi2: where a difference below EQUIVALENT is expected, chance hardly ever makes it this large.
 EQUIVALENT_BY_CHANCE = 30.0
-MAX_RIVALS = 3
+MAX_RIVALS = 3  # of an effect that are refitted
 # Rivals are refitted where first order puts them within NEARLY of chi2, or within a share of the
 # gain: first order is less exact for large changes, and least exact for effects with probes.
 NEARLY, NEAR_SHARE, PROBE_SHARE = 60.0, 0.15, 0.25
 DRAGS = ("linear_drag", "quadratic_drag")  # laws of a force of the air, which a wind moves
 MOVING_AIR = next(one for one in CANDIDATES if one.effect == "wind" and "wind.v_x" in one.fields)
-# Degrees of freedom of an interval: with fewer blocks that tell of a parameter, t is unbounded.
-MIN_FREEDOM = 2.0
+MIN_BLOCKS = 3.0  # that tell of a parameter, effectively: Student's t of fewer is unbounded
 CLEARLY_CHEAPER = 0.5  # of cost and price: swaps that save less would go back and forth
 
 
@@ -213,14 +212,15 @@ def select_effects(
 def with_lags_anew(state: SearchState, model: FittedModel) -> list[FittedModel]:
     """Return the model refitted from other lags, if any lag ended at its lower bound.
 
-    There a lag has no slope that leads back. Lags of the base start anew from nominal, a lag of an
-    effect from the mean of the effect's other axes.
+    There a lag has no slope that leads back. Lags of the base start anew from nominal, a time of an
+    effect from the mean of the effect's other times.
     """
     problem, vector = state.problem, model.vector.copy()
     is_lowest = vector <= problem.low
     starts = {index: problem.start[index] for index in problem.parameter_indices(TAUS)}
     for candidate in model.candidates:
-        lags = problem.parameter_indices([probe.field for probe in candidate.probes])
+        times = [one.field for one in candidate.probes if range_of(one.field).unit == "s"]
+        lags = problem.parameter_indices(times)
         others = [vector[index] for index in lags if not is_lowest[index]]
         starts |= dict.fromkeys(lags, np.mean(others)) if others else {}
     stuck = [
@@ -238,7 +238,8 @@ def with_moving_air(state: SearchState, model: FittedModel) -> list[FittedModel]
     """Return a model of drag and a steady push, refitted with each law of drag and moving air.
 
     Without drag a wind is a push, and where it is found first it stays one. Beside the wrong law of
-    drag that is a local minimum: neither the law nor the wind can be swapped alone.
+    drag that is a local minimum: neither the law nor the wind can be swapped alone. A drag that the
+    given model has is not touched.
     """
     by_name = {candidate.effect: candidate for candidate in model.candidates}
     is_push = "wind" in by_name and by_name["wind"].fields != MOVING_AIR.fields
@@ -341,10 +342,10 @@ class Marginal:
         influence = solve(self.information, weights.T)
         told = np.einsum("ps,bpq,qs->bs", influence, self.by_block, influence, optimize=True)
         share = told / np.maximum(told.sum(axis=0), 1e-300)
-        largest = np.minimum(np.square(share).sum(axis=0), 1.0 / (1.0 + MIN_FREEDOM))
-        spread = np.square(self.scores @ influence).sum(axis=0) / (1.0 - largest)
+        num_blocks = np.maximum(1.0 / np.maximum(np.square(share).sum(axis=0), 1e-9), MIN_BLOCKS)
+        spread = np.square(self.scores @ influence).sum(axis=0) * num_blocks / (num_blocks - 1.0)
         variance = self.inflation * np.einsum("sp,ps->s", weights, influence)
-        of_blocks = np.sqrt(spread) * stats.t.ppf(0.975, 1.0 / largest - 1.0)
+        of_blocks = np.sqrt(spread) * stats.t.ppf(0.975, num_blocks - 1.0)
         return np.asarray(np.maximum(np.sqrt(variance) * TWO_SIDED_95, of_blocks))
 
 

@@ -54,7 +54,7 @@ MAX_CHUNKS = 4  # at a time, evenly spread: twenty seconds mostly suffice
 ON_TIME_S, STANDARD_ERRORS, UNCERTAIN_S = 0.7e-3, 3.0, 1.5e-3
 MIN_LATENCY_S = 0.5e-3  # of a fitted lateness: a smaller one has no effect
 DIFFERENCE_S, MAX_STEP_S = 2e-4, 3e-3  # for slopes; of a step of the fit
-ROUNDS = 2
+ROUNDS = 2  # of Gauss-Newton for the lateness
 IMU_LATENCY = "imu_latency.latency_s"
 LOOK_ALIKES: tuple[Effect, ...] = tuple(
     BY_NAME[name]

@@ -22,7 +22,7 @@ from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
 # standard errors from all others and less than NEAR_ERRORS from it. Without any noise, the share is
 # known to MIN_ERROR.
 ATTITUDE_SHARE = {Motion.EULER: 0.0, Motion.CONTINUOUS: 0.5, Motion.SEMI_IMPLICIT: 1.0}
-SURE_ERRORS, NEAR_ERRORS, MIN_ERROR = 5.0, 4.0, 0.02
+SURE_ERRORS, NEAR_ERRORS, MIN_ERROR = 5.0, 4.0, 0.02  # standard errors; share
 PIECE_S, MIN_PIECE_S, MIN_PIECES = 0.5, 0.2, 20  # of flight, over which force is summed
 
 

@@ -463,12 +463,12 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     is_better = (
         misfit_changes[0] + price < -change_threshold(first.num_parameters)
         and misfit_changes[1] < 0.0
-        and -misfit_changes[0] > gain_of_place(selection)
+        and -misfit_changes[0] > gain_of_other_dependence(selection)
     )
     return later if is_better else None
 
 
-def gain_of_place(selection: Selection) -> float:
+def gain_of_other_dependence(selection: Selection) -> float:
     """Return the gain of the clearest dependence of what a selection leaves, other than on time.
 
     A drone that flies through a thermal once sees a wind that begins and ends. Where the place, the

@@ -23,8 +23,8 @@ MATERIAL = 0.08  # of the sensor's noise, RMS: a smaller dependence is not repor
 OF_NAMED = 0.15  # of the named causes' RMS contribution: laws of the list are not exact
 # of the wandering disturbance, RMS: a dependence that explains less is a coincidence
 OF_WANDERING = 0.45
-MAX_DEPENDENCES = 3
-PERIODIC_HZ = (0.3, 25.0)
+MAX_DEPENDENCES = 3  # of a side
+PERIODIC_HZ = (0.3, 25.0)  # of a line: slower ones are drifts
 LINE = 28.0  # power of a line over that of its neighbourhood: probability e^-28 under noise
 NEIGHBOURS = 40  # frequencies of the neighbourhood on each side of a line
 STOCHASTIC_GAIN, STOCHASTIC_SHARE = (
@@ -35,6 +35,8 @@ STOCHASTIC_GAIN, STOCHASTIC_SHARE = (
 # share of it remains beside a drifting force
 DRIFT_SHARE = 0.1
 FELT = 0.3  # coupling above which a disturbance moves the drone and not only the sensor
+# Waves of a smooth function: of the time, of the rank of a value and of its change, of the
+# heading, and along each axis of the place.
 TIME_WAVES, RANK_WAVES, CHANGE_WAVES, HEADING_WAVES, PLACE_WAVES = 8, 6, 4, 4, 2
 TINY_SPEED = 0.3  # m/s: slower flight has no direction
 # Bumps about positions of the flight: number of positions, and widths (m).

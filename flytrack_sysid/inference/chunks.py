@@ -33,7 +33,7 @@ CHUNKS_PADDED_TO = 2  # logs of about the same length share one compiled program
 # Axes of a residual: rotation x, y, z, force x, y, z (all world), battery. Each axis has two
 # channels: a direct one, and a level, whose rate of change the direct one measures.
 DIRECT, LEVEL = ("w", "f", None), ("q", "v", "v_bat")
-SIZES = (3, 3, 1)
+SIZES = (3, 3, 1)  # number of axes of each side
 AXES = (slice(0, 3), slice(3, 6), slice(6, 7))  # of each side: rotation, force, battery
 NUM_AXES = sum(SIZES)
 

@@ -31,7 +31,7 @@ QUANTITIES = tuple(CHANNEL_OF)
 UNITS = {"attitude": "rad", "rates": "rad/s", "velocity": "m/s", "position": "m"}
 # Windows are computed in batches of this size, so that logs of one rate share a compiled program.
 WINDOWS_PER_BATCH = 128
-BLOCK_S = 2.0
+BLOCK_S = 2.0  # windows that start in one block count as dependent
 
 
 class Windows(NamedTuple):

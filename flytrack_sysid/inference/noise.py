@@ -38,7 +38,7 @@ MIN_DISTURBANCE_RATIO = (
 TAU_RANGE_S = (0.02, 5.0)  # of a disturbance: from a few rows to a chunk
 # Levenberg damping: the first, its factor after a bad step, and its factor after a good step.
 FIRST_DAMPING, MORE, LESS = 1e-2, 10.0, 0.2
-MAX_ROUNDS = 12
+MAX_ROUNDS = 12  # of Levenberg's method
 ENOUGH = 1.0  # of minus twice the log likelihood: the error of one parameter
 OUTLIER = 4.0  # innovations beyond this count by their size, not by its square
 DIFFERENCE = 1e-4  # of logarithms, for slopes

@@ -22,7 +22,7 @@ MAX_FILLED_S = 0.1  # after a longer gap a new flight begins
 WINDOW_WITHOUT_VOLTAGE_S = 1.25
 WINDOW_S = 2.5  # over which increments of velocity and attitude are followed
 PADDED_TO = 1024  # rows: logs of about the same length share one compiled program
-UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # attitude where none was logged
 # Rows with a more uncertain applied action count for nothing: half a gyro's noise at full stick.
 MAX_DOUBT = 0.005
 APPLIED_UNKNOWN = 1.0  # standard deviation of an unknown applied action

@@ -29,7 +29,7 @@ FALSE_CHANGE_RATE = 1e-5  # that an effect changes within a log although none do
 MIN_SIDE_FRACTION = 0.04  # of a log on each side of a change
 # A direction cannot be told from others that explain all but this share of it.
 MIN_INDEPENDENT_FRACTION = 1e-7
-AT_BOUND = 1e-9
+AT_BOUND = 1e-9  # of a parameter, or absolutely: this near to a bound it is there
 # Relative change of a parameter with probes within which its slope holds.
 SAME_SLOPE = 0.1
 PROBE_PRIOR = 1e-2  # prior: a step is shorter than ten times the way to the probe

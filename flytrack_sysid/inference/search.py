@@ -24,7 +24,7 @@ PER_PARAMETER = 4.0  # of chi2: the gain that one more parameter needs to be pre
 MAX_EFFECTS = 6  # of a model
 # of the best gain: candidates this close to first order are refitted before one is chosen
 CLOSE = 0.6
-MAX_REFITTED = 4
+MAX_REFITTED = 4  # candidates of a round
 MAX_FAILED_ROUNDS = 3  # rounds of refits without an effect before a search ends
 PROMISING = 0.7  # of the threshold, to first order
 SHARE_OF_WAY = (0.02, 1.5)  # range of the share of the way to a probe at which a fit starts

@@ -17,10 +17,10 @@ from typing import Any
 import jax
 import numpy as np
 
-import flytrack_env
 from flytrack_env import fusion
 from flytrack_env.compile_cache import FOLDER
 from flytrack_env.files import write_atomically
+from flytrack_env.sources import digest_of_sources
 
 # LLVM's first level compiles a replay in a sixth of the time that its third level takes, into a
 # program that is as fast and computes the same bits.
@@ -115,11 +115,6 @@ def _digest(function: Callable[..., Any], structure: str, kinds: tuple[Any, ...]
     return hashlib.sha256("\n".join(map(str, dependencies)).encode()).hexdigest()
 
 
-@functools.cache
 def _sources() -> str:
-    """Return a digest of JAX's version and of all modules that may be traced."""
-    digest = hashlib.sha256(jax.__version__.encode())
-    for package in (Path(flytrack_env.__file__).parent, Path(__file__).parent):
-        for path in sorted(package.rglob("*.py")):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
+    """Return JAX's version and a digest of all modules that may be traced."""
+    return f"{jax.__version__} {digest_of_sources('flytrack_env', 'flytrack_sysid/inference')}"

@@ -9,7 +9,7 @@ import pytest
 
 from docs.effect_pages import effect_page
 from docs.pages import site_pages
-from docs.threshold_pages import modules
+from docs.threshold_pages import constants_of, modules
 from docs.track_pages import gate_rows, track_page
 from flytrack_env.effects import EFFECTS
 from flytrack_env.tracks import available_tracks, build_course, load_track
@@ -112,14 +112,20 @@ def test_page_of_a_track_has_the_headings_of_its_gates(name):
     assert BLOCK.search(track_page(name)) and (DOCS / "tracks" / f"{name}.png").is_file()
 
 
-@pytest.mark.slow
 def test_every_constant_of_the_diagnosis_says_what_it_means():
-    found = {module: constants for module, _, constants in modules()}
-    assert found["flytrack_sysid.diagnosis.vetoes"][0].names == "HELD_OUT_SIGMAS, HELD_OUT_SHARE"
-    silent = [(name, one.names) for name, many in found.items() for one in many if not one.comment]
+    source = "# m\nABOVE = 1\nBESIDE, TOO = 2.0, (3, 4)  # s\nSILENT = 5\nTEXT = 'no number'\n"
+    assert constants_of(source) == [
+        ("ABOVE", "1", "m"),
+        ("BESIDE, TOO", "2.0, (3, 4)", "s"),
+        ("SILENT", "5", ""),
+    ]
+    silent = [
+        (module, one.names) for module, _, many in modules() for one in many if not one.comment
+    ]
     assert not silent, f"expected a unit, a meaning or a reason in a comment beside {silent}"
 
 
+@pytest.mark.slow
 def test_pages_of_environments_and_effects_are_generated():
     pages = site_pages()
     assert all(text.strip() for text in pages.values())

@@ -3,7 +3,6 @@
 import json
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -19,24 +18,13 @@ from flytrack_env.jobs import ClusterError, Outcome
 from flytrack_env.tracks import TrackError, load_track
 from flytrack_loop.adapt import Adapted
 from tests.support.refusals import refused
-
-CENTRED = "tests.integration.test_bench:hover"
-
-
-def hover(observation):
-    """Sticks centred, thrust about that of hovering."""
-    return jnp.array([0.0, 0.0, 0.0, -0.2]) + 0.0 * observation[:4]
+from tests.support.small_suite import CENTRED, hover, write_small_suite
 
 
 @pytest.fixture
 def small(tmp_path):
     """The file of a suite of two tasks with two starts each."""
-    content = json.loads((FOLDER / "v1.json").read_text())
-    content |= {"starts": 2, "steps": 60, "tasks": [content["tasks"][0], content["tasks"][-1]]}
-    content["digest"] = digest_of(content)
-    path = tmp_path / "small.json"
-    path.write_text(json.dumps(content))
-    return path
+    return write_small_suite(tmp_path / "small.json")
 
 
 def test_the_suite_is_what_its_seed_draws(tmp_path):

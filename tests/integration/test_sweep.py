@@ -1,7 +1,9 @@
-"""Sweeps: which settings are accepted, and a whole sweep on this machine."""
+"""Sweeps: which settings are accepted, and a sweep on this machine that is killed."""
 
+import csv
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -68,21 +70,36 @@ def test_what_no_trial_could_use_is_refused_before_any(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # deprecations in MLflow's own dependencies
-def test_a_sweep_here(tmp_path):
-    pytest.importorskip("ray", reason="needs the extra cluster")
+def test_a_sweep_that_was_killed_goes_on(tmp_path):
     from mlflow import MlflowClient
 
     out = tmp_path / "sweep"
     command = [sys.executable, "-m", "flytrack", "sweep", str(written(tmp_path, GRID))]
     command += ["--trials", "1", "--out", str(out)]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as killed:
+        deadline_s = time.monotonic() + 600.0
+        while not list(out.glob("trial*/step_[1-9]*")):
+            assert killed.poll() is None and time.monotonic() < deadline_s
+            time.sleep(0.2)
+        killed.kill()
+    starts = [path.with_name("step_0.safetensors") for path in out.glob("trial*/step_[1-9]*")]
+    stored = {path: path.stat().st_mtime_ns for path in starts}
+    refused = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert "found a sweep: --resume goes on with it" in refused.stderr
+    command += ["--resume"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stderr
     assert "best: " in done.stdout
+    assert {path: path.stat().st_mtime_ns for path in stored} == stored, "a trial began anew"
+    rows = list(csv.DictReader((out / "sweep.csv").read_text().splitlines()))
     folders = sorted(out.glob("trial*"))
+    assert len(rows) == len(folders) == 2
+    complete = [load_checkpoint(path).steps for path in out.glob("trial*/final.safetensors")]
+    assert complete == [64 * BATCH] * len(complete)
+    stopped = [row for row in rows if row["done"] == "True"]  # by ASHA
+    assert len(complete) + len(stopped) == 2
     paths = [next(iter(sorted(folder.glob("step_0*")))) for folder in folders]
     assert sorted(load_checkpoint(path).config.learning_rate for path in paths) == [1e-3, 3e-3]
-    finals = [folder / "final.safetensors" for folder in folders]
-    assert any(path.exists() and load_checkpoint(path).steps == 64 * BATCH for path in finals)
     client = MlflowClient(tracking_uri=f"sqlite:///{out / 'mlflow.db'}")
     runs = client.search_runs([client.get_experiment_by_name("flytrack").experiment_id])
     (sweep,) = [run for run in runs if "mlflow.parentRunId" not in run.data.tags]
@@ -90,5 +107,3 @@ def test_a_sweep_here(tmp_path):
     assert len(runs) == 3
     assert sorted(run.data.params["config.learning_rate"] for run in trials) == ["0.001", "0.003"]
     assert {run.info.status for run in runs} <= {"FINISHED", "KILLED"}
-    refused = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    assert "found a sweep: --resume goes on with it" in refused.stderr

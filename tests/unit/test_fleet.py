@@ -1,14 +1,15 @@
-"""A fleet: how logs are sorted and stored, and when a change is told; jobs that crash or hang."""
+"""A fleet: how logs are sorted and stored, and when a change is told."""
 
 from functools import partial
 from pathlib import Path
 
+import fsspec
 import numpy as np
 import pytest
 
 from flytrack.flags import Diagnose
 from flytrack.identification import run_diagnose
-from flytrack_env.jobs import ClusterError, Outcome, run_as_task, run_jobs
+from flytrack_env.jobs import Outcome
 from flytrack_sysid import collect, fleet, save_log
 from flytrack_sysid.fleet import (
     FleetError,
@@ -21,38 +22,6 @@ from flytrack_sysid.fleet import (
     find_flights,
 )
 from flytrack_sysid.fleet_page import format_page
-from tests.support.jobs import end_as
-
-
-def test_a_job_that_crashes_or_raises_costs_itself_only():
-    ends = list(run_jobs(end_as, {kind: (kind,) for kind in ("crash", "raise", "a")}, 300.0))
-    assert ends == [
-        ("crash", Outcome(None, "its process crashed, with exit status 3")),
-        ("raise", Outcome(None, "no such thing")),
-        ("a", Outcome("a")),
-    ]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("address", [None, "local"])
-def test_a_job_that_hangs_costs_itself_only(address):
-    if address is not None:
-        pytest.importorskip("ray", reason="needs the extra cluster")
-    ends = dict(run_jobs(end_as, {kind: (kind,) for kind in ("hang", "crash", "a")}, 60.0, address))
-    assert ends["a"] == Outcome("a")
-    assert "found no result after 60 s, the limit of a job" in ends["hang"].error
-    assert "its process crashed" in ends["crash"].error
-
-
-def test_a_cluster_that_is_none_is_refused():
-    pytest.importorskip("ray", reason="needs the extra cluster")
-    with pytest.raises(ClusterError, match=r"--address 127\.0\.0\.1:9: no Ray cluster"):
-        list(run_jobs(end_as, {"a": ("a",)}, 9.0, "127.0.0.1:9"))
-
-
-def test_a_node_of_other_code_is_told():
-    outcome = run_as_task(end_as, ("a",), 9.0, "another")
-    assert outcome.value is None and outcome.error.endswith(", expected another")
 
 
 def touched(path, text=""):
@@ -98,7 +67,7 @@ def test_every_log_has_a_name_of_its_own_and_results_are_no_logs(tmp_path):
 @pytest.fixture
 def memory():
     """A file system of fsspec in the memory, empty."""
-    system = pytest.importorskip("fsspec", reason="needs the extra cluster").filesystem("memory")
+    system = fsspec.filesystem("memory")
     yield system
     system.store.clear()
 
