@@ -131,6 +131,7 @@ def figures(lines: list[Line]) -> list[Figure]:
         ("silent, lambda < 8", "", [not causes_in(line) for line in invisible]),
         ("exact set of 2, each separable", "95 %", exact_sets(by_row["two"])),
         ("exact set of 3, each separable", "90 %", exact_sets(by_row["three"])),
+        ("exact set of 1 to 3, each separable", "", exact_sets(hiding)),
         ("95 % intervals cover the truth", "92 to 98 %", covered(same_law)),
         ("the same, beside an effect of another law", "", covered(other_law)),
         ("outside the list: flagged", "95 %", [bool(line["unexplained"]) for line in outside]),
@@ -196,7 +197,7 @@ def figures_of_rates(lines: list[Line]) -> str:
         name = f"{rate} Hz, {motion}"
         rows.append(share_figure(f"{name}: any name on clean plants", "at most 2 %", is_named))
         rows.append(share_figure(f"{name}: exact single", "95 %", exact_sets(singles)))
-    return figures_table(rows)
+    return figures_table(rows) if rows else "Not measured at this commit."
 
 
 def flown(lines: list[Line], motion: str, rate: int) -> list[Line]:
@@ -251,9 +252,11 @@ def main() -> None:
         LINES.with_suffix(".md"),
         "diagnosis",
         plants=", ".join(f"{row} {rows[row]}" for row in ROWS),
+        num_plants=len({(line["row"], line["number"], line["seed"]) for line in lines}),
         crashed=len(every_line) - len(lines),
         seeds=sorted({line["seed"] for line in every_line}),
-        commits=", ".join(sorted({f"{line['commit']} of {line['date']}" for line in every_line})),
+        commit=every_line[-1]["commit"],
+        date=every_line[-1]["date"],
         machines="; ".join(sorted({line["machine"] for line in every_line})),
         visible=VISIBLE,
         figures=figures_of_motions(lines),
