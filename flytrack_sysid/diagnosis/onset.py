@@ -443,17 +443,16 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     state, model = _likeliest_side(
         selection, first, [one.candidate.effect for one in near[:MAX_NEAR]]
     )
-    state, model = with_refitted_noise(_at_best_row(state, test, model, first.row), model)
+    state, model = with_refitted_noise(at_best_row(state, test, model, first.row), model)
     state, base, model = extended(state, state.fitted((), selection.base.vector), model)
     named = tuple(one for one in state.problem.windows if one.effect in model.effects)
     new_rows, old_rows = (
         {row for one in windows for row in (one.start, one.end)}
         for windows in (named, selection.state.problem.windows)
     )
-    rows = new_rows - old_rows - {ALWAYS, NEVER}
-    if not rows:
-        return None
-    state = _at_best_row(windowed(state, named), test, model, max(rows))
+    state, rows = windowed(state, named), new_rows - old_rows - {ALWAYS, NEVER}
+    if rows:
+        state = at_best_row(state, test, model, max(rows))
     later = select(state, base, state.fitted(model.candidates, model.vector))
     misfit_changes = [
         misfit(later, problem) - misfit(selection, problem)
@@ -518,7 +517,16 @@ def _likeliest_side(
     return begins if begins[1].cost < ends[1].cost + CLEAR else ends
 
 
-def _at_best_row(state: SearchState, test: Problem, model: FittedModel, row: int) -> SearchState:
-    """Return the state with the changes at a row moved to the likeliest row."""
+def at_best_row(state: SearchState, test: Problem, model: FittedModel, row: int) -> SearchState:
+    """Return the state with the changes at a row moved to the likeliest row.
+
+    What changes before the log or after it does not change within it.
+    """
     best = profile_change(state.problem, test, model.vector, row).best
-    return windowed(state, moved(state.problem, row, best).windows)
+    known = state.problem.chunks.row[state.problem.chunks.row >= 0]
+    if best <= known.min():
+        best = ALWAYS
+    elif best > known.max():
+        best = NEVER
+    windows = moved(state.problem, row, best).windows
+    return windowed(state, [one for one in windows if (one.start, one.end) != (ALWAYS, NEVER)])

@@ -11,12 +11,12 @@ from scipy.signal import lfilter
 from benchmarks.diagnosis import model_of
 from flytrack.cli import main
 from flytrack_env.effects import LinearDrag
-from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, vetoes
+from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, onset, vetoes
 from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
 from flytrack_sysid.diagnosis.flight_fit import Fit
 from flytrack_sysid.diagnosis.learned import improves_flights
 from flytrack_sysid.diagnosis.model_selection import Ablation
-from flytrack_sysid.diagnosis.onset import windowed
+from flytrack_sysid.diagnosis.onset import ALWAYS, NEVER, Profile, at_best_row, windowed
 from flytrack_sysid.diagnosis.refinement import Refined
 from flytrack_sysid.diagnosis.report import describe_verdict
 from flytrack_sysid.diagnosis.result import Cause, Estimated
@@ -35,7 +35,7 @@ from flytrack_sysid.inference.chunks import (
     thinned,
 )
 from flytrack_sysid.inference.parameters import DRAIN, THRUST_COEFFS
-from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.problem import Problem, Window
 from flytrack_sysid.inference.record import make_record
 from flytrack_sysid.inference.search import SearchState
 from flytrack_sysid.log_file import save_log
@@ -184,6 +184,23 @@ def test_without_measured_voltages_the_drain_stays_nominal_also_where_effects_ch
         state = windowed(SearchState(Problem.of(chunks, model_of(truth))), ())
         names = [state.problem.names[index] for index in state.base_indices]
         assert (DRAIN in names) is is_free and "tau_roll" in names
+
+
+@pytest.mark.parametrize(
+    ("window", "best", "left"),
+    [
+        (Window("wind", start=300), 400, [Window("wind", start=400)]),
+        (Window("wind", start=300), 0, []),
+        (Window("wind", end=300), 10**6, []),
+        (Window("wind", 100, 300), 10**6, [Window("wind", 100, NEVER)]),
+        (Window("wind", 300, 500), -4, [Window("wind", ALWAYS, 500)]),
+    ],
+)
+def test_what_changes_outside_of_the_log_does_not_change(state, monkeypatch, window, best, left):
+    profile = Profile(np.array([best]), np.zeros(1))
+    monkeypatch.setattr(onset, "profile_change", lambda *_: profile)
+    moved = at_best_row(windowed(state, (window,)), None, SimpleNamespace(vector=None), 300)
+    assert [*moved.problem.windows] == left
 
 
 def test_the_first_look_ranks_what_is_hidden_and_says_what_it_did_not_check(tmp_path, capsys):
