@@ -48,3 +48,12 @@ def test_logs_of_the_suite(log: str, names: set[str]) -> None:
     found = diagnose(plant.log, plant.model)
     assert {cause.effect for cause in found.causes} == names
     assert found.unexplained.flagged  # gusts, or the thermal
+
+
+def test_a_lag_at_zero_does_not_shorten_a_delay() -> None:
+    """The rates of roll ended at 0 s, without a slope, and the delay 4 standard errors off."""
+    truth, _, log, model, _ = make_log(Trial("three", 1004, SEED, "semi_implicit"))
+    found = {cause.effect: cause.parameters for cause in diagnose(log, model).causes}
+    for effect, name in (("command_delay", "delay_s"), ("second_order_rates", "roll_s")):
+        low, high = found[effect][name].ci95
+        assert low < truth.effects[effect][name] < high
