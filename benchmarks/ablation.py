@@ -199,7 +199,7 @@ def score(line: Line, truth: list[str]) -> int:
     return len(found) - len(false)
 
 
-def plant_of(line: Line) -> tuple[Any, ...]:
+def trial_key(line: Line) -> tuple[Any, ...]:
     """Return the fields of a line that identify its plant."""
     return tuple(line[field] for field in Trial._fields)
 
@@ -207,11 +207,11 @@ def plant_of(line: Line) -> tuple[Any, ...]:
 def measure(trials: list[Trial], rules: Iterable[str]) -> None:
     """Append the missing lines: first with all rules, then without one rule at a time."""
     lines, commit = lines_in(LINES), {"commit": commit_of_checkout()}
-    counted = {plant_of(line): line for line in lines if not line["without"]}
+    counted = {trial_key(line): line for line in lines if not line["without"]}
     for trial in progress([one for one in trials if tuple(one) not in counted], "plants"):
         counted[tuple(trial)] = {**trial._asdict(), **commit, "without": "", **census(trial)}
         append_line(LINES, counted[tuple(trial)])
-    done = {(plant_of(line), line["without"]) for line in lines}
+    done = {(trial_key(line), line["without"]) for line in lines}
     missing = [
         (trial, name)
         for trial, name in product(trials, rules)
@@ -255,12 +255,12 @@ def count_whole(lines: list[Line]) -> int:
 
 def count_by_rule(lines: list[Line]) -> list[list[Any]]:
     """Return for each rule how often it fires, and what differs without it."""
-    counted = {plant_of(line): line for line in lines if not line["without"]}
+    counted = {trial_key(line): line for line in lines if not line["without"]}
     rows = []
     for rule in RULES:
         fired = [plant for plant, line in counted.items() if rule.name in line["fired"]]
         removed = [line for line in lines if line["without"] == rule.name]
-        pairs = [(line, counted[plant_of(line)]) for line in removed]
+        pairs = [(line, counted[trial_key(line)]) for line in removed]
         changed = [(line, whole) for line, whole in pairs if line["outcome"] != whole["outcome"]]
         gains = [
             score(line, whole["truth"]) - score(whole, whole["truth"]) for line, whole in changed

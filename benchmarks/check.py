@@ -284,9 +284,9 @@ def write_page() -> None:
         for name in [*FIXABLE, "all"]
     ]
     unequal, equal = split_rows(fixes[:-1])
-    folders = Counter(folder_of(line) for line in by_part["measured"])
+    folders = Counter(dataset_name(line) for line in by_part["measured"])
     contradicted = Counter(
-        folder_of(line) for line in by_part["measured"] if line["outcome"] != "exact"
+        dataset_name(line) for line in by_part["measured"] if line["outcome"] != "exact"
     )
     simulators = [
         [
@@ -335,7 +335,7 @@ def cpu_seconds() -> list[float]:
     return seconds
 
 
-def folder_of(line: Line) -> str:
+def dataset_name(line: Line) -> str:
     """Return the folder of a measured flight."""
     return str(line["name"].partition("/")[0])
 

@@ -268,7 +268,7 @@ def record_trials(
         fields = json.loads(json.dumps(trial._asdict()))
         return any(fields.items() <= line.items() for line in done)
 
-    remaining = {_name_of(trial): trial for trial in trials if not is_done(trial)}
+    remaining = {_job_name(trial): trial for trial in trials if not is_done(trial)}
     arguments = {name: (measure, trial, programs_kept) for name, trial in remaining.items()}
     results: Iterable[tuple[str, dict[str, Any]]]
     if jobs.workers or jobs.address is not None:
@@ -280,7 +280,7 @@ def record_trials(
         append_line(path, {**remaining[name]._asdict(), **stamp, **result})
 
 
-def _name_of(trial: Any) -> str:
+def _job_name(trial: Any) -> str:
     """Return a trial's values as text: the name of its job."""
     return " ".join(map(str, trial))
 

@@ -5,7 +5,6 @@ import inspect
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple
 
 from docs.markdown import one_line, render
@@ -25,7 +24,7 @@ class Constant(NamedTuple):
     comment: str
 
 
-def constants_of(source: str) -> list[Constant]:
+def parse_constants(source: str) -> list[Constant]:
     """Return the statements of a module that assign numbers to constants, with their comments.
 
     A comment is on the lines of the statement, or directly above it.
@@ -58,17 +57,12 @@ def shown(node: ast.expr) -> str:
 def modules() -> Iterator[tuple[str, str, list[Constant]]]:
     """Yield each module with constants: its name, the first line of its docstring, and these."""
     for package in PACKAGES:
-        for path in sorted(Path(folder_of(package)).glob("*.py")):
+        for path in sorted(Path(inspect.getfile(package)).parent.glob("*.py")):
             source = path.read_text(encoding="utf-8")
-            constants = constants_of(source)
+            constants = parse_constants(source)
             if constants:
                 about = (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
                 yield f"{package.__name__}.{path.stem}", one_line(about), constants
-
-
-def folder_of(package: ModuleType) -> str:
-    """Return the folder of a package."""
-    return str(Path(inspect.getfile(package)).parent)
 
 
 def thresholds_page() -> str:

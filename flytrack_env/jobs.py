@@ -147,8 +147,8 @@ def run_jobs(
         yield from _run_on_cluster(function, jobs, limit_s, address)
         return
     free: queue.SimpleQueue[Worker] = queue.SimpleQueue()
-    own = [Worker(cores) for cores in share_cores(min(workers, len(jobs)))]
-    for worker in own:
+    pool = [Worker(cores) for cores in share_cores(min(workers, len(jobs)))]
+    for worker in pool:
         free.put(worker)
 
     def run(arguments: tuple[Any, ...]) -> Outcome:
@@ -158,14 +158,14 @@ def run_jobs(
         finally:
             free.put(worker)
 
-    threads = ThreadPoolExecutor(max(len(own), 1))
+    threads = ThreadPoolExecutor(max(len(pool), 1))
     try:
         futures = {threads.submit(run, arguments): name for name, arguments in jobs.items()}
         for future in as_completed(futures):
             yield futures[future], future.result()
     finally:
         threads.shutdown(wait=False, cancel_futures=True)
-        for worker in own:
+        for worker in pool:
             worker.end()
 
 

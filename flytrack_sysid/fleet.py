@@ -204,7 +204,7 @@ def find_flights(
         for name in sorted(by_folder[folder], key=natural):
             flights.append(
                 Flight(
-                    _craft_of(folder, by_folder),
+                    _craft_name(folder, by_folder),
                     str(folder / name),
                     None if model_path is None else str(model_path.resolve()),
                     str(mapping) if mapping.exists() else None,
@@ -214,7 +214,7 @@ def find_flights(
     return flights
 
 
-def _craft_of(folder: Path, folders: Iterable[Path]) -> str:
+def _craft_name(folder: Path, folders: Iterable[Path]) -> str:
     """Return as many of the last parts of a folder's path as no other one has."""
     for count in range(1, len(folder.parts) + 1):
         parts = folder.parts[-count:]

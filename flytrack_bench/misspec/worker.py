@@ -19,21 +19,21 @@ MAX_BYTES = 2**26  # of flights
 
 
 @functools.cache
-def method_of(name: str) -> Any:
+def import_method(name: str) -> Any:
     """Return the function that ``module:function`` names; raises AnswerError if there is none."""
     return import_object(name, "--method", AnswerError)
 
 
 def load_method(name: str) -> None:
     """Import a method, so that its first log does not have to."""
-    method_of(name)
+    import_method(name)
 
 
 def answer_folder(name: str, folder: Path) -> dict[str, Any]:
     """Return a method's answer as JSON values, with the CPU seconds of the method alone."""
     log, model = load_log(folder / LOG), load_model(folder / MODEL)
     started_s = cpu_s()
-    answer = method_of(name)(log, model)
+    answer = import_method(name)(log, model)
     seconds = cpu_s() - started_s
     if not isinstance(answer, Answer):
         raise AnswerError(f"method: found {type(answer).__name__}, expected a misspec.Answer")

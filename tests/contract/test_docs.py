@@ -9,7 +9,7 @@ import pytest
 
 from docs.effect_pages import effect_page
 from docs.pages import site_pages
-from docs.threshold_pages import constants_of, modules
+from docs.threshold_pages import modules, parse_constants
 from docs.track_pages import gate_rows, track_page
 from flytrack_env.effects import EFFECTS
 from flytrack_env.tracks import available_tracks, build_course, load_track
@@ -114,7 +114,7 @@ def test_page_of_a_track_has_the_headings_of_its_gates(name):
 
 def test_every_constant_of_the_diagnosis_says_what_it_means():
     source = "# m\nABOVE = 1\nBESIDE, TOO = 2.0, (3, 4)  # s\nSILENT = 5\nTEXT = 'no number'\n"
-    assert constants_of(source) == [
+    assert parse_constants(source) == [
         ("ABOVE", "1", "m"),
         ("BESIDE, TOO", "2.0, (3, 4)", "s"),
         ("SILENT", "5", ""),
