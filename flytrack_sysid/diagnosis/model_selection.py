@@ -72,12 +72,20 @@ class Ablation(NamedTuple):
         return self.robust - threshold(self.num_parameters)
 
 
-def without_effect(state: SearchState, model: FittedModel, effect: str) -> FittedModel:
-    """Return the model without an effect, refitted."""
+def without_effect(
+    state: SearchState, model: FittedModel, effect: str, nearby: Linearization | None = None
+) -> FittedModel:
+    """Return the model without an effect, refitted.
+
+    Args:
+        state: of the search.
+        model: with the effect.
+        effect: its name.
+        nearby: as in ``search.refine``.
+    """
     vector = state.problem.at_start(model.vector, model.candidate(effect).fields)
-    return state.fitted(
-        [candidate for candidate in model.candidates if candidate.effect != effect], vector
-    )
+    remaining = [candidate for candidate in model.candidates if candidate.effect != effect]
+    return state.fitted(remaining, vector, nearby)
 
 
 def ablate(
@@ -91,7 +99,7 @@ def ablate(
         linearization: of the model, along everything.
         effect: its name.
     """
-    reduced = without_effect(state, model, effect)
+    reduced = without_effect(state, model, effect, linearization)
     columns = [linearization.column(field) for field in model.candidate(effect).fields]
     effect_gain = linearization.gain(
         columns, linearization.columns_at(model.indices, without=columns)

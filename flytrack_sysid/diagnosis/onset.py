@@ -453,7 +453,10 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     state, rows = windowed(state, named), new_rows - old_rows - {ALWAYS, NEVER}
     if rows:
         state = at_best_row(state, test, model, max(rows))
-    later = select(state, base, state.fitted(model.candidates, model.vector))
+    tried = Selection(state, base, state.fitted(model.candidates, model.vector), {})
+    if misfit(tried, test) >= misfit(selection, test):
+        return None  # before the effects are selected, which takes longest
+    later = select(state, base, tried.model)
     misfit_changes = [
         misfit(later, problem) - misfit(selection, problem)
         for problem in (selection.state.problem, test)

@@ -606,8 +606,8 @@ def refinement_notes(refined: Refined, model: FittedModel) -> list[str]:
     ]
     if silent and refined.fit is not None:
         notes.append(
-            f"after {', '.join(silent)} a placebo that knows the state at the start and no "
-            "commands predicts these flights as well as the models: nothing is named from there"
+            f"after {', '.join(silent)} the held-out flights do not show that a model predicts "
+            "better than the state at the start without commands: nothing is named from there"
         )
     return notes
 

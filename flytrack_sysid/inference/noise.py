@@ -43,9 +43,9 @@ ENOUGH = 1.0  # of minus twice the log likelihood: the error of one parameter
 OUTLIER = 4.0  # innovations beyond this count by their size, not by its square
 DIFFERENCE = 1e-4  # of logarithms, for slopes
 NUM_COMPARED = 7  # noises: one, and one with each of its six parameters moved
-# Sizes of the compiled programs: rows at a time, chunks at a time, and for many models, chunks and
-# models at a time; fewer models are filtered one by one.
-NUM_ROWS, NUM_CHUNKS, MANY_MODELS, MIN_MANY = 200, 16, (2, 32), 8
+# Sizes of the compiled programs: rows at a time, chunks at a time, and chunks and models at a time.
+# A batch takes about as long whatever its size, so the size that needs the fewest is used.
+NUM_ROWS, NUM_CHUNKS, BATCHES = 200, 16, ((2, 32), (16, 4))
 
 
 class Noise(NamedTuple):
@@ -278,8 +278,9 @@ class Filter(NamedTuple):
             white: of the same shape.
         """
         num_rows, num_axes, _, num_chunks, num_models = residuals.shape
-        is_many = num_models >= MIN_MANY
-        chunks_at_once, models_at_once = MANY_MODELS if is_many else (NUM_CHUNKS, 1)
+        chunks_at_once, models_at_once = min(
+            BATCHES, key=lambda size: -(-num_chunks // size[0]) * -(-num_models // size[1])
+        )
         shape = NUM_ROWS, num_axes, 2, chunks_at_once, models_at_once
         starts = range(0, num_chunks, chunks_at_once), range(0, num_models, models_at_once)
         for chunk, model in product(*starts):

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from flytrack_env import fusion
 from flytrack_env.compile_cache import FOLDER
@@ -31,59 +30,40 @@ UNKEPT = "Law["  # in the structure of models with a law: each is traced for its
 def keep_trace(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return ``fast_jit`` of a function of trees of arrays, with traces stored on the disk.
 
-    Traces are stored only where compiled programs are stored, too (``flytrack_env.compile_cache``),
-    and only for calls that are not traced themselves.
+    Traces are stored only where compiled programs are stored, too (``flytrack_env.compile_cache``).
     """
-    program = fast_jit(function)
-    programs: dict[Any, Callable[..., Any]] = {}
 
     @functools.wraps(function)
-    def call(*args: Any) -> Any:
-        leaves, structure = jax.tree.flatten(args)
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
-            return function(*args)
+    def stored(*args: Any) -> Any:
         folder = getattr(jax.config, FOLDER)
-        if folder is None:
-            return program(*args)
-        kinds = tuple(map(_kind, leaves))
-        key = structure, kinds, jax.config.read("jax_enable_x64")
-        if key not in programs:
-            programs[key] = _load(function, structure, kinds, Path(folder) / "traced")
-        return programs[key](*leaves)
+        leaves, structure = jax.tree.flatten(args)
+        if folder is None or UNKEPT in str(structure):
+            return function(*args)
+        kinds = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+        return _load(function, structure, kinds, Path(folder) / "traced").call(*leaves)
 
-    return call
-
-
-def _kind(leaf: Any) -> tuple[tuple[int, ...], Any]:
-    """Return the shape and the type of a leaf."""
-    # Types of JAX take as long as a step of a replay.
-    typed = leaf if isinstance(leaf, np.ndarray | jax.Array) else jax.typeof(leaf)
-    return typed.shape, jax.dtypes.canonicalize_dtype(typed.dtype)
+    return fast_jit(stored)
 
 
 def _load(
     function: Callable[..., Any], structure: Any, kinds: tuple[Any, ...], folder: Path
-) -> Callable[..., Any]:
+) -> jax.export.Exported:
     """Return the program of leaves, loaded from the disk, or traced and stored there."""
+    path = folder / _digest(function, str(structure), kinds)
+    stored = _read(path)
+    if stored is not None:
+        return jax.export.deserialize(stored)
 
     def of_leaves(*leaves: Any) -> Any:
         return function(*jax.tree.unflatten(structure, leaves))
 
     of_leaves.__name__ = function.__name__
-    program, text = fast_jit(of_leaves), str(structure)
-    if UNKEPT in text:
-        return program
-    path = folder / _digest(function, text, kinds)
-    stored = _read(path)
-    if stored is not None:
-        exported = jax.export.deserialize(stored)
-    else:
-        shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds]
-        exported = jax.export.export(program)(*shapes)
-        content = exported.serialize()
-        with contextlib.suppress(OSError):  # a full disk, or a folder that is being recreated
-            write_atomically(path, hashlib.sha256(content).digest() + content)
-    return fast_jit(exported.call)
+    shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds]
+    exported = jax.export.export(fast_jit(of_leaves))(*shapes)
+    content = exported.serialize()
+    with contextlib.suppress(OSError):  # a full disk, or a folder that is being recreated
+        write_atomically(path, hashlib.sha256(content).digest() + content)
+    return exported
 
 
 def _read(path: Path) -> bytearray | None:
