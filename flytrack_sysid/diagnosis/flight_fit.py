@@ -34,6 +34,7 @@ class Fit(NamedTuple):
         losses: cost of each block of windows without a fit to this block, (blocks,), to first
             order (Takeuchi, "Distribution of informational statistics and a criterion of model
             fitting", Suri-Kagaku 153, 1976).
+        columns: slopes of the relative errors along the free parameters, (indices, windows, ...).
     """
 
     vector: np.ndarray
@@ -41,11 +42,30 @@ class Fit(NamedTuple):
     covariance: np.ndarray
     half_widths: np.ndarray
     losses: np.ndarray
+    columns: np.ndarray
 
     @property
     def quantile(self) -> float:
         """Standard deviations in half of a 95 % interval, Student's t for the number of blocks."""
         return float(stats.t.ppf(0.975, max(len(self.losses), 2) - 1))
+
+
+class Linearized(NamedTuple):
+    """A model's errors on windows to first order.
+
+    Attributes:
+        residuals: relative errors, (windows, numbers).
+        columns: their slopes along the free parameters, (indices, windows, numbers).
+        information: of the free parameters with the prior, (indices, indices).
+        scores: of windows, (windows, indices).
+        cost: as of ``Target.cost``.
+    """
+
+    residuals: np.ndarray
+    columns: np.ndarray
+    information: np.ndarray
+    scores: np.ndarray
+    cost: float
 
 
 def huber_loss(residuals: np.ndarray) -> np.ndarray:
@@ -79,25 +99,35 @@ class Target(NamedTuple):
         robust = huber_loss(residuals).sum(axis=1)
         return robust + np.square(vectors - self.problem.start) @ prior_information(self.problem)
 
-    def fitted(self, vector: np.ndarray, indices: Sequence[int], rounds: int) -> Fit:
-        """Fit a model from a start vector by damped Gauss-Newton with one-sided differences."""
+    def fitted(
+        self, vector: np.ndarray, indices: Sequence[int], rounds: int, nearby: Fit | None = None
+    ) -> Fit:
+        """Fit a model from a start vector by damped Gauss-Newton with one-sided differences.
+
+        Args:
+            vector: where the fit starts.
+            indices: of the free parameters.
+            rounds: the most iterations.
+            nearby: a fit along these indices and others whose slopes serve for this one, too.
+        """
         problem, free_indices = self.problem, np.array(indices, int)
+        columns = nearby and nearby.columns[[nearby.indices.index(index) for index in indices]]
         vector = problem.clipped(vector)
         for _ in range(rounds):
-            information, scores, cost = self.linearized(vector, indices)
+            at_vector = self.linearized(vector, indices, columns)
             prior, pull = (
                 prior_information(problem)[free_indices],
                 (vector - problem.start)[free_indices],
             )
-            candidates = self._ways(
-                vector, free_indices, information, scores.sum(axis=0) + prior * pull
-            )
+            gradient = at_vector.scores.sum(axis=0) + prior * pull
+            candidates = self._ways(vector, free_indices, at_vector.information, gradient)
             costs = self.cost(self.residuals(candidates), candidates)
             best = int(np.argmin(costs))
-            if costs[best] > cost * (1.0 - MIN_GAIN):
+            if costs[best] > at_vector.cost * (1.0 - MIN_GAIN):
                 break
             vector = candidates[best]
-        information, scores, _ = self.linearized(vector, indices, LAG_STEP * self.step_s)
+        final = self.linearized(vector, indices, columns, LAG_STEP * self.step_s)
+        information, scores = final.information, final.scores
         whole = self._covariance(information, scores)
         room = 1e-6 * problem.scale[free_indices]
         is_inside = (vector - problem.low)[free_indices] > room
@@ -108,8 +138,9 @@ class Target(NamedTuple):
         variances = np.where(is_inside, np.diag(covariance), np.diag(whole))
         by_block = self.windows.sums_by_block(scores[:, is_inside])
         moved = solve(information[inside], by_block.T).T
-        losses = self.losses(vector) + 2.0 * (by_block * moved).sum(axis=1)
-        return Fit(vector, tuple(indices), covariance, np.sqrt(variances), losses)
+        losses = self.windows.sums_by_block(huber_loss(final.residuals))
+        losses += 2.0 * (by_block * moved).sum(axis=1)
+        return Fit(vector, tuple(indices), covariance, np.sqrt(variances), losses, final.columns)
 
     def nearer_nominal(self, fit: Fit, field: str) -> Fit:
         """Return a fit with a parameter as near to nominal as changes no flight.
@@ -124,9 +155,10 @@ class Target(NamedTuple):
         changes = np.abs(residuals - residuals[-1]).max(axis=(1, 2)) > 0.0
         return fit._replace(vector=vectors[np.flatnonzero(changes).max(initial=-1) + 1])
 
-    def losses(self, vector: np.ndarray) -> np.ndarray:
-        """Return the cost of each block of windows, (blocks,)."""
-        return self.windows.sums_by_block(huber_loss(self.residuals(vector[None])[0]))
+    def losses(self, *vectors: np.ndarray) -> np.ndarray:
+        """Return the cost of each block of windows, (num_vectors, blocks)."""
+        by_window = huber_loss(self.residuals(np.stack(vectors)))
+        return np.stack([self.windows.sums_by_block(one) for one in by_window])
 
     @property
     def step_s(self) -> float:
@@ -134,24 +166,33 @@ class Target(NamedTuple):
         return float(np.median(self.windows.record.step_s))
 
     def linearized(
-        self, vector: np.ndarray, indices: Sequence[int], least_lag_s: float = 0.0
-    ) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return information, scores of windows, (windows, indices), and cost of a vector.
+        self,
+        vector: np.ndarray,
+        indices: Sequence[int],
+        columns: np.ndarray | None = None,
+        least_lag_s: float = 0.0,
+    ) -> Linearized:
+        """Return a model's errors to first order.
 
         Args:
             vector: all parameters.
             indices: of the free ones.
+            columns: slopes of a nearby model; if None, those of this one.
             least_lag_s: as of ``Problem.nudged``.
         """
         problem = self.problem
-        moved, step = problem.nudged(vector, indices, least_lag_s=least_lag_s)
-        residuals = self.residuals(np.concatenate([vector[None], moved]))
-        columns = (residuals[1:] - residuals[0]) / step[:, None, None]
-        root = np.sqrt(OUTLIER / np.maximum(np.abs(residuals[0]), OUTLIER))
-        scores = np.einsum("pwn,wn->wp", columns, residuals[0] * root**2)
-        flat = (columns * root).reshape(len(step), -1)
+        if columns is None:
+            moved, step = problem.nudged(vector, indices, least_lag_s=least_lag_s)
+            residuals, *others = self.residuals(np.concatenate([vector[None], moved]))
+            columns = (np.array(others) - residuals) / step[:, None, None]
+        else:
+            residuals = self.residuals(vector[None])[0]
+        root = np.sqrt(OUTLIER / np.maximum(np.abs(residuals), OUTLIER))
+        scores = np.einsum("pwn,wn->wp", columns, residuals * root**2)
+        flat = (columns * root).reshape(len(indices), -1)
         information = flat @ flat.T + np.diag(prior_information(problem)[list(indices)])
-        return information, scores, float(self.cost(residuals[:1], vector[None])[0])
+        cost = float(self.cost(residuals[None], vector[None])[0])
+        return Linearized(residuals, columns, information, scores, cost)
 
     def _ways(
         self,

@@ -1,6 +1,7 @@
 """Select effects: drop unneeded ones, and swap rivals in that explain more."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -203,12 +204,20 @@ def select_effects(
     """Return the model with unneeded effects removed and better ones swapped in, and ablations."""
     while True:
         state, linearization = state.linearized(model.vector)
-        ablated = [ablate(state, model, linearization, one.effect) for one in model.candidates]
-        weakest = min(ablated, key=lambda one: one.margin, default=None)
-        if weakest is not None and weakest.margin < 0.0:
-            model = weakest.without
+        effects = [candidate.effect for candidate in model.candidates]
+        ablated: dict[str, Ablation] = {}
+        # The weakest to first order comes first: mostly it is the only one that is not needed.
+        for effect in sorted(effects, key=partial(noncentrality, linearization, model)):
+            ablated[effect] = ablate(state, model, linearization, effect)
+            if ablated[effect].margin < 0.0:
+                break
+        unneeded = [one for one in ablated.values() if one.margin < 0.0]
+        if unneeded:
+            model = unneeded[0].without
             continue
-        ablations = with_rivals(state, model, linearization, ablated)
+        ablations = with_rivals(
+            state, model, linearization, [ablated[effect] for effect in effects]
+        )
         swaps = [swap for one in ablations.values() for swap in one.swaps.values()]
         trials = (*swaps, *with_lags_anew(state, model), *with_moving_air(state, model))
         best = min(trials, key=price, default=model)
@@ -283,24 +292,26 @@ class Separation(NamedTuple):
     beside: Mapping[str, float]
 
 
+def noncentrality(
+    linearization: Linearization, model: FittedModel, effect: str, beside: Sequence[int] = ()
+) -> float:
+    """Return lambda of ``Separation`` of an effect, with further columns projected out, too."""
+    problem, fields = linearization.problem, model.candidate(effect).fields
+    columns = [linearization.column(field) for field in fields]
+    size = (model.vector - problem.start)[problem.parameter_indices(fields)]
+    given = linearization.columns_at(model.indices, without=columns)
+    return float(size @ linearization.projected(columns, [*given, *beside])[0] @ size)
+
+
 def separation(linearization: Linearization, model: FittedModel, effect: str) -> Separation:
     """Return how clearly a log shows an effect of a model, alone and beside its rivals."""
-    problem, effect_candidate = linearization.problem, model.candidate(effect)
-    columns = [linearization.column(field) for field in effect_candidate.fields]
-    size = (model.vector - problem.start)[problem.parameter_indices(effect_candidate.fields)]
-    given = linearization.columns_at(model.indices, without=columns)
-
-    def beside(others: list[int]) -> float:
-        return float(size @ linearization.projected(columns, others)[0] @ size)
-
     rivals: dict[str, float] = {}
-    for candidate in candidates_for(problem):
+    for candidate in candidates_for(linearization.problem):
         if candidate.effect not in model.effects:
-            noncentrality = beside(
-                given + linearization.acting(linearization.columns_of(candidate))
-            )
-            rivals[candidate.effect] = min(noncentrality, rivals.get(candidate.effect, np.inf))
-    return Separation(beside(given), rivals)
+            columns = linearization.acting(linearization.columns_of(candidate))
+            left = noncentrality(linearization, model, effect, columns)
+            rivals[candidate.effect] = min(left, rivals.get(candidate.effect, np.inf))
+    return Separation(noncentrality(linearization, model, effect), rivals)
 
 
 def equivalents(ablation: Ablation, effect_separation: Separation) -> tuple[str, ...]:

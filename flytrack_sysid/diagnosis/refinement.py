@@ -252,34 +252,14 @@ class _Refinement(NamedTuple):
         ]
         removed = [candidate.effect for candidate in refined.kept if candidate not in kept]
         while any(candidate.effect in self.acting for candidate in kept):
-            tried = [candidate for candidate in kept if candidate.effect in self.acting]
-            fits = [self._without(target, fit, kept, candidate) for candidate in tried]
-            losses = np.stack([self._losses(target, one) for one in (fit, *fits)])
-            losses_more = (losses[1:] - losses[0]).T
-            sure = sureness(losses_more)
-            worth = np.sqrt(losses[1:].sum(axis=1) / losses[0].sum()) - 1.0
-            needed = np.where(
-                (worth >= WORTHWHILE) & (sure >= LIKELY), np.maximum(sure, SURE), sure
-            )
-            needed[:] = needed if flight_test.matters.any() else np.inf  # no cell is evidence
-            held_out_sure = sureness(losses_more[len(fit.losses) :])
-            is_doubted = np.array([candidate.effect in self.doubted for candidate in tried])
-            needed[is_doubted & (held_out_sure < LIKELY)] = -np.inf
-            without = {
-                candidate.effect: reduced_fit.vector
-                for candidate, reduced_fit in zip(tried, fits, strict=True)
-            }
-            if self.is_explained and not flight_test.is_surely_worse(fit.vector):
+            weakest, fits = self._least_needed(target, fit, kept, flight_test, nearby=fit)
+            if weakest is None:  # slopes of the fit make effects look more needed than they are
+                weakest, fits = self._least_needed(target, fit, kept, flight_test)
+            without = {effect: one.vector for effect, one in fits.items()}
+            if weakest is None:
                 break
-            weakest = int(np.argmin(needed))
-            if needed[weakest] >= SURE:
-                if flight_test.worst_ratio(fit.vector) < 1.0:
-                    break
-                weakest = int(
-                    np.argmin([flight_test.worst_ratio(reduced_fit.vector) for reduced_fit in fits])
-                )
-            kept.remove(tried[weakest])
-            removed.append(tried[weakest].effect)
+            kept = [candidate for candidate in kept if candidate.effect != weakest]
+            removed.append(weakest)
             indices = self.indices(target.problem, kept)
             fit = target.fitted(fits[weakest].vector, indices, MAX_ROUNDS)
         if not any(
@@ -289,6 +269,44 @@ class _Refinement(NamedTuple):
         if not self.is_explained:
             fit, kept = self._narrowed(target, fit, kept)
         return refined._replace(kept=tuple(kept), fit=fit, removed=tuple(removed), without=without)
+
+    def _least_needed(
+        self,
+        target: Target,
+        fit: Fit,
+        kept: Sequence[Candidate],
+        flight_test: FlightTest,
+        nearby: Fit | None = None,
+    ) -> tuple[str | None, dict[str, Fit]]:
+        """Return the effect to remove, None if all are needed, and the fits without each effect.
+
+        Args:
+            target: of the fits.
+            fit: with all effects.
+            kept: the effects.
+            flight_test: of the fit.
+            nearby: as of ``Target.fitted``.
+        """
+        tried = [candidate for candidate in kept if candidate.effect in self.acting]
+        fits = [self._without(target, fit, kept, candidate, nearby) for candidate in tried]
+        by_effect = {one.effect: reduced for one, reduced in zip(tried, fits, strict=True)}
+        if self.is_explained and not flight_test.is_surely_worse(fit.vector):
+            return None, by_effect
+        losses = self._losses(target, fit, *fits)
+        losses_more = (losses[1:] - losses[0]).T
+        sure = sureness(losses_more)
+        worth = np.sqrt(losses[1:].sum(axis=1) / losses[0].sum()) - 1.0
+        needed = np.where((worth >= WORTHWHILE) & (sure >= LIKELY), np.maximum(sure, SURE), sure)
+        needed[:] = needed if flight_test.matters.any() else np.inf  # no cell is evidence
+        held_out_sure = sureness(losses_more[len(fit.losses) :])
+        is_doubted = np.array([candidate.effect in self.doubted for candidate in tried])
+        needed[is_doubted & (held_out_sure < LIKELY)] = -np.inf
+        weakest = int(np.argmin(needed))
+        if needed[weakest] >= SURE:
+            if flight_test.worst_ratio(fit.vector) < 1.0:
+                return None, by_effect
+            weakest = int(np.argmin([flight_test.worst_ratio(one.vector) for one in fits]))
+        return tried[weakest].effect, by_effect
 
     def _narrowed(
         self, target: Target, fit: Fit, kept: Sequence[Candidate]
@@ -308,24 +326,32 @@ class _Refinement(NamedTuple):
                 )
                 vector = target.problem.at_start(fit.vector, [field])
                 held = target.fitted(vector, self.indices(target.problem, others), MAX_ROUNDS)
-                if sureness(self._losses(target, held) - self._losses(target, fit)) >= SURE:
+                losses = self._losses(target, fit, held)
+                if sureness(losses[1] - losses[0]) >= SURE:
                     break
                 fit, kept = held, others
             for field in at_bounds(target.problem, fit.vector, kept[number].fields):
                 fit = target.nearer_nominal(fit, field)
         return fit, kept
 
-    def _losses(self, target: Target, fit: Fit) -> np.ndarray:
-        """Return the cross-validated cost of each block, learnt ones first, (blocks,)."""
+    def _losses(self, target: Target, *fits: Fit) -> np.ndarray:
+        """Return the cross-validated cost of each block, learnt ones first, (fits, blocks)."""
         held_out = target._replace(windows=self.flight_test.windows)
-        return np.concatenate([fit.losses, held_out.losses(fit.vector)])
+        learnt = np.stack([fit.losses for fit in fits])
+        return np.concatenate([learnt, held_out.losses(*(fit.vector for fit in fits))], axis=1)
 
     def _without(
-        self, target: Target, fit: Fit, kept: Sequence[Candidate], removed: Candidate
+        self,
+        target: Target,
+        fit: Fit,
+        kept: Sequence[Candidate],
+        removed: Candidate,
+        nearby: Fit | None,
     ) -> Fit:
         vector = target.problem.at_start(fit.vector, removed.fields)
         remaining = [candidate for candidate in kept if candidate is not removed]
-        return target.fitted(vector, self.indices(target.problem, remaining), REFIT_ROUNDS)
+        indices = self.indices(target.problem, remaining)
+        return target.fitted(vector, indices, REFIT_ROUNDS, nearby)
 
 
 def _acting(

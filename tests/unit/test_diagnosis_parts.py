@@ -47,6 +47,7 @@ from tests.support.written_logs import with_channels
 SECONDS, DT_S = 40.0, 0.01
 RATE = 100  # rows a second
 BATTERY = NUM_AXES - 1  # it has no direct channel
+NO_SLOPES = np.zeros((0, 0, 0))
 # Of the sensors, rad/s, m/s^2, rad, m/s, V; and of gusts that shake both sides.
 DIRECT = np.repeat([0.1, 1.5, 1.0], [3, 3, 1])
 LEVEL = np.repeat([0.01, 0.05, 0.01], [3, 3, 1])
@@ -347,7 +348,7 @@ def test_a_value_that_no_flight_depends_on_is_not_told(state):
     indices = tuple(problem.parameter_indices([f"command_delay.{name}" for name in names]))
     moved = problem.start.copy()
     moved[indices[0]] = 0.01
-    fit = Fit(moved, indices, np.diag([1e-6, 0.0]), np.array([1e-3, 0.0]), np.zeros(1))
+    fit = Fit(moved, indices, np.diag([1e-6, 0.0]), np.array([1e-3, 0.0]), np.zeros(1), NO_SLOPES)
     told = {name: Estimated(0.01, (0.0, 0.02), "s") for name in names}
     cause = replace(CAUSE, effect="command_delay", parameters=told)
     refined = Refined((), fit, None, (), {}, problem, None)
@@ -360,7 +361,7 @@ def test_a_cause_lists_all_that_was_fitted_and_goes_where_flights_show_none_of_i
     """A delay of nothing and of thrust alone is one of thrust; one of neither is no cause."""
     problem, names = state.problem, ("delay_s", "thrust_extra_s")
     indices = tuple(problem.parameter_indices([f"command_delay.{name}" for name in names]))
-    fit = Fit(problem.start, indices, np.eye(2), np.array([0.02, 0.02]), np.zeros(1))
+    fit = Fit(problem.start, indices, np.eye(2), np.array([0.02, 0.02]), np.zeros(1), NO_SLOPES)
     cause = replace(
         CAUSE, effect="command_delay", parameters={"delay_s": Estimated(0.01, (0.0, 0.02), "s")}
     )

@@ -27,6 +27,7 @@ BIAS = next(one for one in CANDIDATES if one.effect == "accelerometer_bias")
 SCALE = next(one for one in CANDIDATES if one.effect == "rate_scale")
 DELAY = next(one for one in CANDIDATES if one.effect == "command_delay" and len(one.fields) > 2)
 CIRCLE_S, RADIUS_M = 4.0, 1.0
+NO_SLOPES = np.zeros((0, 0, 0))
 
 
 def build_problem(truth, log):
@@ -92,6 +93,25 @@ def test_what_flights_do_not_show_is_removed(dragged, candidate, values, doubted
     assert found.removed == (candidate.effect,)
 
 
+def test_slopes_of_a_fit_lead_to_nearly_the_same_fit_without_an_effect(dragged):
+    problem, flight_test, fit = dragged[2], dragged[3].flight_test, dragged[3].fit
+    is_fitted = np.ones(flight_test.scale.shape, bool)
+    target = Target(problem, flight_test.windows, flight_test.scale, is_fitted)
+    fields = problem.parameter_indices(DRAG.fields)
+    remaining = [index for index in fit.indices if index not in fields]
+    start = problem.at_start(fit.vector, DRAG.fields)
+    with jax.enable_x64(True):
+        whole = target.fitted(fit.vector, fit.indices, 10)
+        own, shared = (target.fitted(start, remaining, 2, nearby) for nearby in (None, whole))
+        before, of_whole, of_own, of_shared = (
+            target.losses(vector)[0].sum()
+            for vector in (start, whole.vector, own.vector, shared.vector)
+        )
+    assert of_whole < 0.7 * of_own and of_own < before
+    assert of_shared == pytest.approx(of_own, rel=0.02)
+    assert np.array_equal(shared.columns, whole.columns[[whole.indices.index(i) for i in remaining]])
+
+
 def test_what_changes_no_flight_at_a_bound_goes_back(dragged):
     problem, flight_test = dragged[2], dragged[3].flight_test
     fields = ("command_delay.delay_s", "command_delay.yaw_extra_s", "linear_drag.d_x")
@@ -119,7 +139,7 @@ def test_a_parameter_is_superfluous_beside_others_at_a_bound_or_where_all_may_be
     ]
     vector = problem.start.copy()
     vector[indices] = values
-    fit = Fit(vector, tuple(indices), np.zeros((3, 3)), np.array(halves), np.zeros(1))
+    fit = Fit(vector, tuple(indices), np.zeros((3, 3)), np.array(halves), np.zeros(1), NO_SLOPES)
     assert (superfluous(problem, fit, DELAY) or "") == expected
 
 
