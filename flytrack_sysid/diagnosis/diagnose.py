@@ -62,7 +62,7 @@ from flytrack_sysid.inference.search import (
     extended,
     with_refitted_noise,
 )
-from flytrack_sysid.log import STATED_VOLTAGES, FlightLog, LogError
+from flytrack_sysid.log import STATED_MASS, STATED_VOLTAGES, FlightLog, LogError
 from flytrack_sysid.log_motion import (
     check_commands,
     check_same_origin,
@@ -536,7 +536,8 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
 
     Raises:
         DiagnosisError: no log.
-        LogError: measured logs beside others, or packs of different stated voltages.
+        LogError: measured logs beside others, or packs of different stated voltages, or craft of
+            different stated masses.
     """
     if not logs:
         raise DiagnosisError("logs: found none, expected at least one")
@@ -556,6 +557,11 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
         raise LogError(
             f"{', '.join(STATED_VOLTAGES)}: found {shown}; expected logs of one pack in one command"
         )
+    if len({flight_log.stated_mass_kg for flight_log in logs}) > 1:
+        shown = ", ".join(
+            f"{Path(flight_log.source).name}: {flight_log.stated_mass_kg}" for flight_log in logs
+        )
+        raise LogError(f"{STATED_MASS}: found {shown}; expected logs of one craft in one command")
     names = set.intersection(*(set(log.channels) for log in logs))
     first = np.cumsum([0, *(len(np.unique(log.segment)) for log in logs)])
     segments = [
@@ -570,6 +576,7 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
         origin=logs[0].origin,
         has_motors=logs[0].has_motors,
         stated_voltage_v=logs[0].stated_voltage_v,
+        stated_mass_kg=logs[0].stated_mass_kg,
     )
 
 

@@ -67,9 +67,12 @@ OPERATIONS = {
 @pytest.mark.parametrize("operation", OPERATIONS)
 def test_what_is_stated_survives(operation, truth, tmp_path):
     for origin, voltages in (("measured", FOUR_CELLS), ("simulated", None), (None, FOUR_CELLS)):
-        log = replace(truth.without("v_bat"), origin=origin, stated_voltage_v=voltages)
+        log = replace(
+            truth.without("v_bat"), origin=origin, stated_voltage_v=voltages, stated_mass_kg=0.7
+        )
         result = OPERATIONS[operation](log, tmp_path)
         assert (result.origin, result.stated_voltage_v) == (origin, voltages)
+        assert result.stated_mass_kg == 0.7
 
 
 def test_the_hash_is_of_the_rows_alone():
@@ -89,6 +92,7 @@ LATER = (np.arange(NUM_ROWS) > 3) * ONES
         ({"measured": LATER}, r"row 4.*measured: found 1\.0, expected 0 as in row 0"),
         ({"v_bat_low": ONES}, "column v_bat_high: missing; found only v_bat_low"),
         ({"v_bat_low": 17.0 * ONES, "v_bat_high": ONES}, "found 17 to 1 V, expected"),
+        ({"mass_kg": 0.0 * ONES}, "mass_kg: found 0 kg, expected a mass above 0"),
     ],
 )
 def test_files_that_state_nonsense_are_refused(suffix, columns, message, tmp_path):
@@ -156,6 +160,9 @@ def test_logs_of_different_origin_are_refused():
     other = replace(second, origin="measured", stated_voltage_v=FOUR_CELLS)
     with pytest.raises(LogError, match=r"v_bat_low, v_bat_high: found .*expected logs of one pack"):
         joined([first, other])
+    heavier = replace(first, stated_mass_kg=0.8)
+    with pytest.raises(LogError, match=r"mass_kg: found .*expected logs of one craft"):
+        joined([first, heavier])
 
 
 # --- Voltage --------------------------------------------------------------------------------------

@@ -11,7 +11,8 @@ from flytrack_env.motors import NAMES
 from flytrack_env.toml_file import parse_toml
 from flytrack_sysid.check import check_log, text_of
 from flytrack_sysid.check.fix import fix_mapping
-from flytrack_sysid.fit import fit
+from flytrack_sysid.estimate import FitError
+from flytrack_sysid.fit import fit, what_is_fitted
 from flytrack_sysid.importing import import_log, mapping
 from flytrack_sysid.importing.flight import Craft
 from flytrack_sysid.importing.mapping import Frame
@@ -67,6 +68,56 @@ def test_stated_numbers_replace_those_of_a_known_craft_whatever_they_are(monkeyp
     unstated = {name: getattr(known, name) for name in ("front_m", "rear_m", "yaw_arm_m")}
     motors = Frame(**unstated, inertia_kg_m2=known.inertia_kg_m2).motors(0.028)
     assert (motors.up_s, motors.down_s, motors.rotor_momentum) == (0.03, 0.03, 0.0)
+
+
+def test_a_known_crafts_mass_and_inertia_are_not_replaced_in_silence(log, tmp_path):
+    path, map_file = write_csv(tmp_path, log, frame='craft = "iris"')
+    text = map_file.read_text()
+    both = "frame: mass_kg: found 0.8, iris has 1.535; inertia_kg_m2: found (0.004, 0.005, 0.008)"
+    [warning] = [note for note in import_log(path, "csv", map_file).notes if "warning" in note]
+    assert f"{both}, iris has (0.029125, 0.029125, 0.055225)" in warning
+    without = text.replace("inertia_kg_m2 = [0.004, 0.005, 0.008]", "")
+    map_file.write_text(
+        without.replace("mass_kg = 0.8", "").replace("[craft]", "[craft]\nmass_kg = 1")
+    )
+    [warning] = [note for note in import_log(path, "csv", map_file).notes if "warning" in note]
+    assert "mass_kg: found 1.0, iris has 1.535; the rest is that of iris" in warning
+    map_file.write_text(without.replace("mass_kg = 0.8", "mass_kg = 1.535"))
+    assert not [note for note in import_log(path, "csv", map_file).notes if "warning" in note]
+
+
+def test_a_model_of_another_mass_than_the_mapping_states_is_doubted(log, tmp_path):
+    path, map_file = write_csv(tmp_path, log)
+    found = import_log(path, "csv", map_file)
+    save_log(tmp_path / "log.npz", found.log)
+    again, model = load_log(tmp_path / "log.npz"), found.nominal_model()
+    assert again.stated_mass_kg == 0.8
+    assert not [note for note in validate(model, again).notes if note.startswith("mass:")]
+    [note] = [
+        note for note in validate(model._replace(m=0.9), again).notes if note.startswith("mass:")
+    ]
+    assert "states 0.8 kg, and the model 0.9 kg, which is used" in note
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ({"effects": ["rate_scale"]}, "effects: rate_scale: acts on sticks"),
+        ({"fixed": {"tau_roll": 0.05}}, r"fixed: tau_roll: found 0\.05, expected none"),
+        (
+            {"effects": ["command_delay"], "fixed": {"command_delay.yaw_extra_s": 0.0}},
+            r"fixed: command_delay\.yaw_extra_s: found 0, expected none",
+        ),
+    ],
+)
+def test_a_fit_of_motors_refuses_what_acts_on_sticks(log, arguments, expected):
+    with pytest.raises(FitError, match=expected):
+        fit(log, model_of(crafts()), accept=True, **arguments)
+
+
+def test_a_fit_of_motors_frees_their_common_delay_alone(log):
+    _, free, _ = what_is_fitted(log, model_of(crafts()), effects=["command_delay"], accept=True)
+    assert [name for name in free if name.startswith("command_delay")] == ["command_delay.delay_s"]
 
 
 @pytest.mark.parametrize(("old", "new", "expected"), CASES["tables"])
