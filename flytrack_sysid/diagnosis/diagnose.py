@@ -11,6 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
+from flytrack_env.effects import takes_motors
 from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis import craft, summary
@@ -446,7 +447,8 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
     named = name_causes(vetted, parts)
     selection, linearization = named.selection, named.linearization
     problem, unexplained = selection.state.problem, selection.unexplained
-    causes = with_families((one for one in named.found if not one.beyond), unexplained)
+    has_motors = takes_motors(problem.like.effects)
+    causes = with_families((one for one in named.found if not one.beyond), unexplained, has_motors)
     beyond = (*vetted.refused, *(one for one in named.found if one.beyond))
     outliers = find_outliers((problem, test), named.extended.vector)
     vectors = {

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_env.effects import BY_NAME
+from flytrack_env.effects import BY_NAME, takes_motors
 from flytrack_sysid.diagnosis import model_selection
 from flytrack_sysid.diagnosis import unexplained as unknown
 from flytrack_sysid.diagnosis.result import Unexplained
@@ -261,9 +261,11 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
     A law that holds in transients only stands for dynamics that are not in the list of effects. For
     example, feedforward turns faster than commanded on the way to full stick, as a scale and a
     saturation would, but not while the stick stays there. Where turns are left unexplained, laws
-    that this log never shows at rest are rejected, too.
+    that this log never shows at rest are rejected, too. Where motors are commanded, there are none.
     """
     state, model = selection.state, selection.model
+    if takes_motors(state.problem.like.effects):
+        return []
     laws = [name for name in selection.ablations if BY_NAME[name].search.follows_sticks]
     if state.problem.counts[..., AXES[0], 1].any():  # attitude tells a gyro from any rate loop
         laws = [name for name in laws if "gyro" not in BY_NAME[name].hooks]
