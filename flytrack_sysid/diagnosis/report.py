@@ -142,7 +142,7 @@ def _families(diagnosis: Diagnosis) -> str:
 
 def describe_fault(cause: str, diagnosis: Diagnosis) -> str:
     """Return the verb for a cause: compares the value in the flight with that in the model."""
-    if cause not in BY_NAME or cause.endswith("_scale"):
+    if cause not in BY_NAME or cause.endswith("_scale") or BY_NAME[cause].search.is_setting:
         return WRONG
     neutral, notable = BY_NAME[cause].parameters(), BY_NAME[cause].notable
     models = [model.effect(cause) for model in (diagnosis.nominal, diagnosis.extended)]
