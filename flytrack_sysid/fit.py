@@ -40,6 +40,7 @@ from flytrack_sysid.log_voltage import (
 )
 from flytrack_sysid.plausibility import check_plausible
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
+from flytrack_sysid.torque import torque_notes
 
 # Half-widths of 95 % intervals above which there is a warning: relative to a time constant, and to
 # full thrust.
@@ -319,7 +320,7 @@ def fit(
     model, free, scored_rows = what_is_fitted(log, start, fixed, effects, every, motion, accept)
     notes = motion_notes(log, start, motion, f"replayed as {model.motion.value}")
     given = model.battery
-    notes += voltage_notes(log, given)
+    notes += torque_notes(log, model) + voltage_notes(log, given)
     log = with_voltage(log, model)
     try:
         result = estimate(log, scored_rows, model, free, report)

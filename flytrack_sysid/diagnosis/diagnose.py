@@ -72,6 +72,7 @@ from flytrack_sysid.log_motion import (
 )
 from flytrack_sysid.log_voltage import battery_of_craft, voltage_notes, with_voltage
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
+from flytrack_sysid.torque import torque_notes
 
 STAGES = ("first look", "search", "vetoes", "refinement", "summary")
 Report = Callable[[int, int], None]
@@ -206,7 +207,7 @@ def split(
     motion = required_motion(log, motion)
     model = nominal_parameters() if model is None else model
     check_commands(log, model)
-    warnings += voltage_notes(log, model.battery)
+    warnings += torque_notes(log, model) + voltage_notes(log, model.battery)
     log = with_voltage(log, model)
     model = model._replace(battery=battery_of_craft(log, model.battery))
     reductions: list[Callable[[FlightLog], tuple[FlightLog, np.ndarray, list[str]]]] = [

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_env.effects import BY_NAME, takes_motors
+from flytrack_sysid import torque
 from flytrack_sysid.diagnosis import model_selection
 from flytrack_sysid.diagnosis import unexplained as unknown
 from flytrack_sysid.diagnosis.result import Unexplained
@@ -20,6 +21,7 @@ from flytrack_sysid.inference.problem import Problem, split_blocks
 from flytrack_sysid.inference.record import Record
 from flytrack_sysid.inference.score_test import ALL_BASE_CAUSES, change_threshold, threshold
 from flytrack_sysid.inference.search import FittedModel, SearchState
+from flytrack_sysid.torque import MotorRecord
 
 # Held-out rows contradict a cause if two conditions hold. Its gain is HELD_OUT_SIGMAS standard
 # deviations below the expected gain, and less than HELD_OUT_SHARE of its size shows. The second one
@@ -43,6 +45,13 @@ DISTURBED, DISTURBED_BASE, KEPT_SHARE = 3.0, 10.0, 0.1
 # A stand-in for something unknown explains a part of it. A name that explains this many times what
 # the dependences explain is no stand-in: the dependences are the remainder of its law.
 OUTWEIGHS = 30.0
+LOAD = "motors.load"  # acts on force alone
+# Causes in the base that show in torques about an axis only.
+OF_TORQUE = {
+    "inertia_x": ("roll",),
+    "inertia_y": ("pitch",),
+    "center_of_mass": ("roll", "pitch"),
+}
 
 
 class Selection(NamedTuple):
@@ -295,6 +304,23 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
     return laws if is_unseen or is_contradicted(gain, expected, inflation) else []
 
 
+def turned_by_unseen_torque(selection: Selection, test: Problem) -> list[str]:
+    """Reject changes of single motors and damping where the log does not show torque."""
+    problem, model = selection.state.problem, selection.model
+    candidates = [one for one in model.candidates if BY_NAME[one.effect].takes_motors]
+    turning = [one.effect for one in candidates if one.fields != (LOAD,)]
+    return turning if turning and unseen_torques(problem) else []
+
+
+def unseen_torques(problem: Problem) -> list[str]:
+    """Return the axes about which the log does not show the torque of motors, of ``AXES``."""
+    if not takes_motors(problem.like.effects) or "w" not in problem.chunks.measured:
+        return []
+    values = torque.torque_correlations(problem.like, MotorRecord.of_chunks(problem.chunks))
+    pairs = zip(torque.AXES, values, strict=True)
+    return [axis for axis, value in pairs if value < torque.MIN_CORRELATION]
+
+
 def is_force_law(effect: str) -> bool:
     """Return whether an effect is a law of a force, which may have the wrong form.
 
@@ -326,6 +352,7 @@ VETOES: tuple[Veto, ...] = (
     stands_in_for_unknown,
     contradicted_on_held_out,
     not_seen_at_rest,
+    turned_by_unseen_torque,
     seen_once,
 )
 CONTRADICTED, EXPLAINED_BY_CHANGE = contradicted_on_held_out.__name__, "explained_by_change"
@@ -339,5 +366,6 @@ REASONS = {
         "dynamics of the rate loop that no list has would look the same while sticks move; fly "
         "stick_amplitudes, and hold each stick for a second"
     ),
+    "turned_by_unseen_torque": "the log hardly shows the torque of the motors",
     "seen_once": "it gains barely enough where it was fitted, and nothing on held-out rows",
 }

@@ -1,7 +1,9 @@
 """Logs whose commands are the outputs of motors: imports, checks, fits and what they refuse."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 
@@ -11,15 +13,20 @@ from flytrack_env.motors import NAMES
 from flytrack_env.toml_file import parse_toml
 from flytrack_sysid.check import check_log, text_of
 from flytrack_sysid.check.fix import fix_mapping
+from flytrack_sysid.diagnosis.vetoes import turned_by_unseen_torque, unseen_torques
 from flytrack_sysid.estimate import FitError
 from flytrack_sysid.fit import fit, what_is_fitted
 from flytrack_sysid.importing import import_log, mapping
 from flytrack_sysid.importing.flight import Craft
 from flytrack_sysid.importing.mapping import Frame
+from flytrack_sysid.inference.chunks import cut_chunks
+from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.score_test import Candidate
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_file import load_log, save_log
 from flytrack_sysid.log_motion import DOUBTFUL_MOTORS, check_commands, motion_notes
 from flytrack_sysid.plausibility import find_problems
+from flytrack_sysid.torque import torque_notes
 from flytrack_sysid.validate import validate
 from tests.support.motor_flights import COLUMNS, flown, write_csv
 from tests.support.motor_models import crafts, model_of
@@ -194,6 +201,29 @@ def test_motors_of_measured_flights_are_doubted(log, origin):
     assert (DOUBTFUL_MOTORS in notes) is (origin == "measured")
     of_sticks = replace(log, origin=origin, has_motors=False)
     assert DOUBTFUL_MOTORS not in motion_notes(of_sticks, None, None, "chosen")
+
+
+def test_a_log_that_hardly_shows_torque_is_told_and_names_no_motor(log):
+    """As NanoBench, whose motors were logged at 100 Hz and resampled."""
+    model, rng = model_of(crafts()), np.random.default_rng(0)
+    noisy = with_channels(log, u=np.clip(log["u"] + rng.normal(0.0, 0.3, log["u"].shape), -1, 1))
+    assert not torque_notes(log, model) and not torque_notes(replace(log, has_motors=False), model)
+    assert not torque_notes(log.select(slice(60)), model)  # too short to say
+    (note,) = torque_notes(noisy, model)
+    assert "hardly shows the motors' torque" in note and "roll 0." in note
+    turned = Candidate("motors", ("motors.rear_left",))
+    for flown_log, axes in ((log, []), (noisy, ["roll", "pitch"])):
+        scored = np.ones(len(flown_log), bool)
+        with jax.enable_x64(True):
+            problem = Problem.of(cut_chunks(flown_log, scored, model), model)
+        assert unseen_torques(problem) == axes
+        for candidate in (turned, Candidate("motors", ("motors.load",))):
+            selected = SimpleNamespace(
+                state=SimpleNamespace(problem=problem),
+                model=SimpleNamespace(candidates=[candidate]),
+            )
+            expected = ["motors"] * (axes != [] and candidate is turned)
+            assert turned_by_unseen_torque(selected, problem) == expected
 
 
 @pytest.mark.slow
