@@ -35,6 +35,7 @@ from flytrack_sysid.inference.free_flight import (
     evaluate_windows,
     make_windows,
 )
+from flytrack_sysid.torque import MotorRecord, torque_correlations
 
 MAPPINGS = Path(__file__).parent / "mappings"
 HORIZON = HORIZONS_S.index(0.25)
@@ -42,6 +43,7 @@ RATES = QUANTITIES.index("rates")
 SPACING_S = 0.1
 ROTOR_DRAG = 0.0378  # s/m, of the Gazebo flight: its data's README
 LAGS = {"motors.up_s": 0.02, "motors.down_s": 0.03}
+PHOENIX = "crazyflie_rate_flights/seed00048_log1.csv.gz"
 NANOBENCH_LEARNT = ("B8_star_fast_rep1", "B9_trefoil_fast_rep14")
 NANOBENCH_HELD = ("B7_oval_fast_rep1", "B10_lissajous_fast_rep1")
 NANOBENCH_S = 17.0  # of each flight
@@ -62,6 +64,7 @@ CRAFTS = {
     "Gecko": Craft(("bf_gecko/btfl_002.bbl",), "betaflight", "gecko_motors", LAGS),
     "Crazyflie, log15": Craft(("cf_arpl_motors/log15",), "usd", "arpl_motors_log15"),
 }
+IRIS = Craft(("eth_quadrotor_model/quadrotor_model.csv",), "csv", "eth_motors")
 
 
 def read(craft: Craft) -> Imported:
@@ -117,7 +120,7 @@ def two_flights() -> list[Fit]:
 
 def rotor_drag() -> Fit:
     """Return the fit of the flight in Gazebo, with linear and rotor drag."""
-    flight = read(Craft(("eth_quadrotor_model/quadrotor_model.csv",), "csv", "eth_motors"))
+    flight = read(IRIS)
     return fit(
         flight.log, flight.nominal_model(), effects=("rotor_drag", "linear_drag"), accept=True
     )
@@ -148,12 +151,31 @@ def nanobench() -> dict[str, Any]:
     return {"ratios": ratios, "errors": errors, **shown}
 
 
-def main(out: Path | None = None, only: Literal["all", "nanobench"] = "all") -> None:
+def torques() -> dict[str, list[float]]:
+    """Return how changes of roll and pitch rate correlate with the motors' torque, by flight."""
+    phoenix = MAPPINGS / "phoenix_motors.toml"
+    flights = {
+        **{name: read(craft) for name, craft in CRAFTS.items()},
+        "Crazyflie, log16": read(Craft(("cf_arpl_motors/log16",), "usd", "arpl_motors_log16")),
+        "Crazyflie, rate policy": import_log(DATA / PHOENIX, "csv", phoenix),
+        "Gazebo's iris": read(IRIS),
+    }
+    for name in (*NANOBENCH_LEARNT, *NANOBENCH_HELD):
+        path = DATA / "nanobench" / f"{name}.csv.gz"
+        flights[f"NanoBench, {name}"] = import_log(path, "csv", "nanobench_motors")
+    return {
+        name: torque_correlations(flight.nominal_model(), MotorRecord.of_log(flight.log)).tolist()
+        for name, flight in flights.items()
+    }
+
+
+def main(out: Path | None = None, only: Literal["all", "nanobench", "torque"] = "all") -> None:
     """Measure and print; out: a file of JSON values."""
     results: dict[str, Any] = {"commit": report.commit_of_checkout()}
-    if only == "nanobench":
-        results["NanoBench"] = nanobench()
-        print(results["NanoBench"]["ratios"])
+    if only != "all":
+        results[only] = nanobench() if only == "nanobench" else torques()
+        for name, value in results[only].items():
+            print(name, value if only == "torque" or name == "ratios" else "")
         if out is not None:
             report.write_json(out, results)
         return
