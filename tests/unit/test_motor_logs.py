@@ -163,6 +163,7 @@ def test_the_order_of_motors_is_found_and_corrected(log, tmp_path, order):
     columns = [COLUMNS[motor] for motor in order]
     swapped = with_channels(log, u=log["u"][:, list(order)])
     found = check_log(swapped)
+    assert "u and w" not in {pair.name for pair in (*found.pairs, *found.after)}
     if order == (0, 1, 2, 3):
         assert not found.contradicts
         return
