@@ -29,6 +29,7 @@ from flytrack_sysid.inference.parameters import (
     with_neutral_effects,
     with_values,
 )
+from flytrack_sysid.inference.torque import torque_notes, unseen_in_log
 from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
 from flytrack_sysid.log_motion import check_commands, motion_notes, required_motion
 from flytrack_sysid.log_voltage import (
@@ -40,7 +41,6 @@ from flytrack_sysid.log_voltage import (
 )
 from flytrack_sysid.plausibility import check_plausible
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
-from flytrack_sysid.torque import torque_notes
 
 # Half-widths of 95 % intervals above which there is a warning: relative to a time constant, and to
 # full thrust.
@@ -170,6 +170,7 @@ def _free_names(
     of_effects = [
         name for name in names if "." in name and not BY_NAME[name.split(".")[0]].search.is_setting
     ]
+    unused |= {*unseen_in_log(log, model)}
     candidates = [name for name in (*base_of(model), *of_effects) if name not in unused]
     if "v_bat" not in log:
         candidates = [name for name in candidates if name not in (*THRUST_COEFFS[4:], DRAIN)]

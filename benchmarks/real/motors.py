@@ -35,7 +35,7 @@ from flytrack_sysid.inference.free_flight import (
     evaluate_windows,
     make_windows,
 )
-from flytrack_sysid.torque import MotorRecord, torque_correlations
+from flytrack_sysid.inference.torque import MotorRecord, torque_correlations
 
 MAPPINGS = Path(__file__).parent / "mappings"
 HORIZON = HORIZONS_S.index(0.25)

@@ -63,6 +63,7 @@ from flytrack_sysid.inference.search import (
     extended,
     with_refitted_noise,
 )
+from flytrack_sysid.inference.torque import torque_notes
 from flytrack_sysid.log import STATED_MASS, STATED_VOLTAGES, FlightLog, LogError
 from flytrack_sysid.log_motion import (
     check_commands,
@@ -72,7 +73,6 @@ from flytrack_sysid.log_motion import (
 )
 from flytrack_sysid.log_voltage import battery_of_craft, voltage_notes, with_voltage
 from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
-from flytrack_sysid.torque import torque_notes
 
 STAGES = ("first look", "search", "vetoes", "refinement", "summary")
 Report = Callable[[int, int], None]

@@ -196,9 +196,8 @@ def base_causes(
     problem, model = selection.state.problem, selection.model
     causes: list[Cause] = []
     contradicted: list[str] = []
-    unseen = vetoes.unseen_torques(problem)
     for name, change in base_changes(selection.state, linearization, model).items():
-        if name in selection.stand_ins or set(unseen) & {*vetoes.OF_TORQUE.get(name, ())}:
+        if name in selection.stand_ins:
             continue
         channel = find_channel(problem, problem.at_start(model.vector, change.fields), model.vector)
         refitted = _refitted_to_first_order(linearization, model, change.fields)

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_env.effects import BY_NAME, takes_motors
-from flytrack_sysid import torque
 from flytrack_sysid.diagnosis import model_selection
 from flytrack_sysid.diagnosis import unexplained as unknown
 from flytrack_sysid.diagnosis.result import Unexplained
@@ -21,7 +20,7 @@ from flytrack_sysid.inference.problem import Problem, split_blocks
 from flytrack_sysid.inference.record import Record
 from flytrack_sysid.inference.score_test import ALL_BASE_CAUSES, change_threshold, threshold
 from flytrack_sysid.inference.search import FittedModel, SearchState
-from flytrack_sysid.torque import MotorRecord
+from flytrack_sysid.inference.torque import unseen_in_chunks
 
 # Held-out rows contradict a cause if two conditions hold. Its gain is HELD_OUT_SIGMAS standard
 # deviations below the expected gain, and less than HELD_OUT_SHARE of its size shows. The second one
@@ -46,12 +45,6 @@ DISTURBED, DISTURBED_BASE, KEPT_SHARE = 3.0, 10.0, 0.1
 # the dependences explain is no stand-in: the dependences are the remainder of its law.
 OUTWEIGHS = 30.0
 LOAD = "motors.load"  # acts on force alone
-# Causes in the base that show in torques about an axis only.
-OF_TORQUE = {
-    "inertia_x": ("roll",),
-    "inertia_y": ("pitch",),
-    "center_of_mass": ("roll", "pitch"),
-}
 
 
 class Selection(NamedTuple):
@@ -309,16 +302,7 @@ def turned_by_unseen_torque(selection: Selection, test: Problem) -> list[str]:
     problem, model = selection.state.problem, selection.model
     candidates = [one for one in model.candidates if BY_NAME[one.effect].takes_motors]
     turning = [one.effect for one in candidates if one.fields != (LOAD,)]
-    return turning if turning and unseen_torques(problem) else []
-
-
-def unseen_torques(problem: Problem) -> list[str]:
-    """Return the axes about which the log does not show the torque of motors, of ``AXES``."""
-    if not takes_motors(problem.like.effects) or "w" not in problem.chunks.measured:
-        return []
-    values = torque.torque_correlations(problem.like, MotorRecord.of_chunks(problem.chunks))
-    pairs = zip(torque.AXES, values, strict=True)
-    return [axis for axis, value in pairs if value < torque.MIN_CORRELATION]
+    return turning if turning and unseen_in_chunks(problem.chunks, problem.like) else []
 
 
 def is_force_law(effect: str) -> bool:

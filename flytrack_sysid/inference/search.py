@@ -20,6 +20,7 @@ from flytrack_sysid.inference.score_test import (
     compute_costs,
     threshold,
 )
+from flytrack_sysid.inference.torque import unseen_in_chunks
 from flytrack_sysid.log import FlightLog
 
 PER_PARAMETER = 4.0  # of chi2: the gain that one more parameter needs to be preferred
@@ -103,7 +104,7 @@ class SearchState:
         problem: the rows to learn from, with the noise.
         unobservable: effects that need channels the log lacks.
         refused: effects that vetoes have rejected.
-        held: base parameters that stay nominal.
+        held: base parameters that the log does not show, and that stay nominal.
         linearization: the last one along everything, kept because slopes are expensive.
     """
 
@@ -127,7 +128,8 @@ class SearchState:
             for effect in SEARCHED
             if not set(channels_for(effect, problem.like)) <= channels
         )
-        return cls(problem.with_noise(noise), unobservable=lacking)
+        held = unseen_in_chunks(problem.chunks, problem.like)
+        return cls(problem.with_noise(noise), unobservable=lacking, held=held)
 
     @property
     def base_indices(self) -> list[int]:

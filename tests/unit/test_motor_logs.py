@@ -13,7 +13,7 @@ from flytrack_env.motors import NAMES
 from flytrack_env.toml_file import parse_toml
 from flytrack_sysid.check import check_log, text_of
 from flytrack_sysid.check.fix import fix_mapping
-from flytrack_sysid.diagnosis.vetoes import turned_by_unseen_torque, unseen_torques
+from flytrack_sysid.diagnosis.vetoes import turned_by_unseen_torque
 from flytrack_sysid.estimate import FitError
 from flytrack_sysid.fit import fit, what_is_fitted
 from flytrack_sysid.importing import import_log, mapping
@@ -22,11 +22,12 @@ from flytrack_sysid.importing.mapping import Frame
 from flytrack_sysid.inference.chunks import cut_chunks
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import Candidate
+from flytrack_sysid.inference.search import SearchState
+from flytrack_sysid.inference.torque import torque_notes
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_file import load_log, save_log
 from flytrack_sysid.log_motion import DOUBTFUL_MOTORS, check_commands, motion_notes
 from flytrack_sysid.plausibility import find_problems
-from flytrack_sysid.torque import torque_notes
 from flytrack_sysid.validate import validate
 from tests.support.motor_flights import COLUMNS, flown, write_csv
 from tests.support.motor_models import crafts, model_of
@@ -213,17 +214,21 @@ def test_a_log_that_hardly_shows_torque_is_told_and_names_no_motor(log):
     (note,) = torque_notes(noisy, model)
     assert "hardly shows the motors' torque" in note and "roll 0." in note
     turned = Candidate("motors", ("motors.rear_left",))
-    for flown_log, axes in ((log, []), (noisy, ["roll", "pitch"])):
+    held = ("radius_x", "center_y", "radius_y", "center_x", "radius_z")
+    for flown_log, fields in ((log, ()), (noisy, tuple(f"motors.{name}" for name in held))):
         scored = np.ones(len(flown_log), bool)
         with jax.enable_x64(True):
             problem = Problem.of(cut_chunks(flown_log, scored, model), model)
-        assert unseen_torques(problem) == axes
+            state = SearchState.start(flown_log, problem)
+        _, free, _ = what_is_fitted(flown_log, model, accept=True)
+        assert state.held == fields and {*fields}.isdisjoint(free)
+        assert {"motors.radius_x", "motors.center_x"} - {*free} <= {*fields}
         for candidate in (turned, Candidate("motors", ("motors.load",))):
             selected = SimpleNamespace(
-                state=SimpleNamespace(problem=problem),
+                state=state,
                 model=SimpleNamespace(candidates=[candidate]),
             )
-            expected = ["motors"] * (axes != [] and candidate is turned)
+            expected = ["motors"] * (fields != () and candidate is turned)
             assert turned_by_unseen_torque(selected, problem) == expected
 
 

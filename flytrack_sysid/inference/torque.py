@@ -11,6 +11,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from flytrack_env.dynamics import ModelParameters, collective_thrust
+from flytrack_env.effects import takes_motors
 from flytrack_sysid.inference.chunks import Chunks
 from flytrack_sysid.log import FlightLog, usual_step
 from flytrack_sysid.log_voltage import flown_voltages
@@ -20,6 +21,12 @@ WINDOW_S = 0.05  # of changes of the rates: noise of a gyro is small beside them
 MAX_LATE_S, LATE_STEP_S = 0.04, 0.005  # of the rates behind the motors, beside their lag
 MIN_CORRELATION = 0.8
 MIN_ROWS = 100
+# What shows in torques about an axis only, and, without both axes, in a flight that hardly turns.
+FIELDS = {
+    "roll": ("motors.radius_x", "motors.center_y"),
+    "pitch": ("motors.radius_y", "motors.center_x"),
+}
+OF_BOTH = "motors.radius_z"
 
 
 class MotorRecord(NamedTuple):
@@ -90,18 +97,40 @@ def torque_correlations(model: ModelParameters, record: MotorRecord) -> np.ndarr
     return best
 
 
+def unseen_fields(correlations: np.ndarray) -> tuple[str, ...]:
+    """Return the parameters that a log does not show, by correlations of roll and pitch."""
+    unseen = [
+        axis for axis, value in zip(AXES, correlations, strict=True) if value < MIN_CORRELATION
+    ]
+    fields = [field for axis in unseen for field in FIELDS[axis]]
+    return tuple(fields + [OF_BOTH] * (len(unseen) == len(AXES)))
+
+
+def unseen_in_log(log: FlightLog, model: ModelParameters) -> tuple[str, ...]:
+    """Return the parameters that a log does not show; none of a log without motors."""
+    if not log.has_motors or "w" not in log:
+        return ()
+    return unseen_fields(torque_correlations(model, MotorRecord.of_log(log)))
+
+
+def unseen_in_chunks(chunks: Chunks, model: ModelParameters) -> tuple[str, ...]:
+    """Return the parameters that chunks do not show; none of a model without motors."""
+    if not takes_motors(model.effects) or "w" not in chunks.measured:
+        return ()
+    return unseen_fields(torque_correlations(model, MotorRecord.of_chunks(chunks)))
+
+
 def torque_notes(log: FlightLog, model: ModelParameters) -> list[str]:
     """Return a note if a log of motors does not show their torque."""
-    if not log.has_motors or "w" not in log:
+    if not unseen_in_log(log, model):
         return []
     values = torque_correlations(model, MotorRecord.of_log(log))
-    if not np.any(values < MIN_CORRELATION):
-        return []
     found = ", ".join(
         f"{axis} {value:.2f}" for axis, value in zip(AXES, values, strict=True) if value == value
     )
     return [
         f"{log.source} hardly shows the motors' torque: it correlates with changes of the rates by "
-        f"{found}, expected {MIN_CORRELATION} or more; inertia, centre of mass, damping and single "
-        "motors are not the craft's: log motors and gyro faster, or roll and pitch more"
+        f"{found}, expected {MIN_CORRELATION} or more; radii of gyration and centre of mass are "
+        "held at the model's, and damping and single motors are not named: log motors and gyro "
+        "faster, or roll and pitch more"
     ]
