@@ -560,7 +560,8 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
         raise LogError(
             f"{', '.join(STATED_VOLTAGES)}: found {shown}; expected logs of one pack in one command"
         )
-    if len({flight_log.stated_mass_kg for flight_log in logs}) > 1:
+    masses = {log.stated_mass_kg for log in logs} - {None}
+    if len(masses) > 1:
         shown = ", ".join(
             f"{Path(flight_log.source).name}: {flight_log.stated_mass_kg}" for flight_log in logs
         )
@@ -579,7 +580,7 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
         origin=logs[0].origin,
         has_motors=logs[0].has_motors,
         stated_voltage_v=logs[0].stated_voltage_v,
-        stated_mass_kg=logs[0].stated_mass_kg,
+        stated_mass_kg=next(iter(masses), None),
     )
 
 
