@@ -21,12 +21,13 @@ WINDOW_S = 0.05  # of changes of the rates: noise of a gyro is small beside them
 MAX_LATE_S, LATE_STEP_S = 0.04, 0.005  # of the rates behind the motors, beside their lag
 MIN_CORRELATION = 0.8
 MIN_ROWS = 100
-# What shows in torques about an axis only, and, without both axes, in a flight that hardly turns.
+# What shows in torques about an axis only. Without both axes, lags, which a noisy torque fits best
+# at their bound, are unseen, too.
 FIELDS = {
     "roll": ("motors.radius_x", "motors.center_y"),
     "pitch": ("motors.radius_y", "motors.center_x"),
 }
-OF_BOTH = "motors.radius_z"
+OF_BOTH = ("motors.radius_z", "motors.up_s", "motors.down_s")
 
 
 class MotorRecord(NamedTuple):
@@ -102,8 +103,8 @@ def unseen_fields(correlations: np.ndarray) -> tuple[str, ...]:
     unseen = [
         axis for axis, value in zip(AXES, correlations, strict=True) if value < MIN_CORRELATION
     ]
-    fields = [field for axis in unseen for field in FIELDS[axis]]
-    return tuple(fields + [OF_BOTH] * (len(unseen) == len(AXES)))
+    fields = tuple(field for axis in unseen for field in FIELDS[axis])
+    return fields + OF_BOTH if len(unseen) == len(AXES) else fields
 
 
 def unseen_in_log(log: FlightLog, model: ModelParameters) -> tuple[str, ...]:
@@ -130,7 +131,7 @@ def torque_notes(log: FlightLog, model: ModelParameters) -> list[str]:
     )
     return [
         f"{log.source} hardly shows the motors' torque: it correlates with changes of the rates by "
-        f"{found}, expected {MIN_CORRELATION} or more; radii of gyration and centre of mass are "
-        "held at the model's, and damping and single motors are not named: log motors and gyro "
+        f"{found}, expected {MIN_CORRELATION} or more; radii of gyration, lags and centre of mass "
+        "are held at the model's, and damping and single motors are not named: log motors and gyro "
         "faster, or roll and pitch more"
     ]

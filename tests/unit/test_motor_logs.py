@@ -214,7 +214,7 @@ def test_a_log_that_hardly_shows_torque_is_told_and_names_no_motor(log):
     (note,) = torque_notes(noisy, model)
     assert "hardly shows the motors' torque" in note and "roll 0." in note
     turned = Candidate("motors", ("motors.rear_left",))
-    held = ("radius_x", "center_y", "radius_y", "center_x", "radius_z")
+    held = ("radius_x", "center_y", "radius_y", "center_x", "radius_z", "up_s", "down_s")
     for flown_log, fields in ((log, ()), (noisy, tuple(f"motors.{name}" for name in held))):
         scored = np.ones(len(flown_log), bool)
         with jax.enable_x64(True):
