@@ -298,10 +298,17 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
 
 
 def turned_by_unseen_torque(selection: Selection, test: Problem) -> list[str]:
-    """Reject changes of single motors and damping where the log does not show torque."""
+    """Reject single motors, damping and a gyro's scale where the log does not show torque.
+
+    Modelled rates are then those of noise, which a gyro's scale would shrink.
+    """
     problem, model = selection.state.problem, selection.model
-    candidates = [one for one in model.candidates if BY_NAME[one.effect].takes_motors]
-    turning = [one.effect for one in candidates if one.fields != (LOAD,)]
+    turning = [
+        one.effect
+        for one in model.candidates
+        if one.effect == "gyro_scale"
+        or (BY_NAME[one.effect].takes_motors and one.fields != (LOAD,))
+    ]
     return turning if turning and unseen_in_chunks(problem.chunks, problem.like) else []
 
 

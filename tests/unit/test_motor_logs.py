@@ -214,6 +214,7 @@ def test_a_log_that_hardly_shows_torque_is_told_and_names_no_motor(log):
     (note,) = torque_notes(noisy, model)
     assert "hardly shows the motors' torque" in note and "roll 0." in note
     turned = Candidate("motors", ("motors.rear_left",))
+    scale = Candidate("gyro_scale", ("gyro_scale.x",))
     held = ("radius_x", "center_y", "radius_y", "center_x", "radius_z", "up_s", "down_s")
     for flown_log, fields in ((log, ()), (noisy, tuple(f"motors.{name}" for name in held))):
         scored = np.ones(len(flown_log), bool)
@@ -223,12 +224,12 @@ def test_a_log_that_hardly_shows_torque_is_told_and_names_no_motor(log):
         _, free, _ = what_is_fitted(flown_log, model, accept=True)
         assert state.held == fields and {*fields}.isdisjoint(free)
         assert {"motors.radius_x", "motors.center_x"} - {*free} <= {*fields}
-        for candidate in (turned, Candidate("motors", ("motors.load",))):
+        for candidate in (turned, scale, Candidate("motors", ("motors.load",))):
             selected = SimpleNamespace(
                 state=state,
                 model=SimpleNamespace(candidates=[candidate]),
             )
-            expected = ["motors"] * (fields != () and candidate is turned)
+            expected = [candidate.effect] * (fields != () and candidate in (turned, scale))
             assert turned_by_unseen_torque(selected, problem) == expected
 
 
