@@ -132,6 +132,6 @@ def torque_notes(log: FlightLog, model: ModelParameters) -> list[str]:
     return [
         f"{log.source} hardly shows the motors' torque: it correlates with changes of the rates by "
         f"{found}, expected {MIN_CORRELATION} or more; radii of gyration, lags and centre of mass "
-        "are held at the model's, and damping, single motors and a gyro's scale are not named: log motors and "
-        "gyro faster, or roll and pitch more"
+        "are held at the model's, and damping, single motors and a gyro's scale are not named: log "
+        "motors and gyro faster, or roll and pitch more"
     ]
