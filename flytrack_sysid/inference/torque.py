@@ -19,8 +19,8 @@ from flytrack_sysid.log_voltage import flown_voltages
 AXES = ("roll", "pitch")  # yaw is turned by little, and by rotors that spin up
 WINDOW_S = 0.05  # of changes of the rates: noise of a gyro is small beside them
 MAX_LATE_S, LATE_STEP_S = 0.04, 0.005  # of the rates behind the motors, beside their lag
-MIN_CORRELATION = 0.8
-MIN_ROWS = 100
+MIN_CORRELATION = 0.8  # between the two groups of ten logs; chosen on them
+MIN_ROWS = 100  # of a correlation: fewer say nothing
 # What shows in torques about an axis only. Without both axes, lags, which a noisy torque fits best
 # at their bound, are unseen, too.
 FIELDS = {
