@@ -1,5 +1,6 @@
 """What a log states (its origin, its pack's voltages) survives and decides how it is replayed."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,8 @@ from flytrack_sysid.diagnosis.diagnose import split
 from flytrack_sysid.diagnosis.size import is_notable
 from flytrack_sysid.fit import what_is_fitted
 from flytrack_sysid.importing.flight import Craft
-from flytrack_sysid.inference.lateness import read_poses
+from flytrack_sysid.inference.chunks import NUM_AXES
+from flytrack_sysid.inference.lateness import TAPS, Late, read_poses
 from flytrack_sysid.inference.parameters import DRAIN
 from flytrack_sysid.inference.record import fill_gaps, make_record
 from flytrack_sysid.log import STATED, LogError
@@ -244,3 +246,12 @@ def test_batteries_follow_the_voltages_of_a_log(logged, stated, given, of_craft,
     assert battery_of_craft(known, given) == Battery(*of_craft)
     assert fitted_battery(known, given) == Battery(*fitted)
     assert_noted(voltage_notes(log, given), parts)
+
+
+def test_late_residuals_of_a_diverged_trial_give_no_warning():
+    taps = np.where(np.arange(len(TAPS)) % 2, -1.0, 1.0)
+    late = Late(np.tile(taps, (9, 1, 1)), np.zeros((9, 1, NUM_AXES)))
+    diverged = np.full((1, 9, 1, NUM_AXES, 2), np.inf)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.isnan(late.residuals(diverged)[..., :-1, 1]).all()
