@@ -69,8 +69,11 @@ class ModelParameters(NamedTuple):
 
         Raises:
             TypeError: something that is not the parameters of an effect.
+            ValueError: an effect of sticks beside motors that are commanded.
         """
-        return self._replace(effects=effects.merge(self.effects, *parameters))
+        merged = effects.merge(self.effects, *parameters)
+        effects.check_beside_motors(merged)
+        return self._replace(effects=merged)
 
     def effect(self, name: str) -> Any:
         """Return the parameters of an effect; neutral ones where the model does not have it.

@@ -187,7 +187,11 @@ def model_from_json(
         motion=file.motion,
         battery=battery,
     )
-    return base.with_effects(*(_read_effect(str(path), *item) for item in file.effects.items()))
+    parameters = [_read_effect(str(path), *item) for item in file.effects.items()]
+    try:
+        return base.with_effects(*parameters)
+    except ValueError as error:
+        raise ModelFileError(f"{path}: {error}") from error
 
 
 def load_provenance(path: str | Path) -> dict[str, Any]:

@@ -10,7 +10,13 @@ import jax
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import DEFAULT_DELAY_STEPS, ROUNDING, Range, check_parameters
+from flytrack_env.effects import (
+    DEFAULT_DELAY_STEPS,
+    ROUNDING,
+    Range,
+    check_beside_motors,
+    check_parameters,
+)
 from flytrack_env.quaternion import Scalar
 from flytrack_env.resets import ResetParams
 from flytrack_env.rewards import RewardWeights
@@ -100,6 +106,7 @@ class EnvParams:
         self.model.battery.check()
         for parameters in self.model.effects:
             check_parameters(parameters, self.dt, delay_steps)
+        check_beside_motors(self.model.effects)
         _check_course(self.course)
         if not np.all(
             np.asarray(self.course.gates.half_opening) > np.asarray(self.drone_radius)[..., None]

@@ -9,7 +9,7 @@ import gymnax
 from gymnax.registration import registered_envs
 
 from flytrack_env.dynamics import nominal_motor_parameters
-from flytrack_env.effects import check_frame, takes_motors
+from flytrack_env.effects import check_motors, takes_motors
 from flytrack_env.env import FlyTrack
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.messages import check_keywords
@@ -104,7 +104,7 @@ def make(env_id: str, **overrides: Any) -> EpisodicEnvironment:
     check_keywords(overrides, ARGUMENTS)
     variant = ENVIRONMENTS[env_id]
     env: EpisodicEnvironment = FlyTrack(**{**variant.arguments, **overrides})
-    check_frame(env.default_params.model.effects)
+    check_motors(env.default_params.model.effects)
     is_of_motors = takes_motors(env.default_params.model.effects)
     if "model" in variant.arguments and env.plant.dt is None and not is_of_motors:
         raise ValueError(

@@ -10,7 +10,7 @@ from scipy import signal
 
 from flytrack_env import __version__
 from flytrack_env.dynamics import ModelParameters, collective_thrust, nominal_parameters
-from flytrack_env.effects import BY_NAME
+from flytrack_env.effects import BY_NAME, effect_of
 from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis.result import TWO_SIDED_95
 from flytrack_sysid.estimate import Estimate, FitError, estimate
@@ -21,6 +21,7 @@ from flytrack_sysid.inference.parameters import (
     THRUST_COEFFS,
     as_float32,
     base_of,
+    fields_of_sticks,
     names_of,
     neutral_value,
     range_of,
@@ -28,6 +29,7 @@ from flytrack_sysid.inference.parameters import (
     with_neutral_effects,
     with_values,
 )
+from flytrack_sysid.inference.torque import torque_notes, unseen_in_log
 from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
 from flytrack_sysid.log_motion import check_commands, motion_notes, required_motion
 from flytrack_sysid.log_voltage import (
@@ -149,18 +151,27 @@ def _free_names(
     model: ModelParameters, log: FlightLog, fixed: Mapping[str, float]
 ) -> tuple[str, ...]:
     """Return the names of lags, thrust map, drain and effects that the log's channels determine."""
-    names = names_of(model)
+    names, unused = names_of(model), fields_of_sticks(model)
     unknown = [name for name in fixed if name not in names]
     if unknown:
         raise FitError(f"fixed: {unknown[0]}: unknown; expected of {', '.join(names)}")
     for name, value in fixed.items():
+        if name in unused or (name in TAUS and name not in base_of(model)):
+            responds = next(
+                effect.name for effect in map(effect_of, model.effects) if "respond" in effect.hooks
+            )
+            raise FitError(
+                f"fixed: {name}: found {value:g}, expected none: it does nothing in a model with "
+                f"the effect {responds}"
+            )
         low, high, unit = range_of(name)
         if not (np.isfinite(value) and low <= value <= high):
             raise FitError(f"fixed: {name}: found {value}, expected {low:g} to {high:g} {unit}")
     of_effects = [
         name for name in names if "." in name and not BY_NAME[name.split(".")[0]].search.is_setting
     ]
-    candidates = [*base_of(model), *of_effects]
+    unused |= {*unseen_in_log(log, model)}
+    candidates = [name for name in (*base_of(model), *of_effects) if name not in unused]
     if "v_bat" not in log:
         candidates = [name for name in candidates if name not in (*THRUST_COEFFS[4:], DRAIN)]
     return tuple(name for name in candidates if name not in fixed)
@@ -262,6 +273,11 @@ def what_is_fitted(
         raise FitError(
             f"effects: {name}: known from settings and not fitted; start from a model that has it"
         )
+    for name in effects:
+        if fields_of_sticks(model).issuperset(f"{name}.{field}" for field in BY_NAME[name].ranges):
+            raise FitError(
+                f"effects: {name}: acts on sticks, and the model's commands are those of motors"
+            )
     check_commands(log, model)
     free = _free_names(model, log, fixed)
     model = with_values(model, fixed)
@@ -305,7 +321,7 @@ def fit(
     model, free, scored_rows = what_is_fitted(log, start, fixed, effects, every, motion, accept)
     notes = motion_notes(log, start, motion, f"replayed as {model.motion.value}")
     given = model.battery
-    notes += voltage_notes(log, given)
+    notes += torque_notes(log, model) + voltage_notes(log, given)
     log = with_voltage(log, model)
     try:
         result = estimate(log, scored_rows, model, free, report)

@@ -13,7 +13,8 @@ whole ones.
 Columns of ``STATED`` hold the same number in every row: ``measured``, 1 where a real drone flew and
 0 where a simulator did; ``motors``, 1 where ``u`` holds the outputs of the motors rear right, front
 right, rear left and front left instead of sticks, -1 off and 1 full; ``v_bat_low`` and
-``v_bat_high``, V, the range that is stated for a pack that was not logged.
+``v_bat_high``, V, the range that is stated for a pack that was not logged; ``mass_kg``, the mass
+that is stated for the craft.
 """
 
 import hashlib
@@ -45,7 +46,8 @@ CHANNELS: dict[str, tuple[str, ...]] = {
 }
 REQUIRED = ("t", *CHANNELS["u"])
 MEASURED, OF_MOTORS, STATED_VOLTAGES = "measured", "motors", ("v_bat_low", "v_bat_high")
-STATED = (MEASURED, OF_MOTORS, *STATED_VOLTAGES)
+STATED_MASS = "mass_kg"
+STATED = (MEASURED, OF_MOTORS, *STATED_VOLTAGES, STATED_MASS)
 COLUMNS = (
     "t",
     "segment",
@@ -87,6 +89,7 @@ class FlightLog:
         stated_voltage_v: lowest and highest voltage of the pack in flight, V, if they are stated
             but ``v_bat`` was not logged.
         has_motors: whether the commands are the outputs of four motors instead of sticks.
+        stated_mass_kg: mass of the craft, kg, if it is stated.
     """
 
     time: np.ndarray
@@ -96,6 +99,7 @@ class FlightLog:
     origin: Origin | None = None
     stated_voltage_v: tuple[float, float] | None = None
     has_motors: bool = False
+    stated_mass_kg: float | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -110,7 +114,7 @@ class FlightLog:
     def sha256(self) -> str:
         """The hash of the rows, the same in memory and in any file.
 
-        It does not depend on origin and stated voltages.
+        It does not depend on origin, stated voltages and stated mass.
         """
         digest = hashlib.sha256()
         segment = np.cumsum(self.is_start())

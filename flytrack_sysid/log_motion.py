@@ -7,7 +7,7 @@ measured.
 """
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import check_frame, takes_motors
+from flytrack_env.effects import check_motors, takes_motors
 from flytrack_env.motion import Motion
 from flytrack_sysid.log import MEASURED, FlightLog, LogError
 
@@ -16,6 +16,7 @@ DOUBTFUL_MOTORS = (
     "commands are the outputs of motors: where a measured flight hardly turns, inertia and lags "
     "may come out several times wrong, with too narrow intervals; trust what more flights show"
 )
+SAME_MASS = 1e-3  # relative: models hold float32, and people write three digits
 HOW_TO_MARK = f"a column {MEASURED!r} says it: 1 for a real drone, 0 for a simulator"
 
 
@@ -49,6 +50,13 @@ def motion_notes(
             f"motion: {required.value} was requested, but {log.source} is measured: drones move "
             "continuously"
         )
+    if model is not None and log.stated_mass_kg is not None:
+        mass_kg = float(model.m)
+        if abs(mass_kg - log.stated_mass_kg) > SAME_MASS * mass_kg:
+            notes.append(
+                f"mass: {log.source} states {log.stated_mass_kg:g} kg, and the model "
+                f"{mass_kg:g} kg, which is used: thrust and drag are those of that mass"
+            )
     if model is not None and required is not None and model.motion is not required:
         why = "as requested" if requested is not None else f"since {log.source} is measured"
         notes.append(
@@ -65,11 +73,11 @@ def motion_notes(
 def check_commands(log: FlightLog, model: ModelParameters) -> None:
     """Raise LogError for a model that takes other commands than the log has, sticks or motors.
 
-    Motors without a frame are refused, too. The rates of a model that takes motors follow from
-    torques, so that they have to be measured.
+    Motors without a frame or beside effects of sticks are refused, too. The rates of a model that
+    takes motors follow from torques, so that they have to be measured.
     """
     try:
-        check_frame(model.effects)
+        check_motors(model.effects)
     except ValueError as error:
         raise LogError(f"model: {error}") from error
     expects_motors = takes_motors(model.effects)

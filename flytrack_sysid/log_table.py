@@ -15,6 +15,7 @@ from flytrack_sysid.log import (
     ORIGINS,
     REQUIRED,
     STATED,
+    STATED_MASS,
     STATED_VOLTAGES,
     FlightLog,
     LogError,
@@ -122,6 +123,8 @@ def stated_columns(log: FlightLog) -> dict[str, np.ndarray]:
         )
     if log.has_motors:
         stated[OF_MOTORS] = 1.0
+    if log.stated_mass_kg is not None:
+        stated[STATED_MASS] = log.stated_mass_kg
     return {name: np.full(len(log), stated[name]) for name in STATED if name in stated}
 
 
@@ -152,7 +155,7 @@ def log_of_table(table: Table) -> FlightLog:
         is_command = np.abs(table.columns[column]) <= 1.0 + COMMAND_MARGIN
         table.check(is_command, column, "a command in [-1, 1]")
     origin, stated_voltage_v = _origin(table), _stated_voltages(table)
-    has_motors = _has_motors(table)
+    has_motors, stated_mass_kg = _has_motors(table), _stated_mass(table)
     channels = {}
     for name, columns in CHANNELS.items():
         if columns[0] in table.columns:
@@ -166,7 +169,14 @@ def log_of_table(table: Table) -> FlightLog:
         table.check(error <= MAX_NORM_ERROR, ", ".join(CHANNELS["q"]), expected, norm)
         channels["q"] *= np.where(error > MIN_NORM_ERROR, 1.0 / norm, 1.0)[:, None]
     return FlightLog(
-        table.columns["t"], channels, segment, table.source, origin, stated_voltage_v, has_motors
+        time=table.columns["t"],
+        channels=channels,
+        segment=segment,
+        source=table.source,
+        origin=origin,
+        stated_voltage_v=stated_voltage_v,
+        has_motors=has_motors,
+        stated_mass_kg=stated_mass_kg,
     )
 
 
@@ -198,6 +208,14 @@ def _has_motors(table: Table) -> bool:
         expected = "expected 1 (commands of four motors) or 0 (of sticks)"
         raise table.error(0, OF_MOTORS, f"found {value}, {expected}")
     return value == 1.0
+
+
+def _stated_mass(table: Table) -> float | None:
+    """Return the mass that is stated for the craft, kg."""
+    mass_kg = _stated(table, STATED_MASS)
+    if mass_kg is not None and mass_kg <= 0.0:
+        raise table.error(0, STATED_MASS, f"found {mass_kg:g} kg, expected a mass above 0")
+    return mass_kg
 
 
 def _stated_voltages(table: Table) -> tuple[float, float] | None:

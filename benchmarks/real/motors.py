@@ -2,14 +2,15 @@
 
 The first half of each flight is learnt from, the second is predicted, beside a linear ARX of the
 same motors and rates. Then the parameters of two flights of one craft, and the rotor drag of a
-simulated flight of others (PX4 in Gazebo), whose truth is known. Flights come from
+simulated flight of others (PX4 in Gazebo), whose truth is known. Last, two flights of NanoBench are
+diagnosed twice, from motors and from sticks, and two others are predicted. Flights come from
 ``benchmarks.real.crazyflie.DATA``.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import tyro
@@ -23,6 +24,7 @@ from benchmarks.real.black_boxes import (
     with_pose,
 )
 from benchmarks.real.crazyflie import DATA, MAX_WINDOWS
+from benchmarks.real.section import diagnose_log
 from flytrack_sysid import FitError, fit, import_log
 from flytrack_sysid.fit import Fit
 from flytrack_sysid.importing.importer import Imported
@@ -33,6 +35,7 @@ from flytrack_sysid.inference.free_flight import (
     evaluate_windows,
     make_windows,
 )
+from flytrack_sysid.inference.torque import MotorRecord, torque_correlations
 
 MAPPINGS = Path(__file__).parent / "mappings"
 HORIZON = HORIZONS_S.index(0.25)
@@ -40,6 +43,11 @@ RATES = QUANTITIES.index("rates")
 SPACING_S = 0.1
 ROTOR_DRAG = 0.0378  # s/m, of the Gazebo flight: its data's README
 LAGS = {"motors.up_s": 0.02, "motors.down_s": 0.03}
+PHOENIX = "crazyflie_rate_flights/seed00048_log1.csv.gz"
+NANOBENCH_LEARNT = ("B8_star_fast_rep1", "B9_trefoil_fast_rep14")
+NANOBENCH_HELD = ("B7_oval_fast_rep1", "B10_lissajous_fast_rep1")
+NANOBENCH_S = 17.0  # of each flight
+NANOBENCH_ERRORS = (("position_m", "0.5"), ("attitude_rad", "0.25"), ("rates_rad_per_s", "0.25"))
 
 
 class Craft(NamedTuple):
@@ -56,6 +64,7 @@ CRAFTS = {
     "Gecko": Craft(("bf_gecko/btfl_002.bbl",), "betaflight", "gecko_motors", LAGS),
     "Crazyflie, log15": Craft(("cf_arpl_motors/log15",), "usd", "arpl_motors_log15"),
 }
+IRIS = Craft(("eth_quadrotor_model/quadrotor_model.csv",), "csv", "eth_motors")
 
 
 def read(craft: Craft) -> Imported:
@@ -111,15 +120,65 @@ def two_flights() -> list[Fit]:
 
 def rotor_drag() -> Fit:
     """Return the fit of the flight in Gazebo, with linear and rotor drag."""
-    flight = read(Craft(("eth_quadrotor_model/quadrotor_model.csv",), "csv", "eth_motors"))
+    flight = read(IRIS)
     return fit(
         flight.log, flight.nominal_model(), effects=("rotor_drag", "linear_drag"), accept=True
     )
 
 
-def main(out: Path | None = None) -> None:
+def nanobench() -> dict[str, Any]:
+    """Return the diagnoses of NanoBench from motors and from sticks, and error ratios on others.
+
+    The ratios are of held-out errors of both extended models, motors over sticks.
+    """
+    files = [DATA / "nanobench" / f"{name}.csv.gz" for name in (*NANOBENCH_LEARNT, *NANOBENCH_HELD)]
+    records = {}
+    for kind, mapping in (("motors", "nanobench_motors"), ("sticks", "nanobench")):
+        flight = import_log(files, "csv", mapping)
+        starts_s = flight.log.time[flight.log.is_start()]
+        log = flight.log.select(flight.log.time - starts_s[flight.log.segment] < NANOBENCH_S)
+        held_out = log.segment >= len(NANOBENCH_LEARNT)
+        records[kind] = diagnose_log(log, flight.nominal_model(), held_out)[1]
+        print(kind, records[kind]["sentence"], f"{records[kind]['cpu_s']:.0f} CPU s", flush=True)
+    errors = {kind: record["diagnosis"]["prediction"]["errors"] for kind, record in records.items()}
+    ratios = {
+        f"{quantity} after {horizon} s": errors["motors"]["extended"][quantity][horizon]
+        / errors["sticks"]["extended"][quantity][horizon]
+        for quantity, horizon in NANOBENCH_ERRORS
+    }
+    kept = ("num_rows", "cpu_s", "sentence")
+    shown = {kind: {name: one[name] for name in kept} for kind, one in records.items()}
+    return {"ratios": ratios, "errors": errors, **shown}
+
+
+def torques() -> dict[str, list[float]]:
+    """Return how changes of roll and pitch rate correlate with the motors' torque, by flight."""
+    phoenix = MAPPINGS / "phoenix_motors.toml"
+    flights = {
+        **{name: read(craft) for name, craft in CRAFTS.items()},
+        "Crazyflie, log16": read(Craft(("cf_arpl_motors/log16",), "usd", "arpl_motors_log16")),
+        "Crazyflie, rate policy": import_log(DATA / PHOENIX, "csv", phoenix),
+        "Gazebo's iris": read(IRIS),
+    }
+    for name in (*NANOBENCH_LEARNT, *NANOBENCH_HELD):
+        path = DATA / "nanobench" / f"{name}.csv.gz"
+        flights[f"NanoBench, {name}"] = import_log(path, "csv", "nanobench_motors")
+    return {
+        name: torque_correlations(flight.nominal_model(), MotorRecord.of_log(flight.log)).tolist()
+        for name, flight in flights.items()
+    }
+
+
+def main(out: Path | None = None, only: Literal["all", "nanobench", "torque"] = "all") -> None:
     """Measure and print; out: a file of JSON values."""
     results: dict[str, Any] = {"commit": report.commit_of_checkout()}
+    if only != "all":
+        results[only] = nanobench() if only == "nanobench" else torques()
+        for name, value in results[only].items():
+            print(name, value if only == "torque" or name == "ratios" else "")
+        if out is not None:
+            report.write_json(out, results)
+        return
     for name, craft in CRAFTS.items():
         try:
             results[name] = predicted(craft)

@@ -6,6 +6,7 @@ draws them, the documentation lists them. A new effect is a file here and a line
 
 from typing import Any
 
+import jax
 import numpy as np
 
 from flytrack_env.effects.accelerometer_bias import ACCELEROMETER_BIAS, AccelerometerBias
@@ -206,22 +207,54 @@ def takes_motors(effects: Effects) -> bool:
     return any(effect_of(parameters).takes_motors for parameters in effects)
 
 
-def check_frame(effects: Effects) -> None:
-    """Raise ValueError for a model with the effect ``motors`` and without their frame."""
+def check_motors(effects: Effects) -> None:
+    """Raise ValueError for the effect ``motors`` without a frame, or beside effects of sticks."""
     for parameters in effects:
         if isinstance(parameters, Motors) and not np.all(np.asarray(parameters.front_y) > 0.0):
             raise ValueError(
                 f"effects.motors.front_y: found {np.min(parameters.front_y):g}, expected above 0: "
                 "without a frame there are no motors to command"
             )
+    check_beside_motors(effects)
 
 
-def acts_on_sticks(effect: Effect) -> bool:
-    """Return whether an effect acts on sticks or on the rates that follow them, not on motors.
+def check_beside_motors(effects: Effects) -> None:
+    """Raise ValueError for effects of sticks beside motors that are commanded.
 
-    A delay of the commands is that of any commands.
+    Neutral effects and motors without a frame do nothing. Traced values cannot be checked.
     """
-    return effect is not COMMAND_DELAY and not {"command", "lag", "rates"}.isdisjoint(effect.hooks)
+    if not any(_commands_motors(parameters) for parameters in effects):
+        return
+    for parameters in effects:
+        effect = effect_of(parameters)
+        neutral = effect.parameters()
+        for name in stick_fields(effect):
+            value, expected = getattr(parameters, name), getattr(neutral, name)
+            if not isinstance(value, jax.core.Tracer) and np.any(np.asarray(value) != expected):
+                raise ValueError(
+                    f"effects.{effect.name}.{name}: found {np.ravel(value)[0]:g}, expected "
+                    f"{expected:g}: it acts on sticks, and with the effect motors there are none"
+                )
+
+
+def _commands_motors(parameters: Any) -> bool:
+    """Return whether parameters are those of motors with a frame, as far as values are known."""
+    if not isinstance(parameters, Motors) or isinstance(parameters.front_y, jax.core.Tracer):
+        return False
+    return bool(np.any(np.asarray(parameters.front_y) > 0.0))
+
+
+def stick_fields(effect: Effect) -> tuple[str, ...]:
+    """Return the parameters that act on sticks or on the rates that follow them, not on motors.
+
+    A delay of all commands is that of motors, too. A learnt law is what a log of motors showed.
+    """
+    if effect is COMMAND_DELAY:  # commands of yaw and thrust are two of the motors
+        return ("yaw_extra_s", "thrust_extra_s")
+    acts_on_sticks = not {"command", "lag", "rates"}.isdisjoint(effect.hooks)
+    if effect is BETAFLIGHT_LOOP or (acts_on_sticks and effect is not LEARNED_LAW):
+        return tuple(effect.ranges)
+    return ()
 
 
 def fold(
@@ -357,9 +390,9 @@ __all__ = [
     "Wind",
     "YawReaction",
     "acts",
-    "acts_on_sticks",
     "at_row",
-    "check_frame",
+    "check_beside_motors",
+    "check_motors",
     "check_parameters",
     "delay_steps_of",
     "effect_of",
@@ -370,5 +403,6 @@ __all__ = [
     "remember",
     "respond",
     "start_memories",
+    "stick_fields",
     "takes_motors",
 ]

@@ -14,8 +14,10 @@ from flytrack_env.effects import (
     Range,
     ThrustScale,
     Wind,
+    check_beside_motors,
     check_parameters,
     effect_of,
+    merge,
 )
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.params import RANGES, EnvParams
@@ -211,10 +213,15 @@ def _check_ranges(ranges: RandomizationParams, params: EnvParams, delay_steps: i
     ]
     for low, high in zip(ranges.low, ranges.high, strict=True):
         effect = effect_of(low)
-        known = {
-            name: getattr(high, name) for name in effect.ranges if getattr(high, name) is not None
-        }
-        check_parameters(effect.parameters()._replace(**known), params.dt, delay_steps)
+        for side in (low, high):
+            known = {
+                name: getattr(side, name)
+                for name in effect.ranges
+                if getattr(side, name) is not None
+            }
+            drawn = effect.parameters()._replace(**known)
+            check_beside_motors(merge(params.model.effects, drawn))
+        check_parameters(drawn, params.dt, delay_steps)  # of the upper side: delays are longest
         for name, bounds in effect.ranges.items():
             pair = getattr(low, name), getattr(high, name)
             if any(end is not None for end in pair):

@@ -139,15 +139,20 @@ def check_log(
     """
     if log.has_motors:
         motors = 0.5 * (log["u"] + 1.0) if motors is None else motors
-        log = with_throttle_alone(log)
+        found = check_log(with_throttle_alone(log), model, motors)
+        pairs, after = (
+            tuple(pair for pair in part if pair.name != "u and w")  # there are no sticks
+            for part in (found.pairs, found.after)
+        )
+        return replace(found, pairs=pairs, after=after)
     samples = sample_changes(log)
     held = {change.channel for change in samples if change.kind == "held"}
     # Rates about the world's axes also look like an inverted attitude: the simpler one counts.
     readings = [((), log), *with_body_rates(log)]
-    found = [(turned, one, *explain_frames(one)) for turned, one in readings]
-    explained = [one for one in found if one[3]]
+    framed = [(turned, one, *explain_frames(one)) for turned, one in readings]
+    explained = [one for one in framed if one[3]]
     battery = compare_battery(log)
-    pairs = (*found[0][2].pairs, *battery)
+    pairs = (*framed[0][2].pairs, *battery)
     if not explained:
         return Check(log.source, pairs, ((),), log)
     turned, right, compared, frames, scales = min(

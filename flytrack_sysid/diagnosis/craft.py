@@ -82,8 +82,10 @@ def summarize_lift(
     vectors: Mapping[str, np.ndarray],
 ) -> dict[str, Lift]:
     """Return what models lift, the extended one with intervals; empty if no thrust is fitted."""
-    problem, indices = refined.problem, free_indices(model, refined)
-    of_thrust = {*THRUST_COEFFS, THRUST_FACTOR}
+    problem, of_thrust = refined.problem, {*THRUST_COEFFS, THRUST_FACTOR}
+    if not of_thrust.intersection(problem.names[index] for index in free_indices(model, refined)):
+        refined = refined._replace(fit=None)  # flights do not show it, and single steps do
+    indices = free_indices(model, refined)
     columns = [column for column, index in enumerate(indices) if problem.names[index] in of_thrust]
     if not columns:
         return {}

@@ -11,6 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
+from flytrack_env.effects import takes_motors
 from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis import craft, summary
@@ -62,7 +63,8 @@ from flytrack_sysid.inference.search import (
     extended,
     with_refitted_noise,
 )
-from flytrack_sysid.log import STATED_VOLTAGES, FlightLog, LogError
+from flytrack_sysid.inference.torque import torque_notes
+from flytrack_sysid.log import STATED_MASS, STATED_VOLTAGES, FlightLog, LogError
 from flytrack_sysid.log_motion import (
     check_commands,
     check_same_origin,
@@ -205,7 +207,7 @@ def split(
     motion = required_motion(log, motion)
     model = nominal_parameters() if model is None else model
     check_commands(log, model)
-    warnings += voltage_notes(log, model.battery)
+    warnings += torque_notes(log, model) + voltage_notes(log, model.battery)
     log = with_voltage(log, model)
     model = model._replace(battery=battery_of_craft(log, model.battery))
     reductions: list[Callable[[FlightLog], tuple[FlightLog, np.ndarray, list[str]]]] = [
@@ -446,7 +448,8 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
     named = name_causes(vetted, parts)
     selection, linearization = named.selection, named.linearization
     problem, unexplained = selection.state.problem, selection.unexplained
-    causes = with_families((one for one in named.found if not one.beyond), unexplained)
+    has_motors = takes_motors(problem.like.effects)
+    causes = with_families((one for one in named.found if not one.beyond), unexplained, has_motors)
     beyond = (*vetted.refused, *(one for one in named.found if one.beyond))
     outliers = find_outliers((problem, test), named.extended.vector)
     vectors = {
@@ -536,7 +539,8 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
 
     Raises:
         DiagnosisError: no log.
-        LogError: measured logs beside others, or packs of different stated voltages.
+        LogError: measured logs beside others, or packs of different stated voltages, or craft of
+            different stated masses.
     """
     if not logs:
         raise DiagnosisError("logs: found none, expected at least one")
@@ -556,6 +560,12 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
         raise LogError(
             f"{', '.join(STATED_VOLTAGES)}: found {shown}; expected logs of one pack in one command"
         )
+    masses = {log.stated_mass_kg for log in logs} - {None}
+    if len(masses) > 1:
+        shown = ", ".join(
+            f"{Path(flight_log.source).name}: {flight_log.stated_mass_kg}" for flight_log in logs
+        )
+        raise LogError(f"{STATED_MASS}: found {shown}; expected logs of one craft in one command")
     names = set.intersection(*(set(log.channels) for log in logs))
     first = np.cumsum([0, *(len(np.unique(log.segment)) for log in logs)])
     segments = [
@@ -570,6 +580,7 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
         origin=logs[0].origin,
         has_motors=logs[0].has_motors,
         stated_voltage_v=logs[0].stated_voltage_v,
+        stated_mass_kg=next(iter(masses), None),
     )
 
 

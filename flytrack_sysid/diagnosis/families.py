@@ -1,4 +1,4 @@
-"""Families of laws that give the same response to the sticks.
+"""Families of laws that give the same response to the sticks, or to the motors.
 
 A response that a model lacks only in part can be put together from several laws. While something in
 it is unexplained, the laws of a family trade places: flights of one craft had other names, while
@@ -16,12 +16,23 @@ FAMILIES = {  # by the side of the residuals, as in ``unexplained.SIDES``
     "rate": (*TAUS[:3], "command_delay", "second_order_rates", "rate_slew_limit", "imu_latency"),
     "force": (TAUS[3], "command_delay", "thrust_lag_asymmetry"),
 }
+FAMILIES_OF_MOTORS = {
+    "rate": ("motor_lag", "command_delay", "imu_latency"),
+    "force": ("motor_lag", "command_delay"),
+}
 
 
-def with_families(causes: Iterable[Cause], unexplained: Unexplained) -> tuple[Cause, ...]:
-    """Return causes with their families, where something on the family's side is unexplained."""
+def with_families(
+    causes: Iterable[Cause], unexplained: Unexplained, has_motors: bool
+) -> tuple[Cause, ...]:
+    """Return causes with their families, where something on the family's side is unexplained.
+
+    Args:
+        has_motors: whether the commands are those of motors.
+    """
     sides = {name.partition(":")[0] for name in unexplained.shares}
-    families = [members for side, members in FAMILIES.items() if side in sides]
+    by_side = FAMILIES_OF_MOTORS if has_motors else FAMILIES
+    families = [members for side, members in by_side.items() if side in sides]
     result = []
     for cause in causes:
         own = [name for members in families if cause.effect in members for name in members]

@@ -30,7 +30,7 @@ from flytrack_sysid.diagnosis.motion_of_sensors import apparent_lateness, motion
 from flytrack_sysid.inference import noise as noises
 from flytrack_sysid.inference.chunks import Chunks, cut_chunks
 from flytrack_sysid.inference.lateness import read_poses, scored_as_logged
-from flytrack_sysid.inference.parameters import base_of
+from flytrack_sysid.inference.parameters import base_of, fields_of_sticks
 from flytrack_sysid.inference.problem import (
     Problem,
     merge_seconds,
@@ -154,10 +154,15 @@ class LogPart(NamedTuple):
 def _indices(problem: Problem, motion_estimate: MotionEstimate) -> list[int]:
     """Return the indices that are fitted; the sensors' latency only if poses would be early."""
     names = [f"{effect.name}.{name}" for effect in LOOK_ALIKES for name in effect.ranges]
+    unknown = fields_of_sticks(problem.like)
     return problem.parameter_indices(
         [
             *base_of(problem.like),
-            *(name for name in names if name != IMU_LATENCY or motion_estimate.late_s < 0.0),
+            *(
+                name
+                for name in names
+                if name not in unknown and (name != IMU_LATENCY or motion_estimate.late_s < 0.0)
+            ),
         ]
     )
 

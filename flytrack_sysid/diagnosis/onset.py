@@ -493,7 +493,7 @@ def misfit(selection: Selection, problem: Problem) -> float:
 def windowed(state: SearchState, windows: Sequence[Window]) -> SearchState:
     """Return the state with these windows."""
     problem = replace(state.problem, windows=tuple(windows))
-    return replace(state, problem=problem, held=(), linearization=None)
+    return replace(state, problem=problem, linearization=None)
 
 
 def _likeliest_side(

@@ -10,6 +10,9 @@ therefore
    held-out rows, and to first order those of each block of training rows without this block,
 4. holds parameters at nominal that an effect does not need.
 
+Flights without position and velocity show no force: the thrust map of single steps stands, since
+rates alone show only its ratio to inertia.
+
 Where a placebo without the commands predicts as well as the models, the diagnosis names nothing.
 """
 
@@ -32,8 +35,8 @@ from flytrack_sysid.diagnosis.flight_errors import (
 from flytrack_sysid.diagnosis.flight_fit import Fit, Target, at_bounds
 from flytrack_sysid.diagnosis.model_selection import ablate_all
 from flytrack_sysid.diagnosis.vetoes import Selection
-from flytrack_sysid.inference.free_flight import HORIZONS_S, UNITS, Windows
-from flytrack_sysid.inference.parameters import DRAIN
+from flytrack_sysid.inference.free_flight import HORIZONS_S, QUANTITIES, UNITS, Windows
+from flytrack_sysid.inference.parameters import DRAIN, THRUST_COEFFS
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import Candidate, base_fields, candidates_for
 from flytrack_sysid.inference.search import FittedModel, SearchState
@@ -158,7 +161,7 @@ def refine(
     unrefined = unrefined._replace(flight_test=flight_test)
     if not candidates or not flight_test.is_known.any():
         return unrefined
-    acting = _acting(problem, _probed(problem, extended, candidates), candidates, learnt)
+    acting = acting_effects(problem, _probed(problem, extended, candidates), candidates, learnt)
     refinement = _Refinement(
         flight_test,
         learnt,
@@ -213,7 +216,8 @@ class _Refinement(NamedTuple):
 
     def indices(self, problem: Problem, candidates: Sequence[Candidate]) -> list[int]:
         """Return the indices of the free parameters that act on the windows."""
-        base_indices = [index for index in self.base_indices if problem.names[index] != DRAIN]
+        unseen = {DRAIN} if shows_force(self.learnt) else {DRAIN, *THRUST_COEFFS}
+        base_indices = [index for index in self.base_indices if problem.names[index] not in unseen]
         return base_indices + problem.parameter_indices(self.fields_of(candidates))
 
     def run(self, extended: np.ndarray, unrefined: Refined) -> Refined:
@@ -354,17 +358,31 @@ class _Refinement(NamedTuple):
         return target.fitted(vector, indices, REFIT_ROUNDS, nearby)
 
 
-def _acting(
+def shows_force(windows: Windows) -> bool:
+    """Return whether position or velocity is scored in any window."""
+    seen = [QUANTITIES.index(name) for name in ("velocity", "position")]
+    return bool(windows.counts[..., seen].any())
+
+
+def acting_effects(
     problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate], windows: Windows
 ) -> tuple[str, ...]:
-    """Return the effects that change the predictions of a model."""
-    without = [problem.at_start(vector, candidate.fields) for candidate in candidates]
+    """Return the effects that change the predictions of a model, by all that they change of it."""
+    fields = [field for candidate in candidates for field in candidate.fields]
+    without = [problem.at_start(vector, [field]) for field in fields]
     errors = errors_at(problem, np.stack([vector, *without]), windows).errors
     changes = np.abs(errors[1:] - errors[0]).max(axis=(1, 2, 3, 4))
+    is_neutral = [np.array_equal(one, vector) for one in without]
+    unseen = {
+        field
+        for field, change, neutral in zip(fields, changes, is_neutral, strict=True)
+        if change == 0.0 and not neutral
+    }
+    seen = {field for field, change in zip(fields, changes, strict=True) if change > 0.0}
     return tuple(
         candidate.effect
-        for candidate, change in zip(candidates, changes, strict=True)
-        if change > 0.0
+        for candidate in candidates
+        if seen.intersection(candidate.fields) and unseen.isdisjoint(candidate.fields)
     )
 
 
@@ -424,10 +442,10 @@ def reduced(selection: Selection, refined: Refined) -> Selection:
             if name not in candidate.fields
         ]
         vector = refined.problem.at_start(model.vector, nominal)
+        thrust = {*refined.problem.parameter_indices(THRUST_COEFFS)} & {*model.indices}
+        indices = (*refined.fit.indices, *sorted(thrust - {*refined.fit.indices}))
         return selection._replace(
-            model=model._replace(
-                candidates=refined.kept, vector=vector, indices=refined.fit.indices
-            )
+            model=model._replace(candidates=refined.kept, vector=vector, indices=indices)
         )
     if refined.kept:
         return selection if refined.kept == model.candidates else _narrowed(selection, refined.kept)

@@ -8,7 +8,7 @@ import numpy as np
 
 from flytrack_env import __version__, save_model
 from flytrack_env.dynamics import SECONDS_PER_MINUTE
-from flytrack_env.effects import BY_NAME, LearnedLaw
+from flytrack_env.effects import BY_NAME, LearnedLaw, takes_motors
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
@@ -142,7 +142,7 @@ def _families(diagnosis: Diagnosis) -> str:
 
 def describe_fault(cause: str, diagnosis: Diagnosis) -> str:
     """Return the verb for a cause: compares the value in the flight with that in the model."""
-    if cause not in BY_NAME or cause.endswith("_scale"):
+    if cause not in BY_NAME or cause.endswith("_scale") or BY_NAME[cause].search.is_setting:
         return WRONG
     neutral, notable = BY_NAME[cause].parameters(), BY_NAME[cause].notable
     models = [model.effect(cause) for model in (diagnosis.nominal, diagnosis.extended)]
@@ -292,15 +292,16 @@ def _errors_table(diagnosis: Diagnosis) -> Table:
         for stick in diagnosis.half_response_s.get("extended", {})
     ]
     lifts = [diagnosis.lift.get(name) for name in diagnosis.error]
+    stick = "motors" if takes_motors(diagnosis.nominal.effects) else "stick"
     for lift in [one for one in lifts if one is not None][:1]:
         rows += [
             [
-                f"thrust over weight at full stick, {lift.full_v:.3g} V",
+                f"thrust over weight at full {stick}, {lift.full_v:.3g} V",
                 "1",
                 *("-" if one is None else _known(one.thrust_to_weight) for one in lifts),
             ],
             [
-                f"stick of the hover, {lift.middle_v:.3g} V",
+                f"{stick} of the hover, {lift.middle_v:.3g} V",
                 "1",
                 *("-" if one is None else _known(one.hover) for one in lifts),
             ],
@@ -385,10 +386,11 @@ def _lift_text(diagnosis: Diagnosis) -> list[str]:
     if "extended" not in diagnosis.lift:
         return []
     nominal, lift = diagnosis.lift["nominal"], diagnosis.lift["extended"]
+    stick = "motors" if takes_motors(diagnosis.nominal.effects) else "stick"
     return [
-        f"thrust over weight at full stick and {lift.full_v:.3g} V: "
+        f"thrust over weight at full {stick} and {lift.full_v:.3g} V: "
         f"{_known(lift.thrust_to_weight)}, the model says {_known(nominal.thrust_to_weight)}; "
-        f"stick of the hover at {lift.middle_v:.3g} V: {_known(lift.hover)}, the model says "
+        f"{stick} of the hover at {lift.middle_v:.3g} V: {_known(lift.hover)}, the model says "
         f"{_known(nominal.hover)}"
     ]
 

@@ -57,7 +57,7 @@ from flytrack_sysid.inference.score_test import (
     solve,
     threshold,
 )
-from flytrack_sysid.inference.search import FittedModel, SearchState
+from flytrack_sysid.inference.search import FittedModel, SearchState, channels_for
 
 LOOSE = 0.5  # of the prior's width: a parameter with a wider interval is not determined
 SCALE_TWINS = (
@@ -275,7 +275,8 @@ def not_identifiable(
             twins |= {name: (*twins.get(name, ()), cause.effect) for name in cause.equivalent}
     confusions = {name: limit.confused_with for name, limit in limits.items()} | twins
     flights = {
-        name: TO_LOG + " and ".join(BY_NAME[name].search.needs) for name in state.unobservable
+        name: TO_LOG + " and ".join(channels_for(BY_NAME[name], state.problem.like))
+        for name in state.unobservable
     }
     observable = {
         name: equivalent
@@ -477,10 +478,9 @@ def with_refined_values(
                 )
                 values[name] = Estimated.around(value, half[index], range_of(field).unit, low, high)
         fields = [field for field in fields if field.split(".")[-1] in values]
-        if "mean_factor" in values and fit is not None:
-            thrust_columns = [
-                fit.indices.index(index) for index in problem.parameter_indices(THRUST_COEFFS)
-            ]
+        thrust = problem.parameter_indices(THRUST_COEFFS)
+        if "mean_factor" in values and fit is not None and half.keys() >= {*thrust}:
+            thrust_columns = [fit.indices.index(index) for index in thrust]
             slopes = mean_thrust(problem)
             half_n = float(
                 np.sqrt(slopes @ fit.covariance[np.ix_(thrust_columns, thrust_columns)] @ slopes)
@@ -531,16 +531,16 @@ def changed_parameters(
     indices = [
         index for index in extended.indices if abs(vector[index] - problem.start[index]) > 0.0
     ]
-    if fit is not None:
-        widths = dict(zip(fit.indices, fit.half_widths, strict=True))
-    else:
-        acting = [
-            index for index in indices if linearization.acting([linearization.indices.index(index)])
-        ]
-        halves = Marginal(
-            linearization, extended, [problem.names[index] for index in acting]
-        ).half_widths()
-        widths = dict(zip(acting, halves, strict=True))
+    widths = {} if fit is None else dict(zip(fit.indices, fit.half_widths, strict=True))
+    acting = [
+        index
+        for index in indices
+        if index not in widths and linearization.acting([linearization.indices.index(index)])
+    ]
+    if acting:
+        names = [problem.names[index] for index in acting]
+        halves = Marginal(linearization, extended, names).half_widths()
+        widths |= dict(zip(acting, halves, strict=True))
     result = []
     for index in indices:
         name, value, half = (

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_env.effects import BY_NAME
+from flytrack_env.effects import BY_NAME, takes_motors
 from flytrack_sysid.diagnosis import model_selection
 from flytrack_sysid.diagnosis import unexplained as unknown
 from flytrack_sysid.diagnosis.result import Unexplained
@@ -20,6 +20,7 @@ from flytrack_sysid.inference.problem import Problem, split_blocks
 from flytrack_sysid.inference.record import Record
 from flytrack_sysid.inference.score_test import ALL_BASE_CAUSES, change_threshold, threshold
 from flytrack_sysid.inference.search import FittedModel, SearchState
+from flytrack_sysid.inference.torque import unseen_in_chunks
 
 # Held-out rows contradict a cause if two conditions hold. Its gain is HELD_OUT_SIGMAS standard
 # deviations below the expected gain, and less than HELD_OUT_SHARE of its size shows. The second one
@@ -43,6 +44,7 @@ DISTURBED, DISTURBED_BASE, KEPT_SHARE = 3.0, 10.0, 0.1
 # A stand-in for something unknown explains a part of it. A name that explains this many times what
 # the dependences explain is no stand-in: the dependences are the remainder of its law.
 OUTWEIGHS = 30.0
+LOAD = "motors.load"  # acts on force alone
 
 
 class Selection(NamedTuple):
@@ -261,9 +263,11 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
     A law that holds in transients only stands for dynamics that are not in the list of effects. For
     example, feedforward turns faster than commanded on the way to full stick, as a scale and a
     saturation would, but not while the stick stays there. Where turns are left unexplained, laws
-    that this log never shows at rest are rejected, too.
+    that this log never shows at rest are rejected, too. Where motors are commanded, there are none.
     """
     state, model = selection.state, selection.model
+    if takes_motors(state.problem.like.effects):
+        return []
     laws = [name for name in selection.ablations if BY_NAME[name].search.follows_sticks]
     if state.problem.counts[..., AXES[0], 1].any():  # attitude tells a gyro from any rate loop
         laws = [name for name in laws if "gyro" not in BY_NAME[name].hooks]
@@ -291,6 +295,21 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
     are_turns_unexplained = any(name.startswith("rate:") for name in selection.unexplained.shares)
     is_unseen = expected < HELD_OUT_SHOWN * inflation and are_turns_unexplained
     return laws if is_unseen or is_contradicted(gain, expected, inflation) else []
+
+
+def turned_by_unseen_torque(selection: Selection, test: Problem) -> list[str]:
+    """Reject single motors, damping and a gyro's scale where the log does not show torque.
+
+    Modelled rates are then those of noise, which a gyro's scale would shrink.
+    """
+    problem, model = selection.state.problem, selection.model
+    turning = [
+        one.effect
+        for one in model.candidates
+        if one.effect == "gyro_scale"
+        or (BY_NAME[one.effect].takes_motors and one.fields != (LOAD,))
+    ]
+    return turning if turning and unseen_in_chunks(problem.chunks, problem.like) else []
 
 
 def is_force_law(effect: str) -> bool:
@@ -324,6 +343,7 @@ VETOES: tuple[Veto, ...] = (
     stands_in_for_unknown,
     contradicted_on_held_out,
     not_seen_at_rest,
+    turned_by_unseen_torque,
     seen_once,
 )
 CONTRADICTED, EXPLAINED_BY_CHANGE = contradicted_on_held_out.__name__, "explained_by_change"
@@ -337,5 +357,6 @@ REASONS = {
         "dynamics of the rate loop that no list has would look the same while sticks move; fly "
         "stick_amplitudes, and hold each stick for a second"
     ),
+    "turned_by_unseen_torque": "the log hardly shows the torque of the motors",
     "seen_once": "it gains barely enough where it was fitted, and nothing on held-out rows",
 }

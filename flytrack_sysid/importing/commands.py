@@ -13,12 +13,14 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from flytrack_env.effects import Motors
 from flytrack_env.motors import NAMES
 from flytrack_sysid.importing.flight import saturation
 from flytrack_sysid.importing.units import PER_DEGREE
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import COMMAND_MARGIN
 from flytrack_sysid.plausibility import MIN_ROWS
+from flytrack_sysid.resample import SLOW_STEP_S
 from flytrack_sysid.timestamps import MAX_GAP_S
 
 AXES = ("roll", "pitch", "yaw")
@@ -118,6 +120,33 @@ def commands_of_motors(source: str, motors: np.ndarray | None) -> np.ndarray:
                 "move, expected the output of a motor in flight"
             )
     return 2.0 * motors - 1.0
+
+
+def check_motors_of_autopilot(
+    source: str, step_s: float, motors: Motors | None, turns_out: bool
+) -> None:
+    """Check an autopilot's own log of motors against what a model of motors needs.
+
+    Args:
+        source: log and message, for the error.
+        step_s: between its samples.
+        motors: the frame that the mapping states; None if it does not.
+        turns_out: whether the autopilot's propellers turn the other way than Betaflight's default.
+
+    Raises:
+        LogError: outputs are too slow, or the mapping's propellers turn the other way.
+    """
+    if step_s > SLOW_STEP_S:
+        raise LogError(
+            f"{source}: found motors at {1.0 / step_s:.3g} Hz, expected {1.0 / SLOW_STEP_S:.0f} Hz "
+            "or more with motors.as_command: they answer faster; log them at a higher rate"
+        )
+    if motors is not None and (float(motors.yaw_arm) < 0.0) != turns_out:
+        found, expected = ("in", "out") if turns_out else ("out", "in")
+        raise LogError(
+            f'{source}: frame.propellers: found "{found}" in the mapping, expected "{expected}" as '
+            "the log's parameters say"
+        )
 
 
 def _thrust(

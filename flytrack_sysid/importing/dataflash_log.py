@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flytrack_env.effects import Motors
 from flytrack_env.messages import quote_name
+from flytrack_sysid.importing.commands import check_motors_of_autopilot
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, read_log_file
 from flytrack_sysid.importing.mapping import Channel, Mapping
@@ -67,6 +69,17 @@ MOTOR_DEFAULTS = {
     "MOT_SPIN_MIN": 0.15,
     "MOT_SPIN_MAX": 0.95,
 }
+# Values of FRAME_TYPE: numbers of the motors in our order; those whose propellers turn the other
+# way than Betaflight's default (AP_MotorsMatrix.cpp).
+ORDERS = {
+    1: (4, 1, 2, 3),  # X
+    3: (4, 1, 2, 3),  # H
+    12: (1, 2, 3, 4),  # Betaflight X
+    13: (4, 1, 3, 2),  # DJI X
+    14: (2, 1, 3, 4),  # clockwise X
+    18: (1, 2, 3, 4),  # Betaflight X, reversed
+}
+TURN_OUT, DEFAULT_FRAME_TYPE = (3, 18), 1
 MIN_HEALTHY_FRACTION = 0.5  # of an instance's rows: the sensor is healthy for most of the flight
 
 
@@ -104,17 +117,15 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
         raise LogError(
             f"{path}: message RATE: missing or without {', '.join(FIELDS['RATE'])}; found {listed}"
         )
-    craft = mapping.craft
-    if craft.max_rate_deg_s is None:
+    craft, of_motors = mapping.craft, mapping.rules.motors_as_command
+    if craft.max_rate_deg_s is None and not of_motors:
         craft = craft._replace(
             max_rate_deg_s=_full_stick_deg_s(path, parameters, chosen["RATE"], remarks)
         )
-    if mapping.rules.motors_as_command:
-        raise LogError(
-            f"{mapping.source}: motors.as_command: not read of ArduPilot logs, whose motors have "
-            "another order; expected false"
-        )
-    channels = _channels(chosen, parameters, np.array(craft.max_rate_deg_s), remarks)
+    channels = _channels(chosen, parameters, craft.max_rate_deg_s, remarks)
+    if of_motors:
+        channels = [channel for channel in channels if channel.name not in ("u", "motors")]
+        channels.append(_motors_as_commands(path, chosen, parameters, craft.motors))
     topics = [
         Table(str(path), {TIMESTAMP: fields[TIME] * UNITS["time"]["us"], **_named(name, fields)})
         for name, fields in chosen.items()
@@ -224,10 +235,10 @@ def _full_stick_deg_s(
 def _channels(
     messages: dict[str, dict[str, np.ndarray]],
     parameters: dict[str, float],
-    full_deg_s: np.ndarray,
+    full_deg_s: tuple[float, ...] | None,
     remarks: list[str],
 ) -> list[Channel]:
-    """Return the channels of the messages that a log has."""
+    """Return the channels of the messages that a log has; commands need a known full stick."""
 
     def columns_of(message: str, fields: tuple[str, ...]) -> tuple[str, ...]:
         """Return the columns of a message; none if the log lacks one of them."""
@@ -246,7 +257,8 @@ def _channels(
         return [Channel(message, name, columns, convert)] if columns else []
 
     def commands(table: Table) -> np.ndarray:
-        rates = vector_from(table.matrix(columns_of("RATE", SETPOINTS)), True) / full_deg_s
+        full_stick = np.array(full_deg_s)
+        rates = vector_from(table.matrix(columns_of("RATE", SETPOINTS)), True) / full_stick
         return np.column_stack([rates, 2.0 * table.matrix(columns_of("RATE", (THROTTLE,))) - 1.0])
 
     gyroscope = vector("w", "IMU", GYROSCOPE)
@@ -284,6 +296,42 @@ def _attitude(quaternion: tuple[str, ...], euler: tuple[str, ...]) -> list[Chann
 
     columns = quaternion or euler
     return [Channel("XKQ" if quaternion else "ATT", "q", columns, convert)] if columns else []
+
+
+def _motors_as_commands(
+    path: Path,
+    messages: dict[str, dict[str, np.ndarray]],
+    parameters: dict[str, float],
+    motors: Motors | None,
+) -> Channel:
+    """Return the channel of four motors' outputs in our order, 0 (off) to 1 (full)."""
+    source = f"{path}: message RCOU"
+    frame_type = int(parameters.get("FRAME_TYPE", DEFAULT_FRAME_TYPE))
+    if frame_type not in ORDERS:
+        expected = ", ".join(map(str, ORDERS))
+        raise LogError(f"{source}: FRAME_TYPE: found {frame_type}, expected an X: {expected}")
+    outputs = {
+        function: number
+        for number in range(NUM_OUTPUTS, 0, -1)
+        if (function := _function(parameters, number)) in MOTOR_FUNCTIONS
+    }
+    if outputs and sorted(outputs) != [*MOTOR_FUNCTIONS[:NUM_MOTORS]]:
+        raise LogError(
+            f"{source}: SERVOn_FUNCTION: found {len(outputs)} motors, expected motors 1 to 4"
+        )
+    columns = [f"C{outputs.get(MOTOR_FUNCTIONS[motor - 1], motor)}" for motor in ORDERS[frame_type]]
+    rows = messages.get("RCOU", {})
+    if any(name not in rows for name in (TIME, *columns)):
+        raise LogError(f"{source}: missing or without {', '.join(columns)}; expected the outputs")
+    steps_s = np.diff(rows[TIME]) * UNITS["time"]["us"]
+    step_s = float(np.median(steps_s)) if len(steps_s) else np.inf
+    check_motors_of_autopilot(source, step_s, motors, frame_type in TURN_OUT)
+    low, high = (
+        parameters.get(name) or MOTOR_DEFAULTS[name] for name in ("MOT_PWM_MIN", "MOT_PWM_MAX")
+    )
+    named = tuple(f"RCOU.{column}" for column in columns)
+    convert = lambda table: np.clip((table.matrix(named) - low) / (high - low), 0.0, 1.0)  # noqa: E731
+    return Channel("RCOU", "motors", named, convert)
 
 
 def _motors(columns: tuple[str, ...], parameters: dict[str, float]) -> list[Channel]:

@@ -140,7 +140,7 @@ def import_log(
     if loaded.rows.logs and format not in FORMATS_OF_SEVERAL_LOGS:
         raise LogError(f"{loaded.source}: rows.logs: a file of format {format} holds one log")
     flights_read = [(path, flight) for path in files for flight in READERS[format](path, loaded)]
-    notes = tuple(note for _, flight in flights_read for note in flight.notes)
+    notes = (*loaded.notes, *(note for _, flight in flights_read for note in flight.notes))
     flights, ground_notes = _flights_in_the_air(flights_read, loaded, format in DENSE_FORMATS)
     notes += ground_notes
     sources = [flight.log.source for flight in flights]
@@ -148,7 +148,10 @@ def import_log(
     log, offsets = align_clocks(log, align)
     craft = _common_craft(flights, sources)
     log = replace(
-        log, origin="measured", stated_voltage_v=None if "v_bat" in log else craft.voltage_v
+        log,
+        origin="measured",
+        stated_voltage_v=None if "v_bat" in log else craft.voltage_v,
+        stated_mass_kg=craft.mass_kg,
     )
     if craft.voltage_v is None and "v_bat" in log and log["v_bat"].min() > 0.0:
         craft = craft._replace(voltage_v=(float(log["v_bat"].min()), float(log["v_bat"].max())))

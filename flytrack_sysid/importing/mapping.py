@@ -481,9 +481,30 @@ class Frame(Fields):
             return self
         crafts = _load(FRAMES)
         values = crafts[choose("craft", self.craft, crafts)]
-        stated = {name: getattr(self, name) for name in Frame.__struct_fields__}
-        given = {name: value for name, value in stated.items() if value is not None}
-        return msgspec.convert({**values, **given}, Frame)
+        return msgspec.convert({**values, **self._stated()}, Frame)
+
+    def _stated(self) -> dict[str, Any]:
+        """Return the fields that the mapping states."""
+        fields = {name: getattr(self, name) for name in Frame.__struct_fields__}
+        return {name: value for name, value in fields.items() if value is not None}
+
+    def changes(self, mass_kg: float | None) -> str:
+        """Return what mass and inertia the mapping states instead of its known craft's; else "".
+
+        Args:
+            mass_kg: of the craft, by any table of the mapping; None if none states it.
+        """
+        if self.craft is None:
+            return ""
+        known = Frame(craft=self.craft).known()
+        changes = []
+        for name, value in (("mass_kg", mass_kg), ("inertia_kg_m2", self.inertia_kg_m2)):
+            usual = getattr(known, name)
+            if value is not None and not np.allclose(value, usual):
+                changes.append(f"{name}: found {quote_value(value)}, {self.craft} has {usual}")
+        if len(changes) == 1:
+            changes.append(f"the rest is that of {self.craft}")
+        return "; ".join(changes)
 
     def motors(self, mass_kg: float | None) -> Motors:
         """Return the parameters of the effect; raises ValueError.
@@ -567,6 +588,7 @@ class Mapping(NamedTuple):
         channels: channels of its tables of columns; empty if it has none.
         rules: how commands follow from setpoints and motors.
         delimiter: separator of a CSV file's cells.
+        notes: for the user.
         files: the CSV files of a log of several, by the names that columns begin with.
     """
 
@@ -576,6 +598,7 @@ class Mapping(NamedTuple):
     channels: tuple[Channel, ...] = ()
     rules: CommandRules = CommandRules()
     delimiter: str = ","
+    notes: tuple[str, ...] = ()
     files: dict[str, CsvFile] = {}  # noqa: RUF012, not written to
 
 
@@ -610,10 +633,12 @@ def load_mapping(where: str | Path) -> Mapping:
             channels += table.channels(name) if table is not None else []
         except ValueError as error:
             raise LogError(f"{source}: {join_text(name, str(error))}") from error
+    craft = _craft(source, file)
+    changes = file.frame.changes(file.craft.mass_kg or file.frame.mass_kg) if file.frame else ""
     return Mapping(
         source=source,
         rows=file.rows,
-        craft=_craft(source, file),
+        craft=craft,
         channels=tuple(channels),
         rules=file.rules(),
         files={
@@ -621,6 +646,7 @@ def load_mapping(where: str | Path) -> Mapping:
             for name, table in file.files.items()
         },
         delimiter=file.delimiter,
+        notes=(f"warning: {source}: frame: {changes}",) if changes else (),
     )
 
 

@@ -6,11 +6,15 @@ The rows are those of the body rates. Other sensors are interpolated between the
 setpoints are held. There are no rows where a topic has a gap of more than three of its usual steps.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flytrack_env.effects import Motors
+from flytrack_env.motors import NAMES
+from flytrack_sysid.importing.commands import check_motors_of_autopilot, commands_of_motors
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, read_log_file
 from flytrack_sysid.importing.mapping import Mapping
@@ -91,8 +95,12 @@ SOURCES: dict[str, tuple[Source, ...]] = {
     ),
     "v_bat": (("battery_status", BATTERY_FIELDS),),
     "landed": (("vehicle_land_detected", ("landed",)),),
+    "motors": (_indexed("actuator_motors", "control", 4),),
 }
-REQUIRED = ("w", "u", "q")
+REQUIRED = ("w", "u", "q", "motors")
+# Rotors of PX4's quadcopter X, in our order, where CA_ROTORn_PX and _PY do not say it.
+ROTORS_OF_X = (3, 0, 1, 2)
+QUADRANTS = ((-1, 1), (1, 1), (-1, -1), (1, -1))  # ahead, right: of the motors in our order
 TIMES = ("timestamp", "timestamp_sample")
 EVENTS = ("vehicle_land_detected",)  # topics that are published when something changes
 
@@ -105,20 +113,21 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
     Raises:
         LogError: the file is no ULog, or at no time has rates, attitude and rate setpoints.
     """
-    for name in ("as_thrust", "as_command"):
-        if not getattr(mapping.rules, f"motors_{name}"):
-            continue
-        raise LogError(
-            f"{mapping.source}: motors.{name}: not read of PX4 logs: actuator outputs are too slow"
-        )
-    samples, clocks, parameters, remarks = _decode(path)
-    craft = mapping.craft
-    if craft.max_rate_deg_s is None:
-        craft = craft._replace(max_rate_deg_s=_full_stick_deg_s(path, parameters))
-    base, full_stick = samples["w"].times, np.array(craft.max_rate_deg_s)
-    commands = _commands(samples["u"].values, full_stick * PER_DEGREE)
-    _check_full_stick(path, commands, full_stick)
-    converted = {"u": Samples(samples["u"].times, commands), "q": _attitude(path, samples["q"])}
+    if mapping.rules.motors_as_thrust:
+        raise LogError(f"{mapping.source}: motors.as_thrust: not read of PX4 logs, expected false")
+    of_motors, craft = mapping.rules.motors_as_command, mapping.craft
+    samples, clocks, parameters, remarks = _decode(path, of_motors)
+    if of_motors:
+        commands = _motors_as_commands(path, samples["motors"], parameters, craft.motors)
+    else:
+        if craft.max_rate_deg_s is None:
+            craft = craft._replace(max_rate_deg_s=_full_stick_deg_s(path, parameters))
+        full_stick = np.array(craft.max_rate_deg_s)
+        values = _commands(samples["u"].values, full_stick * PER_DEGREE)
+        _check_full_stick(path, values, full_stick)
+        commands = samples["u"]._replace(values=values)
+    base = samples["w"].times
+    converted = {"u": commands, "q": _attitude(path, samples["q"])}
     for name in ("w", "f", "p", "v"):
         if name in samples:
             converted[name] = samples[name]._replace(values=vector_from(samples[name].values, True))
@@ -143,7 +152,8 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
         f"{path}: {text}"
         for text in [usage, *remarks, *_airframe(parameters), *slow_channels(converted)]
     )
-    return ImportedFlight(log_of_table(Table(str(path), columns)), craft, notes, is_landed)
+    log = replace(log_of_table(Table(str(path), columns)), has_motors=of_motors)
+    return ImportedFlight(log, craft, notes, is_landed)
 
 
 def _airframe(parameters: dict[str, float]) -> list[str]:
@@ -160,8 +170,39 @@ def _airframe(parameters: dict[str, float]) -> list[str]:
     )
 
 
-def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, Clock], dict[str, float], list[str]]:
+def _motors_as_commands(
+    path: Path, outputs: Samples, parameters: dict[str, float], motors: Motors | None
+) -> Samples:
+    """Return the controls of four motors as commands, in our order."""
+    topic = f"{path}: topic actuator_motors"
+    num_rotors = int(parameters.get("CA_ROTOR_COUNT", len(NAMES)))
+    if num_rotors != len(NAMES):
+        raise LogError(f"{topic}: found {num_rotors} rotors (CA_ROTOR_COUNT), expected 4")
+    places = [
+        tuple(np.sign(parameters.get(f"CA_ROTOR{number}_P{axis}", 0.0)) for axis in "XY")
+        for number in range(len(NAMES))
+    ]
+    is_placed = sorted(places) == sorted(QUADRANTS)
+    if any(map(any, places)) and not is_placed:
+        raise LogError(
+            f"{topic}: CA_ROTORn_PX, CA_ROTORn_PY: found no rotor in each quadrant, expected an X"
+        )
+    order = [places.index(quadrant) for quadrant in QUADRANTS] if is_placed else [*ROTORS_OF_X]
+    turns_out = parameters.get(f"CA_ROTOR{order[1]}_KM", 0.0) < 0.0  # clockwise at the front right
+    step_s = float(np.median(np.diff(outputs.times))) if len(outputs.times) > 1 else np.inf
+    check_motors_of_autopilot(topic, step_s, motors, turns_out)
+    controls = np.clip(outputs.values[:, order], 0.0, 1.0)
+    return outputs._replace(values=commands_of_motors(str(path), controls))
+
+
+def _decode(
+    path: Path, of_motors: bool
+) -> tuple[dict[str, Samples], dict[str, Clock], dict[str, float], list[str]]:
     """Read the topics of a log.
+
+    Args:
+        path: of the log.
+        of_motors: read the motors' controls, in place of rate setpoints.
 
     Returns:
         samples: by channel, on one time line.
@@ -170,8 +211,10 @@ def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, Clock], dict[str,
         remarks: what is wrong with the log.
     """
     read_log_file(path, MAX_BYTES, FIRST_BYTES, "a PX4 log (ULog)", len(FIRST_BYTES))
+    unused = "u" if of_motors else "motors"
+    used = {channel: sources for channel, sources in SOURCES.items() if channel != unused}
     fields: dict[str, list[str]] = {}
-    for topic, names in (source for sources in SOURCES.values() for source in sources):
+    for topic, names in (source for sources in used.values() for source in sources):
         fields[topic] = [*fields.get(topic, TIMES), *names]
     notes, arrays = decode(str(path), "ulog", path, fields)
     vehicle = OTHER_VEHICLES.get(int(notes["parameters"].get("MAV_TYPE", 0)))
@@ -186,7 +229,7 @@ def _decode(path: Path) -> tuple[dict[str, Samples], dict[str, Clock], dict[str,
     remarks = ["damaged in places; what could be read is used"] if notes["is_damaged"] else []
     if notes["is_cut_off"] and not remarks:  # a damaged log may end within a message, too
         remarks.append("cut off: used up to the last whole message")
-    for channel, sources in SOURCES.items():
+    for channel, sources in used.items():
         for topic, names in sources:
             best = _best_instance(path, topic, topics.get(topic, {}), names)
             if best is not None:

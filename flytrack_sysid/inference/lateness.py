@@ -49,9 +49,10 @@ class Late(NamedTuple):
             corrected: the residuals of corrected chunks, (models, rows, chunks, NUM_AXES, 2).
         """
         result = corrected.copy()
-        result[..., :-1, 1] = (
-            _delayed(corrected[..., :-1, 1], self.weights, -3) + self.constant[..., :-1]
-        )
+        with np.errstate(invalid="ignore"):  # of a diverged trial: infinite ones become NaN
+            result[..., :-1, 1] = (
+                _delayed(corrected[..., :-1, 1], self.weights, -3) + self.constant[..., :-1]
+            )
         return result
 
 

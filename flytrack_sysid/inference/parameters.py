@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import BY_NAME, Range, effect_of
+from flytrack_env.effects import BY_NAME, EFFECTS, Range, effect_of, stick_fields, takes_motors
 
 STICKS = ("roll", "pitch", "yaw", "thrust")
 TAUS = tuple(f"tau_{stick}" for stick in STICKS)
@@ -46,6 +46,16 @@ def base_of(model: ModelParameters) -> tuple[str, ...]:
     taus = () if any("respond" in effect.hooks for effect in effects) else TAUS
     craft = [f"{effect.name}.{field}" for effect in effects for field in effect.search.fitted]
     return (*taus, *THRUST_COEFFS, DRAIN, *craft)
+
+
+def fields_of_sticks(model: ModelParameters) -> set[str]:
+    """Return the parameters of effects that act on sticks, where a model has none: motors do.
+
+    As ``effect.parameter``; empty for a model that sticks command.
+    """
+    if not takes_motors(model.effects):
+        return set()
+    return {f"{effect.name}.{field}" for effect in EFFECTS for field in stick_fields(effect)}
 
 
 def range_of(name: str) -> Range:

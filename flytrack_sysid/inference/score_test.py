@@ -12,8 +12,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg, optimize, stats
 
-from flytrack_env.effects import BY_NAME, EFFECTS, Effect, acts_on_sticks, takes_motors
-from flytrack_sysid.inference.parameters import DRAIN, TAUS, THRUST_COEFFS, neutral_value, range_of
+from flytrack_env.effects import BY_NAME, EFFECTS, Effect, takes_motors
+from flytrack_sysid.inference.parameters import (
+    DRAIN,
+    TAUS,
+    THRUST_COEFFS,
+    fields_of_sticks,
+    neutral_value,
+    range_of,
+)
 from flytrack_sysid.inference.problem import (
     SEARCHED,
     Problem,
@@ -173,19 +180,26 @@ def searched_in(problem: Problem) -> list[str]:
     """
     if not takes_motors(problem.like.effects):
         return [effect.name for effect in SEARCHED]
+    unknown = fields_of_sticks(problem.like)
     return [
         effect.name
         for effect in SEARCHED
-        if not acts_on_sticks(effect) and effect.name != "thrust_scale"
+        if not unknown.issuperset(f"{effect.name}.{field}" for field in effect.ranges)
+        and effect.name != "thrust_scale"
     ]
 
 
 def candidates_for(problem: Problem) -> list[Candidate]:
     """Return the candidates: effects of the list, and settings of the craft that may change."""
     searched = searched_in(problem)
+    unknown = fields_of_sticks(problem.like)
     given = [BY_NAME[name] for name in problem.given_effects if BY_NAME[name].search.is_setting]
     return [
-        *(candidate for candidate in CANDIDATES if candidate.effect in searched),
+        *(
+            candidate
+            for candidate in CANDIDATES
+            if candidate.effect in searched and unknown.isdisjoint(candidate.fields)
+        ),
         *(
             candidate
             for effect in given

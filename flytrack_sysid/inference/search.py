@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import Effect, takes_motors
 from flytrack_sysid.inference import noise as noises
 from flytrack_sysid.inference.chunks import measured_voltage_range
 from flytrack_sysid.inference.parameters import DRAIN, base_of
@@ -18,6 +20,7 @@ from flytrack_sysid.inference.score_test import (
     compute_costs,
     threshold,
 )
+from flytrack_sysid.inference.torque import unseen_in_chunks
 from flytrack_sysid.log import FlightLog
 
 PER_PARAMETER = 4.0  # of chi2: the gain that one more parameter needs to be preferred
@@ -84,6 +87,15 @@ class FittedModel(NamedTuple):
         return (*others, candidate._replace(fields=fields))
 
 
+def channels_for(effect: Effect, model: ModelParameters) -> tuple[str, ...]:
+    """Return the channels that a log must have to show an effect of a model.
+
+    Rates that follow from torques show a gyro's scale as inertia; attitude tells both apart.
+    """
+    is_gyro_scale = effect.name == "gyro_scale" and takes_motors(model.effects)
+    return (*effect.search.needs, "q") if is_gyro_scale else effect.search.needs
+
+
 @dataclass(frozen=True, eq=False)
 class SearchState:
     """State of a search; every step of the search returns a new one.
@@ -92,7 +104,7 @@ class SearchState:
         problem: the rows to learn from, with the noise.
         unobservable: effects that need channels the log lacks.
         refused: effects that vetoes have rejected.
-        held: base parameters that stay nominal.
+        held: base parameters that the log does not show, and that stay nominal.
         linearization: the last one along everything, kept because slopes are expensive.
     """
 
@@ -112,9 +124,12 @@ class SearchState:
         noise = noises.first_guess(problem.chunks, problem.residuals(problem.start[None])[0])
         channels = {*log.channels, *problem.chunks.measured}
         lacking = tuple(
-            effect.name for effect in SEARCHED if not set(effect.search.needs) <= channels
+            effect.name
+            for effect in SEARCHED
+            if not set(channels_for(effect, problem.like)) <= channels
         )
-        return cls(problem.with_noise(noise), unobservable=lacking)
+        held = unseen_in_chunks(problem.chunks, problem.like)
+        return cls(problem.with_noise(noise), unobservable=lacking, held=held)
 
     @property
     def base_indices(self) -> list[int]:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden import measure
+from flytrack_env.dynamics import nominal_motor_parameters
 from flytrack_env.effects import EFFECTS, AccelerometerBias, LinearDrag
 from flytrack_sysid.diagnosis import report, summary
 from flytrack_sysid.diagnosis.evidence import EVIDENCE
@@ -303,3 +304,10 @@ def test_hostile_text_is_only_shown_and_nothing_is_loaded_from_elsewhere():
     (target,) = re.findall(r'(?:src|href)="([^"]*)"', plain)
     assert target.startswith("data:image/png;base64,")
     assert not re.search(r"https?://|url\(|@import|<link|<script", plain)
+
+
+def test_a_setting_of_the_craft_has_a_wrong_value():
+    nominal = nominal_motor_parameters()
+    weak = nominal.with_effects(nominal.effect("motors")._replace(rear_left=0.9))
+    flown = SimpleNamespace(nominal=nominal, extended=weak)
+    assert report.describe_fault("motors", flown) == report.WRONG

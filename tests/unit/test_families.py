@@ -2,10 +2,11 @@
 
 import pytest
 
+from flytrack_env.dynamics import nominal_motor_parameters
 from flytrack_env.effects import BY_NAME
-from flytrack_sysid.diagnosis.families import FAMILIES, with_families
+from flytrack_sysid.diagnosis.families import FAMILIES, FAMILIES_OF_MOTORS, with_families
 from flytrack_sysid.diagnosis.result import Cause, Unexplained
-from flytrack_sysid.inference.parameters import TAUS
+from flytrack_sysid.inference.parameters import TAUS, fields_of_sticks
 from tests.support.tables import table
 
 
@@ -13,7 +14,7 @@ from tests.support.tables import table
 def test_a_family_is_of_the_side_that_is_unexplained(cause, sides, family):
     shares = {f"{side}: stochastic": 1.0 for side in sides}
     named = Cause(cause, (), "rates", {}, 1.0, 1.0, 1.0, 1.0)
-    (found,) = with_families([named], Unexplained(bool(shares), shares=shares))
+    (found,) = with_families([named], Unexplained(bool(shares), shares=shares), False)
     assert {*family} <= {*found.family} and cause not in found.family
     assert bool(found.family) == bool(family)
 
@@ -21,3 +22,13 @@ def test_a_family_is_of_the_side_that_is_unexplained(cause, sides, family):
 def test_members_are_effects_or_lags():
     members = {name for family in FAMILIES.values() for name in family}
     assert members <= {*BY_NAME, *TAUS}
+
+
+def test_families_of_motors_have_no_laws_of_sticks():
+    unexplained = Unexplained(True, shares={"rate: stochastic": 1.0})
+    named = Cause("command_delay", (), "rates", {}, 1.0, 1.0, 1.0, 1.0)
+    (found,) = with_families([named], unexplained, True)
+    assert found.family == ("motor_lag", "imu_latency")
+    members = {name for family in FAMILIES_OF_MOTORS.values() for name in family}
+    of_sticks = {field.split(".")[0] for field in fields_of_sticks(nominal_motor_parameters())}
+    assert members.isdisjoint(of_sticks - {"command_delay"}) and members.isdisjoint(TAUS)

@@ -110,3 +110,50 @@ def test_other_logs_are_refused(messages, read, absent, options, message):
 def test_another_airframe_is_noted(messages, read):
     notes = read(messages, parameters={**COPTER_PARAMETERS, "FRAME_CLASS": 2.0}).notes
     assert "found a hexacopter (FRAME_CLASS 2), not a quadcopter" in " ".join(notes)
+
+
+OF_MOTORS = "[motors]\nas_command = true\n"
+
+
+def with_outputs(messages, every=1):
+    """Return messages with outputs 1 to 4 of a tenth to four of the range, and a movement."""
+    rows = [
+        (row[0], *(1000 + 100 * motor + index % 2 for motor in range(1, 5)))
+        for index, row in enumerate(messages["RATE"][2][::every])
+    ]
+    return {**messages, "RCOU": ("QHHHH", "TimeUS,C1,C2,C3,C4", rows)}
+
+
+@pytest.mark.parametrize(
+    ("parameters", "shares"),
+    [
+        ({}, (0.4, 0.1, 0.2, 0.3)),
+        ({"FRAME_TYPE": 12.0}, (0.1, 0.2, 0.3, 0.4)),
+        ({"FRAME_TYPE": 13.0}, (0.4, 0.1, 0.3, 0.2)),
+        ({"FRAME_TYPE": 14.0}, (0.2, 0.1, 0.3, 0.4)),
+        (
+            {f"SERVO{output}_FUNCTION": 37.0 - output for output in range(1, 5)},
+            (0.1, 0.4, 0.3, 0.2),
+        ),
+    ],
+)
+def test_motors_are_commands_in_our_order(messages, read, parameters, shares):
+    log = read(with_outputs(messages), OF_MOTORS, parameters=parameters).log
+    assert log.has_motors
+    np.testing.assert_allclose(log["u"][0], 2.0 * np.array(shares) - 1.0, atol=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("every", "parameters", "frame", "message"),
+    [
+        (10, {}, "", "message RCOU: found motors at 10 Hz, expected 40 Hz or more"),
+        (1, {"FRAME_TYPE": 0.0}, "", "FRAME_TYPE: found 0, expected an X: 1, 3, 12"),
+        (1, {"SERVO1_FUNCTION": 33.0}, "", "SERVOn_FUNCTION: found 1 motors, expected motors 1 to"),
+        (1, {"FRAME_TYPE": 18.0}, '[frame]\ncraft = "iris"', 'expected "out" as the log'),
+    ],
+)
+def test_motors_that_do_not_suit_are_refused(messages, read, every, parameters, frame, message):
+    with pytest.raises(LogError, match=message):
+        read(with_outputs(messages, every), OF_MOTORS + frame, parameters=parameters)
+    with pytest.raises(LogError, match="message RCOU: missing or without C4, C1, C2, C3"):
+        read(messages, OF_MOTORS)

@@ -35,11 +35,11 @@ def topics():
 def read(tmp_path):
     """Return the import of topics, or of what a file has."""
 
-    def import_content(content, parameters=PX4_PARAMETERS, full_stick=None):
+    def import_content(content, parameters=PX4_PARAMETERS, full_stick=None, mapping=""):
         content = content if isinstance(content, bytes) else ulog(content, parameters)
         (tmp_path / "a.ulg").write_bytes(content)
         craft = f"[craft]\nmax_rate_deg_s = {full_stick}\n" if full_stick else ""
-        (tmp_path / "map.toml").write_text(craft)
+        (tmp_path / "map.toml").write_text(craft + mapping)
         return import_log(tmp_path / "a.ulg", "ulog", tmp_path / "map.toml")
 
     return import_content
@@ -179,3 +179,44 @@ def test_stamps_of_samples_from_another_clock_give_way_to_those_of_publishing(
     assert len(imported.log) == NUM_ROWS - 1  # the last attitude was sampled 0.5 ms before its row
     latency = f"timestamp_sample of {RATES} is {microseconds * 1e-6:.6g} s before timestamp"
     assert latency in " ".join(imported.notes)
+
+
+MOTORS, OF_MOTORS = "actuator_motors", "[motors]\nas_command = true\n"
+PLACED = {"CA_ROTOR_COUNT": 4.0}
+for rotor, (ahead, right) in enumerate(((-1, -1), (1, 1), (-1, 1), (1, -1))):  # not PX4's X
+    PLACED |= {f"CA_ROTOR{rotor}_PX": 0.1 * ahead, f"CA_ROTOR{rotor}_PY": 0.1 * right}
+
+
+def with_motors(topics, every=1):
+    """Return topics with controls of motors: a tenth of their number, and a little movement."""
+    stamps = [row[0] for row in topics[RATES][1][::every]]
+    unused = [np.nan] * 8
+    rows = [(stamp, *(0.1 * np.arange(1, 5) + 1e-9 * stamp), *unused) for stamp in stamps]
+    return {**topics, MOTORS: ("float[12] control", rows)}
+
+
+@pytest.mark.parametrize(
+    ("parameters", "shares"), [({}, (0.4, 0.1, 0.2, 0.3)), (PLACED, (0.3, 0.2, 0.1, 0.4))]
+)
+def test_motors_are_commands_in_our_order(topics, read, parameters, shares):
+    content = with_motors(topics)
+    del content[SETPOINT]  # and full stick need not be known
+    log = read(content, parameters, mapping=OF_MOTORS).log
+    assert log.has_motors
+    np.testing.assert_allclose(log["u"][0], 2.0 * np.array(shares) - 1.0, atol=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("every", "parameters", "frame", "message"),
+    [
+        (25, {}, "", r"topic actuator_motors: found motors at 10 Hz, expected 40 Hz or more"),
+        (1, {"CA_ROTOR_COUNT": 6.0}, "", "found 6 rotors .CA_ROTOR_COUNT., expected 4"),
+        (1, {"CA_ROTOR0_PX": 0.1}, "", "found no rotor in each quadrant, expected an X"),
+        (1, {"CA_ROTOR0_KM": -0.05}, '[frame]\ncraft = "iris"', 'expected "out" as the log'),
+    ],
+)
+def test_motors_that_do_not_suit_are_refused(topics, read, every, parameters, frame, message):
+    with pytest.raises(LogError, match=message):
+        read(with_motors(topics, every), parameters, mapping=OF_MOTORS + frame)
+    with pytest.raises(LogError, match=r"topic actuator_motors .*: missing or empty"):
+        read(topics, mapping=OF_MOTORS)

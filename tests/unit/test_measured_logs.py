@@ -1,5 +1,6 @@
 """What a log states (its origin, its pack's voltages) survives and decides how it is replayed."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,8 @@ from flytrack_sysid.diagnosis.diagnose import split
 from flytrack_sysid.diagnosis.size import is_notable
 from flytrack_sysid.fit import what_is_fitted
 from flytrack_sysid.importing.flight import Craft
-from flytrack_sysid.inference.lateness import read_poses
+from flytrack_sysid.inference.chunks import NUM_AXES
+from flytrack_sysid.inference.lateness import TAPS, Late, read_poses
 from flytrack_sysid.inference.parameters import DRAIN
 from flytrack_sysid.inference.record import fill_gaps, make_record
 from flytrack_sysid.log import STATED, LogError
@@ -67,9 +69,12 @@ OPERATIONS = {
 @pytest.mark.parametrize("operation", OPERATIONS)
 def test_what_is_stated_survives(operation, truth, tmp_path):
     for origin, voltages in (("measured", FOUR_CELLS), ("simulated", None), (None, FOUR_CELLS)):
-        log = replace(truth.without("v_bat"), origin=origin, stated_voltage_v=voltages)
+        log = replace(
+            truth.without("v_bat"), origin=origin, stated_voltage_v=voltages, stated_mass_kg=0.7
+        )
         result = OPERATIONS[operation](log, tmp_path)
         assert (result.origin, result.stated_voltage_v) == (origin, voltages)
+        assert result.stated_mass_kg == 0.7
 
 
 def test_the_hash_is_of_the_rows_alone():
@@ -89,6 +94,7 @@ LATER = (np.arange(NUM_ROWS) > 3) * ONES
         ({"measured": LATER}, r"row 4.*measured: found 1\.0, expected 0 as in row 0"),
         ({"v_bat_low": ONES}, "column v_bat_high: missing; found only v_bat_low"),
         ({"v_bat_low": 17.0 * ONES, "v_bat_high": ONES}, "found 17 to 1 V, expected"),
+        ({"mass_kg": 0.0 * ONES}, "mass_kg: found 0 kg, expected a mass above 0"),
     ],
 )
 def test_files_that_state_nonsense_are_refused(suffix, columns, message, tmp_path):
@@ -156,6 +162,12 @@ def test_logs_of_different_origin_are_refused():
     other = replace(second, origin="measured", stated_voltage_v=FOUR_CELLS)
     with pytest.raises(LogError, match=r"v_bat_low, v_bat_high: found .*expected logs of one pack"):
         joined([first, other])
+    light, heavy = (replace(first, stated_mass_kg=mass_kg) for mass_kg in (0.7, 0.8))
+    with pytest.raises(
+        LogError, match=r"mass_kg: found .*0\.7, .*0\.8; expected logs of one craft"
+    ):
+        joined([light, heavy])
+    assert joined([first, heavy]).stated_mass_kg == 0.8
 
 
 # --- Voltage --------------------------------------------------------------------------------------
@@ -234,3 +246,12 @@ def test_batteries_follow_the_voltages_of_a_log(logged, stated, given, of_craft,
     assert battery_of_craft(known, given) == Battery(*of_craft)
     assert fitted_battery(known, given) == Battery(*fitted)
     assert_noted(voltage_notes(log, given), parts)
+
+
+def test_late_residuals_of_a_diverged_trial_give_no_warning():
+    taps = np.where(np.arange(len(TAPS)) % 2, -1.0, 1.0)
+    late = Late(np.tile(taps, (9, 1, 1)), np.zeros((9, 1, NUM_AXES)))
+    diverged = np.full((1, 9, 1, NUM_AXES, 2), np.inf)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.isnan(late.residuals(diverged)[..., :-1, 1]).all()

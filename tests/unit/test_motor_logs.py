@@ -1,7 +1,9 @@
 """Logs whose commands are the outputs of motors: imports, checks, fits and what they refuse."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 
@@ -11,10 +13,17 @@ from flytrack_env.motors import NAMES
 from flytrack_env.toml_file import parse_toml
 from flytrack_sysid.check import check_log, text_of
 from flytrack_sysid.check.fix import fix_mapping
-from flytrack_sysid.fit import fit
+from flytrack_sysid.diagnosis.vetoes import turned_by_unseen_torque
+from flytrack_sysid.estimate import FitError
+from flytrack_sysid.fit import fit, what_is_fitted
 from flytrack_sysid.importing import import_log, mapping
 from flytrack_sysid.importing.flight import Craft
 from flytrack_sysid.importing.mapping import Frame
+from flytrack_sysid.inference.chunks import cut_chunks
+from flytrack_sysid.inference.problem import Problem
+from flytrack_sysid.inference.score_test import Candidate
+from flytrack_sysid.inference.search import SearchState
+from flytrack_sysid.inference.torque import torque_notes
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_file import load_log, save_log
 from flytrack_sysid.log_motion import DOUBTFUL_MOTORS, check_commands, motion_notes
@@ -69,6 +78,56 @@ def test_stated_numbers_replace_those_of_a_known_craft_whatever_they_are(monkeyp
     assert (motors.up_s, motors.down_s, motors.rotor_momentum) == (0.03, 0.03, 0.0)
 
 
+def test_a_known_crafts_mass_and_inertia_are_not_replaced_in_silence(log, tmp_path):
+    path, map_file = write_csv(tmp_path, log, frame='craft = "iris"')
+    text = map_file.read_text()
+    both = "frame: mass_kg: found 0.8, iris has 1.535; inertia_kg_m2: found (0.004, 0.005, 0.008)"
+    [warning] = [note for note in import_log(path, "csv", map_file).notes if "warning" in note]
+    assert f"{both}, iris has (0.029125, 0.029125, 0.055225)" in warning
+    without = text.replace("inertia_kg_m2 = [0.004, 0.005, 0.008]", "")
+    map_file.write_text(
+        without.replace("mass_kg = 0.8", "").replace("[craft]", "[craft]\nmass_kg = 1")
+    )
+    [warning] = [note for note in import_log(path, "csv", map_file).notes if "warning" in note]
+    assert "mass_kg: found 1.0, iris has 1.535; the rest is that of iris" in warning
+    map_file.write_text(without.replace("mass_kg = 0.8", "mass_kg = 1.535"))
+    assert not [note for note in import_log(path, "csv", map_file).notes if "warning" in note]
+
+
+def test_a_model_of_another_mass_than_the_mapping_states_is_doubted(log, tmp_path):
+    path, map_file = write_csv(tmp_path, log)
+    found = import_log(path, "csv", map_file)
+    save_log(tmp_path / "log.npz", found.log)
+    again, model = load_log(tmp_path / "log.npz"), found.nominal_model()
+    assert again.stated_mass_kg == 0.8
+    assert not [note for note in validate(model, again).notes if note.startswith("mass:")]
+    [note] = [
+        note for note in validate(model._replace(m=0.9), again).notes if note.startswith("mass:")
+    ]
+    assert "states 0.8 kg, and the model 0.9 kg, which is used" in note
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ({"effects": ["rate_scale"]}, "effects: rate_scale: acts on sticks"),
+        ({"fixed": {"tau_roll": 0.05}}, r"fixed: tau_roll: found 0\.05, expected none"),
+        (
+            {"effects": ["command_delay"], "fixed": {"command_delay.yaw_extra_s": 0.0}},
+            r"fixed: command_delay\.yaw_extra_s: found 0, expected none",
+        ),
+    ],
+)
+def test_a_fit_of_motors_refuses_what_acts_on_sticks(log, arguments, expected):
+    with pytest.raises(FitError, match=expected):
+        fit(log, model_of(crafts()), accept=True, **arguments)
+
+
+def test_a_fit_of_motors_frees_their_common_delay_alone(log):
+    _, free, _ = what_is_fitted(log, model_of(crafts()), effects=["command_delay"], accept=True)
+    assert [name for name in free if name.startswith("command_delay")] == ["command_delay.delay_s"]
+
+
 @pytest.mark.parametrize(("old", "new", "expected"), CASES["tables"])
 def test_tables_that_contradict_each_other_are_refused(log, tmp_path, old, new, expected):
     path, map_file = write_csv(tmp_path, log)
@@ -105,6 +164,7 @@ def test_the_order_of_motors_is_found_and_corrected(log, tmp_path, order):
     columns = [COLUMNS[motor] for motor in order]
     swapped = with_channels(log, u=log["u"][:, list(order)])
     found = check_log(swapped)
+    assert "u and w" not in {pair.name for pair in (*found.pairs, *found.after)}
     if order == (0, 1, 2, 3):
         assert not found.contradicts
         return
@@ -143,6 +203,34 @@ def test_motors_of_measured_flights_are_doubted(log, origin):
     assert (DOUBTFUL_MOTORS in notes) is (origin == "measured")
     of_sticks = replace(log, origin=origin, has_motors=False)
     assert DOUBTFUL_MOTORS not in motion_notes(of_sticks, None, None, "chosen")
+
+
+def test_a_log_that_hardly_shows_torque_is_told_and_names_no_motor(log):
+    """As NanoBench, whose motors were logged at 100 Hz and resampled."""
+    model, rng = model_of(crafts()), np.random.default_rng(0)
+    noisy = with_channels(log, u=np.clip(log["u"] + rng.normal(0.0, 0.3, log["u"].shape), -1, 1))
+    assert not torque_notes(log, model) and not torque_notes(replace(log, has_motors=False), model)
+    assert not torque_notes(log.select(slice(60)), model)  # too short to say
+    (note,) = torque_notes(noisy, model)
+    assert "hardly shows the motors' torque" in note and "roll 0." in note
+    turned = Candidate("motors", ("motors.rear_left",))
+    scale = Candidate("gyro_scale", ("gyro_scale.x",))
+    held = ("radius_x", "center_y", "radius_y", "center_x", "radius_z", "up_s", "down_s")
+    for flown_log, fields in ((log, ()), (noisy, tuple(f"motors.{name}" for name in held))):
+        scored = np.ones(len(flown_log), bool)
+        with jax.enable_x64(True):
+            problem = Problem.of(cut_chunks(flown_log, scored, model), model)
+            state = SearchState.start(flown_log, problem)
+        _, free, _ = what_is_fitted(flown_log, model, accept=True)
+        assert state.held == fields and {*fields}.isdisjoint(free)
+        assert {"motors.radius_x", "motors.center_x"} - {*free} <= {*fields}
+        for candidate in (turned, scale, Candidate("motors", ("motors.load",))):
+            selected = SimpleNamespace(
+                state=state,
+                model=SimpleNamespace(candidates=[candidate]),
+            )
+            expected = [candidate.effect] * (fields != () and candidate in (turned, scale))
+            assert turned_by_unseen_torque(selected, problem) == expected
 
 
 @pytest.mark.slow

@@ -9,12 +9,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.motor_craft import Pilot, State, advance, fly, hovering, speed_for
-from flytrack_env import effects, nominal_parameters
+from flytrack_env import effects, load_model, make, nominal_parameters, save_model
 from flytrack_env.dynamics import move
 from flytrack_env.effects.motors import Spinning
+from flytrack_env.model_file import ModelFileError
 from flytrack_env.motors import NAMES
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone, pack, unpack_action
+from flytrack_env.wrappers import DomainRandomization
+from flytrack_sysid.inference.parameters import fields_of_sticks
 from flytrack_sysid.inference.score_test import candidates_for, searched_in
 from tests.support.compiling import quick_jit
 from tests.support.motor_models import crafts, model_of
@@ -174,6 +177,52 @@ def test_a_flown_minute_part_is_that_of_the_independent_craft_to_second_order():
     finer = np.repeat(commands, 2, axis=0)
     fine = np.abs(both(WHOLE, state, finer, DT / 2)[1][1::2] - truth).max()
     assert 3.0 < coarse / fine < 5.0
+
+
+SETTINGS_OF_STICKS = [
+    ("rate_scale.roll", effects.RateScale(roll=0.9)),
+    ("rate_expo.pitch", effects.RateExpo(pitch=0.3)),
+    ("rate_saturation.yaw", effects.RateSaturation(yaw=0.2)),
+    ("thrust_lag_asymmetry.ratio", effects.ThrustLagAsymmetry(1.5)),
+    ("second_order_rates.roll_s", effects.SecondOrderRates(0.01)),
+    ("command_delay.thrust_extra_s", effects.CommandDelay(0.01, thrust_extra_s=0.01)),
+    ("betaflight_loop.roll_arm", effects.BetaflightLoop(roll_arm=1.0)),
+]
+
+
+@pytest.mark.parametrize(("field", "parameters"), SETTINGS_OF_STICKS)
+def test_effects_of_sticks_beside_motors_are_refused(field, parameters, tmp_path):
+    expected = rf"effects\.{field}: found .*: it acts on sticks, and with the effect motors"
+    model = model_of(BALANCED)
+    with pytest.raises(ValueError, match=expected):
+        model.with_effects(parameters)
+    forced = model._replace(effects=effects.merge(model.effects, parameters))
+    with pytest.raises(ValueError, match=expected):
+        make("FlyTrackMotors-v0", model=forced)
+    save_model(tmp_path / "model.json", forced, {})
+    with pytest.raises(ModelFileError, match=rf"model\.json: {expected}"):
+        load_model(tmp_path / "model.json")
+    neutral = model.with_effects(type(parameters)(), effects.CommandDelay(0.01))
+    assert neutral.with_effects(effects.Motors()).with_effects(parameters)
+
+
+def test_effects_of_sticks_are_not_drawn_beside_motors():
+    env = DomainRandomization(make("FlyTrackMotors-v0"))
+    params = env.default_params
+    env.check_params(params)
+    ranges = params.wrappers[env.key]._replace(
+        low=(effects.RateScale(0.9, 1.0, 1.0),), high=(effects.RateScale(1.0, 1.0, 1.0),)
+    )
+    with pytest.raises(ValueError, match=r"effects\.rate_scale\.roll: found 0\.9"):
+        env.check_params(params.replace(wrappers={**params.wrappers, env.key: ranges}))
+
+
+def test_effects_of_sticks_are_no_candidates_beside_motors():
+    problem = SimpleNamespace(like=model_of(crafts()), given_effects=("motors",))
+    fields = {field for candidate in candidates_for(problem) for field in candidate.fields}
+    assert "command_delay.delay_s" in fields and "gyro_scale.x" in fields
+    assert not fields & fields_of_sticks(problem.like)
+    assert fields_of_sticks(nominal_parameters()) == set()
 
 
 def test_a_scale_of_the_force_alone_is_not_looked_for():

@@ -8,15 +8,19 @@ from scipy.spatial.transform import Rotation
 from benchmarks.diagnosis import model_of
 from flytrack_sysid.diagnosis.flight_errors import FlightTest, errors_at, sample_windows
 from flytrack_sysid.diagnosis.flight_fit import Fit, Target
-from flytrack_sysid.diagnosis.refinement import refine, superfluous
+from flytrack_sysid.diagnosis.refinement import acting_effects, refine, superfluous
 from flytrack_sysid.inference.chunks import cut_chunks
 from flytrack_sysid.inference.free_flight import QUANTITIES
+from flytrack_sysid.inference.parameters import THRUST_COEFFS
 from flytrack_sysid.inference.problem import Problem
-from flytrack_sysid.inference.score_test import CANDIDATES
+from flytrack_sysid.inference.score_test import CANDIDATES, Candidate
 from flytrack_sysid.inference.search import FittedModel, SearchState
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import held_out_rows
 from tests.support.hidden_flights import scripted
+from tests.support.motor_flights import flown
+from tests.support.motor_models import crafts
+from tests.support.motor_models import model_of as motor_model_of
 from tests.support.slow import slow_but
 from tests.support.tables import table
 
@@ -141,6 +145,29 @@ def test_a_parameter_is_superfluous_beside_others_at_a_bound_or_where_all_may_be
     vector[indices] = values
     fit = Fit(vector, tuple(indices), np.zeros((3, 3)), np.array(halves), np.zeros(1), NO_SLOPES)
     assert (superfluous(problem, fit, DELAY) or "") == expected
+
+
+def test_flights_without_velocity_leave_the_thrust_of_single_steps():
+    """Torque over inertia is all that rates show: a map and radii of gyration trade off."""
+    weak = crafts(thrust=[4.8] * 4)
+    log = flown(weak, SECONDS).without("p", "v", "q")
+    model = motor_model_of(crafts())
+    with jax.enable_x64(True):
+        problem = Problem.of(cut_chunks(log, ~held_out_rows(log), model), model)
+        vector = problem.start.copy()
+        vector[problem.names.index("motors.damping_x")] = 0.5
+        windows = sample_windows(log, held_out_rows(log))
+        damping = Candidate("motors", ("motors.load", "motors.damping_x"))
+        assert acting_effects(problem, vector, [damping], windows) == ("motors",)
+        vector[problem.names.index("motors.load")] = 0.1  # acts on force alone
+        assert acting_effects(problem, vector, [damping], windows) == ()
+    delay = Candidate("command_delay", ("command_delay.delay_s",))
+    found = refined(problem, log, problem.start, (delay,), {delay.fields[0]: 0.01})
+    thrust, radii = (
+        problem.parameter_indices(names) for names in (THRUST_COEFFS, ("motors.radius_x",))
+    )
+    np.testing.assert_array_equal(found.base[thrust], problem.start[thrust])
+    assert abs(found.base[radii] / problem.start[radii] - np.sqrt(6.0 / 4.8)) < 0.05
 
 
 @pytest.mark.parametrize("step_s", slow_but([0.01], [0.01, 0.005]))
