@@ -1,14 +1,19 @@
 """Clocks of sensors and commands: offsets are found and corrected; the plant's lag is not one."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 
 from benchmarks.diagnosis import model_of
+from benchmarks.hidden import fly, measure
+from benchmarks.scaling import draw_craft
 from flytrack_env.motion import Motion
 from flytrack_sysid import clocks, sensors
 from flytrack_sysid.clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis.motion_choice import MotionEstimate, estimate_motion
+from flytrack_sysid.split import held_out_rows
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 from tests.support.hidden_flights import scripted
 from tests.support.made_flight import TIME_S, flight, noisy
@@ -117,3 +122,16 @@ def test_a_drone_on_time_is_no_simulator_however_little_the_model_explains():
         assert estimate_motion(
             log, HandoutPlant().model(), np.ones(len(log), bool)
         ) == MotionEstimate(Motion.CONTINUOUS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("late_s", [0.0, 0.0035])
+def test_offset_within_its_errors_decides_nothing(late_s):
+    """The offset of 20 s seems to be -1.7 ms, two standard errors, and lateness adds to it."""
+    truth = replace(draw_craft(np.random.default_rng([61, 3]), False)[0], mocap_late_s=late_s)
+    rng = np.random.default_rng([61, 3, 14])
+    log = measure(fly(truth, 20.0, rng), "sensors", rng)
+    with jax.enable_x64(True):
+        estimate = estimate_motion(log, model_of(truth), ~held_out_rows(log))
+    assert estimate.motion is Motion.CONTINUOUS
+    assert abs(estimate.late_s - late_s) <= 3.0 * estimate.sigma_s
