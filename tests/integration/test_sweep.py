@@ -4,12 +4,13 @@ import csv
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 
-from baselines.purejaxrl_ppo import load_checkpoint
+from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.config import ConfigError
-from baselines.purejaxrl_ppo.sweep import Flags, prepare, read_settings
+from baselines.purejaxrl_ppo.sweep import Flags, make_scheduler, prepare, read_settings
 
 BATCH = 16 * 24
 SMALL = f"total_timesteps = {64 * BATCH}\nnum_envs = 16\nnum_steps = 24\nhidden_sizes = [8]\n"
@@ -66,6 +67,27 @@ def test_what_no_trial_could_use_is_refused_before_any(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             prepare(flags)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")  # Ray's own
+def test_asha_remembers_trials_of_before_an_interruption(tmp_path):
+    from ray import cloudpickle
+
+    config = Config()
+    scheduler = make_scheduler(tmp_path / "asha.pkl", config)
+    stored = cloudpickle.dumps(scheduler)  # as Ray stores it, before any result
+
+    def result_of(scheduler, name, last_return):
+        trial = SimpleNamespace(trial_id=name)
+        scheduler.on_trial_add(None, trial)
+        result = {"steps": config.total_timesteps // 8, "last_return": last_return}
+        return scheduler.on_trial_result(None, trial, result)
+
+    assert [result_of(scheduler, name, 9.0) for name in "abc"] == ["CONTINUE"] * 3
+    assert result_of(cloudpickle.loads(stored), "d", 1.0) == "STOP"
+    (tmp_path / "asha.pkl").unlink()
+    assert result_of(cloudpickle.loads(stored), "d", 1.0) == "CONTINUE"
 
 
 @pytest.mark.slow
