@@ -5,6 +5,8 @@ ends those that fall behind; one that is interrupted continues from its newest c
 """
 
 import dataclasses
+import socket
+import sys
 import warnings
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -149,10 +151,24 @@ def draws_of(space: Space) -> dict[str, Any]:
     return draws
 
 
+def check_is_shared(out: Path) -> None:
+    """Raise ConfigError on a node that does not see the folder of a sweep, which has begun."""
+    if not (out / TUNE).is_dir():
+        node = socket.gethostname()
+        raise ConfigError(
+            f"--out {out}: found none on node {node}, expected one that all nodes see"
+        )
+
+
 def run_trial(drawn: dict[str, Any], base: Base) -> None:
-    """Train with drawn settings, and tell Ray Tune how well; continue what is in the folder."""
+    """Train with drawn settings, and tell Ray Tune how well; continue what is in the folder.
+
+    Raises:
+        ConfigError: on a node that does not see the sweep's folder.
+    """
     from ray import tune
 
+    check_is_shared(base.out)
     out = base.out / Path(tune.get_context().get_trial_dir()).name
     trainer = Trainer(dataclasses.replace(base.config, **drawn), base.env_id, **base.env_arguments)
     start = newest_intact(out) if checkpoints_in(out) else None
@@ -303,6 +319,10 @@ def run_sweep(flags: Flags) -> int:
         print(table.sort_values(METRIC, ascending=False)[shown].to_string(index=False))
         print(f"best: {base.out / Path(results.get_best_result(METRIC, 'max').path).name}")
     print(f"written: {path}")
+    errors = [result.error for result in results if result.error is not None]
+    # Ray's error holds that of the trial beside its traceback.
+    for reason in sorted({error_text(getattr(error, "cause", error)) for error in errors}):
+        print(f"trials failed: {reason}", file=sys.stderr)
     for folder in base.out.glob("trial*"):  # those that ASHA ended
         end_unfinished(folder, base.options.tracking_uri)
     return int(results.num_errors == len(results))

@@ -10,7 +10,13 @@ import pytest
 
 from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.config import ConfigError
-from baselines.purejaxrl_ppo.sweep import Flags, make_scheduler, prepare, read_settings
+from baselines.purejaxrl_ppo.sweep import (
+    Flags,
+    check_is_shared,
+    make_scheduler,
+    prepare,
+    read_settings,
+)
 
 BATCH = 16 * 24
 SMALL = f"total_timesteps = {64 * BATCH}\nnum_envs = 16\nnum_steps = 24\nhidden_sizes = [8]\n"
@@ -67,6 +73,13 @@ def test_what_no_trial_could_use_is_refused_before_any(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             prepare(flags)
+
+
+def test_a_node_that_does_not_see_the_folder_says_so(tmp_path):
+    (tmp_path / "tune").mkdir()
+    check_is_shared(tmp_path)
+    with pytest.raises(ConfigError, match=r"--out .*gone: found none on node .*all nodes see"):
+        check_is_shared(tmp_path / "gone")
 
 
 @pytest.mark.slow
