@@ -212,7 +212,7 @@ def make_scheduler(path: Path, config: Config) -> Any:
     """
     from ray.tune.schedulers import ASHAScheduler
 
-    class KeptScheduler(ASHAScheduler):  # type: ignore[misc]
+    class KeptScheduler(ASHAScheduler):
         """ASHA that stores what it compared after each result."""
 
         def on_trial_result(self, *arguments: Any) -> str:
