@@ -20,6 +20,13 @@ from tests.support.made_flight import TIME_S, flight, noisy
 from tests.support.written_logs import with_channels
 
 
+def flight_of_fleet(number, mocap_late_s=0.0):
+    """Return plant and log of a flight of craft03 of docs/results/scaling.md."""
+    truth, _ = draw_craft(np.random.default_rng([61, 3]), False)
+    truth, rng = replace(truth, mocap_late_s=mocap_late_s), np.random.default_rng([61, 3, number])
+    return truth, measure(fly(truth, 20.0, rng), "sensors", rng)
+
+
 def rms(errors):
     return float(np.sqrt(np.mean(errors**2)))
 
@@ -71,6 +78,12 @@ def test_clocks_of_a_drone_at_rest_or_too_short_are_not_compared(truth):
     assert clocks.align_clocks(rest)[1][0].verdict.startswith("offset unknown: correlation")
     short = clocks.align_clocks(truth.select(slice(500)))[1]
     assert [one.verdict for one in short] == ["not compared: less than 10 s without a gap"] * 3
+
+
+def test_noise_of_the_accelerometer_is_no_late_clock():
+    """In 20 s of calm flight it moved velocity by 19 ms and position by 23 ms."""
+    log = flight_of_fleet(12)[1]
+    assert on_one_clock(log)[2] == []
 
 
 LATE_S = 0.013
@@ -128,9 +141,7 @@ def test_a_drone_on_time_is_no_simulator_however_little_the_model_explains():
 @pytest.mark.parametrize("late_s", [0.0, 0.0035])
 def test_offset_within_its_errors_decides_nothing(late_s):
     """The offset of 20 s seems to be -1.7 ms, two standard errors, and lateness adds to it."""
-    truth = replace(draw_craft(np.random.default_rng([61, 3]), False)[0], mocap_late_s=late_s)
-    rng = np.random.default_rng([61, 3, 14])
-    log = measure(fly(truth, 20.0, rng), "sensors", rng)
+    truth, log = flight_of_fleet(14, late_s)
     with jax.enable_x64(True):
         estimate = estimate_motion(log, model_of(truth), ~held_out_rows(log))
     assert estimate.motion is Motion.CONTINUOUS
