@@ -310,7 +310,7 @@ def write_page() -> None:
             "fault | shown | equal | ambiguous | left | wrong | missed | wrong where not shown",
             [*unequal, fixes[-1]],
         ),
-        exact=", ".join(exact),
+        num_exact=len(exact),
         num_equal=len(equal),
         pairs=table(f"two faults | {columns}", two),
         simulators=table("simulator | expected | outcome", simulators),

@@ -140,13 +140,20 @@ def grade_single(
     return {**single, "single_refused": refused}
 
 
+def print_count(done: int, total: int) -> None:
+    """Print how many jobs are done: those of a fleet take hours."""
+    print(f"{done} of {total} jobs", file=sys.stderr, flush=True)
+
+
 def run_fleet(craft: int, flights: int, seconds: float, seed: int, workers: int) -> dict[str, Any]:
     """Return how a simulated fleet was told."""
-    folder, out = RUNS / f"fleet{seed}", RUNS / f"told{seed}"
+    # A second call goes on, so that each size has its own folder.
+    size = f"{seed}_{craft}_craft_{flights}_flights_{seconds:g}_s"
+    folder, out = RUNS / f"fleet{size}", RUNS / f"told{size}"
     causes = fly_fleet(folder, craft, flights, seconds, seed)
     found = find_flights([folder], None)
     started, used = time.perf_counter(), sum(os.times()[:4])
-    results, changes = diagnose_fleet(found, out, LIMIT_S, workers)
+    results, changes = diagnose_fleet(found, out, LIMIT_S, workers, report=print_count)
     write_fleet(out, found, results, changes)
     return {
         "craft": craft,

@@ -5,6 +5,8 @@ ends those that fall behind; one that is interrupted continues from its newest c
 """
 
 import dataclasses
+import socket
+import sys
 import warnings
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -36,7 +38,7 @@ KINDS = (*LISTS, "uniform", "quniform", "loguniform", "qloguniform", "randint", 
 GRACE, KEPT = 8, 3  # ASHA: no trial ends before 1/8 of its length; of three, the best goes on
 CHECKPOINTS = 8  # of a trial
 MAX_FAILURES = 8  # of a trial, whose node or process is lost
-TABLE, TUNE = "sweep.csv", "tune"
+TABLE, TUNE, RUNGS = "sweep.csv", "tune", "asha.pkl"
 Space = dict[str, tuple[str, list[Any]]]
 
 
@@ -149,10 +151,24 @@ def draws_of(space: Space) -> dict[str, Any]:
     return draws
 
 
+def check_is_shared(out: Path) -> None:
+    """Raise ConfigError on a node that does not see the folder of a sweep, which has begun."""
+    if not (out / TUNE).is_dir():
+        node = socket.gethostname()
+        raise ConfigError(
+            f"--out {out}: found none on node {node}, expected one that all nodes see"
+        )
+
+
 def run_trial(drawn: dict[str, Any], base: Base) -> None:
-    """Train with drawn settings, and tell Ray Tune how well; continue what is in the folder."""
+    """Train with drawn settings, and tell Ray Tune how well; continue what is in the folder.
+
+    Raises:
+        ConfigError: on a node that does not see the sweep's folder.
+    """
     from ray import tune
 
+    check_is_shared(base.out)
     out = base.out / Path(tune.get_context().get_trial_dir()).name
     trainer = Trainer(dataclasses.replace(base.config, **drawn), base.env_id, **base.env_arguments)
     start = newest_intact(out) if checkpoints_in(out) else None
@@ -187,10 +203,44 @@ def prepare(flags: Flags) -> tuple[Base, Space]:
     return Base(out, config, flags.seed, flags.env_id, arguments, options), space
 
 
+def make_scheduler(path: Path, config: Config) -> Any:
+    """Return ASHA, whose comparisons outlive the process: Ray Tune restores all but its scheduler.
+
+    Args:
+        path: file that holds what was compared; a scheduler that is unpickled reads it.
+        config: hyperparameters of the trials.
+    """
+    from ray.tune.schedulers import ASHAScheduler
+
+    class KeptScheduler(ASHAScheduler):
+        """ASHA that stores what it compared after each result."""
+
+        def on_trial_result(self, *arguments: Any) -> str:
+            action = super().on_trial_result(*arguments)
+            partial = path.with_suffix(".part")
+            self.save(str(partial))
+            partial.replace(path)
+            return str(action)
+
+        def __setstate__(self, state: dict[str, Any]) -> None:
+            self.__dict__.update(state)
+            if path.exists():
+                self.restore(str(path))
+
+    length = config.total_timesteps
+    return KeptScheduler(
+        "steps",
+        METRIC,
+        "max",
+        max_t=length + 1,
+        grace_period=max(length // GRACE, config.batch_size),
+        reduction_factor=KEPT,
+    )
+
+
 def make_tuner(flags: Flags, base: Base, space: Space) -> Any:
     """Return Ray's tuner of a sweep, or of one that goes on."""
     from ray import tune
-    from ray.tune.schedulers import ASHAScheduler
 
     class Progress(tune.Callback):
         """Shows how many trials ended, on one line."""
@@ -211,8 +261,6 @@ def make_tuner(flags: Flags, base: Base, space: Space) -> Any:
 
     resources = {"cpu": flags.cpus_per_trial, "gpu": flags.gpus_per_trial}
     trainable = tune.with_resources(tune.with_parameters(run_trial, base=base), resources)
-    length = base.config.total_timesteps
-    grace = max(length // GRACE, base.config.batch_size)
     if flags.resume:
         return tune.Tuner.restore(
             str(base.out / TUNE),
@@ -225,12 +273,8 @@ def make_tuner(flags: Flags, base: Base, space: Space) -> Any:
         trainable,
         param_space=draws_of(space),
         tune_config=tune.TuneConfig(
-            metric=METRIC,
-            mode="max",
             num_samples=flags.trials,
-            scheduler=ASHAScheduler(
-                "steps", max_t=length + 1, grace_period=grace, reduction_factor=KEPT
-            ),
+            scheduler=make_scheduler(base.out / TUNE / RUNGS, base.config),
             search_alg=tune.search.BasicVariantGenerator(random_state=flags.seed),
             trial_dirname_creator=lambda trial: (
                 f"trial{int(trial.trial_id.rsplit('_', 1)[-1]):03d}"
@@ -275,6 +319,10 @@ def run_sweep(flags: Flags) -> int:
         print(table.sort_values(METRIC, ascending=False)[shown].to_string(index=False))
         print(f"best: {base.out / Path(results.get_best_result(METRIC, 'max').path).name}")
     print(f"written: {path}")
+    errors = [result.error for result in results if result.error is not None]
+    # Ray's error holds that of the trial beside its traceback.
+    for reason in sorted({error_text(getattr(error, "cause", error)) for error in errors}):
+        print(f"trials failed: {reason}", file=sys.stderr)
     for folder in base.out.glob("trial*"):  # those that ASHA ended
         end_unfinished(folder, base.options.tracking_uri)
     return int(results.num_errors == len(results))

@@ -3,7 +3,6 @@
 The section has sentences for pilots, a picture and tables.
 """
 
-import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -39,8 +38,6 @@ SHOWN_HORIZON_S = "0.5"
 SHOWN_MODELS = ("nominal", "refitted_base", "extended", "placebo")
 # They trade off against each other, so that their mean over the log says more.
 THRUST_COEFFICIENTS = ("c0", "c1", "c2", "c3", "c4", "c5")
-# Counts of rows; the record has all.
-UNSHOWN_WARNING = re.compile(r"outliers, beyond|of \S+ rows a second, one in \d+ was used")
 
 
 def diagnose_log(
@@ -175,7 +172,12 @@ def formulas_of(learned: Record) -> list[str]:
 
 
 def format_section(measured: Record, picture: str) -> str:
-    """Return what was found in one diagnosis; picture: the file of ``draw_errors``."""
+    """Return what was found in one diagnosis; the record has its warnings.
+
+    Args:
+        measured: record of a diagnosis.
+        picture: file of ``draw_errors``.
+    """
     diagnosis = measured["diagnosis"]
     unexplained = [
         f"{name} ({format_number(share)} times the sensor's noise)"
@@ -183,7 +185,6 @@ def format_section(measured: Record, picture: str) -> str:
     ]
     small = ", ".join(f"`{cause['effect']}`" for cause in diagnosis["negligible"])
     learned = diagnosis.get("learned")
-    warnings = [text for text in diagnosis["warnings"] if not UNSHOWN_WARNING.match(text)]
     cost = f"{measured['cpu_s']:.0f} CPU s, compilation included; commit {measured['commit']}"
     has_flights = diagnosis["prediction"]["errors"]
     # Else the sentence has the error of position.
@@ -199,6 +200,5 @@ def format_section(measured: Record, picture: str) -> str:
         errors_table(diagnosis) if is_without_positions else "",
         f"Unexplained: {', '.join(unexplained) or 'nothing'}.",
         f"Learnt beyond the list: {'; '.join(formulas_of(learned))}." if learned else "",
-        "\n".join(f"- {warning}" for warning in warnings),
     ]
     return "\n\n".join(filter(None, parts))

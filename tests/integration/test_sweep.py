@@ -4,12 +4,19 @@ import csv
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 
-from baselines.purejaxrl_ppo import load_checkpoint
+from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.config import ConfigError
-from baselines.purejaxrl_ppo.sweep import Flags, prepare, read_settings
+from baselines.purejaxrl_ppo.sweep import (
+    Flags,
+    check_is_shared,
+    make_scheduler,
+    prepare,
+    read_settings,
+)
 
 BATCH = 16 * 24
 SMALL = f"total_timesteps = {64 * BATCH}\nnum_envs = 16\nnum_steps = 24\nhidden_sizes = [8]\n"
@@ -66,6 +73,34 @@ def test_what_no_trial_could_use_is_refused_before_any(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             prepare(flags)
+
+
+def test_a_node_that_does_not_see_the_folder_says_so(tmp_path):
+    (tmp_path / "tune").mkdir()
+    check_is_shared(tmp_path)
+    with pytest.raises(ConfigError, match=r"--out .*gone: found none on node .*all nodes see"):
+        check_is_shared(tmp_path / "gone")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")  # Ray's own
+def test_asha_remembers_trials_of_before_an_interruption(tmp_path):
+    from ray import cloudpickle
+
+    config = Config()
+    scheduler = make_scheduler(tmp_path / "asha.pkl", config)
+    stored = cloudpickle.dumps(scheduler)  # as Ray stores it, before any result
+
+    def result_of(scheduler, name, last_return):
+        trial = SimpleNamespace(trial_id=name)
+        scheduler.on_trial_add(None, trial)
+        result = {"steps": config.total_timesteps // 8, "last_return": last_return}
+        return scheduler.on_trial_result(None, trial, result)
+
+    assert [result_of(scheduler, name, 9.0) for name in "abc"] == ["CONTINUE"] * 3
+    assert result_of(cloudpickle.loads(stored), "d", 1.0) == "STOP"
+    (tmp_path / "asha.pkl").unlink()
+    assert result_of(cloudpickle.loads(stored), "d", 1.0) == "CONTINUE"
 
 
 @pytest.mark.slow

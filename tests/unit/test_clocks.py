@@ -1,18 +1,30 @@
 """Clocks of sensors and commands: offsets are found and corrected; the plant's lag is not one."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 
 from benchmarks.diagnosis import model_of
+from benchmarks.hidden import fly, measure
+from benchmarks.scaling import draw_craft
 from flytrack_env.motion import Motion
 from flytrack_sysid import clocks, sensors
 from flytrack_sysid.clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis.motion_choice import MotionEstimate, estimate_motion
+from flytrack_sysid.split import held_out_rows
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 from tests.support.hidden_flights import scripted
 from tests.support.made_flight import TIME_S, flight, noisy
 from tests.support.written_logs import with_channels
+
+
+def flight_of_fleet(number, mocap_late_s=0.0):
+    """Return plant and log of a flight of craft03 of docs/results/scaling.md."""
+    truth, _ = draw_craft(np.random.default_rng([61, 3]), False)
+    truth, rng = replace(truth, mocap_late_s=mocap_late_s), np.random.default_rng([61, 3, number])
+    return truth, measure(fly(truth, 20.0, rng), "sensors", rng)
 
 
 def rms(errors):
@@ -68,6 +80,12 @@ def test_clocks_of_a_drone_at_rest_or_too_short_are_not_compared(truth):
     assert [one.verdict for one in short] == ["not compared: less than 10 s without a gap"] * 3
 
 
+def test_noise_of_the_accelerometer_is_no_late_clock():
+    """In 20 s of calm flight it moved velocity by 19 ms and position by 23 ms."""
+    log = flight_of_fleet(12)[1]
+    assert on_one_clock(log)[2] == []
+
+
 LATE_S = 0.013
 SECONDS, POSE_LATE_S = 40.0, 0.024  # of a hidden plant
 
@@ -117,3 +135,14 @@ def test_a_drone_on_time_is_no_simulator_however_little_the_model_explains():
         assert estimate_motion(
             log, HandoutPlant().model(), np.ones(len(log), bool)
         ) == MotionEstimate(Motion.CONTINUOUS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("late_s", [0.0, 0.0035])
+def test_offset_within_its_errors_decides_nothing(late_s):
+    """The offset of 20 s seems to be -1.7 ms, two standard errors, and lateness adds to it."""
+    truth, log = flight_of_fleet(14, late_s)
+    with jax.enable_x64(True):
+        estimate = estimate_motion(log, model_of(truth), ~held_out_rows(log))
+    assert estimate.motion is Motion.CONTINUOUS
+    assert abs(estimate.late_s - late_s) <= 3.0 * estimate.sigma_s
