@@ -113,7 +113,8 @@ def test_slopes_of_a_fit_lead_to_nearly_the_same_fit_without_an_effect(dragged):
         )
     assert of_whole < 0.7 * of_own and of_own < before
     assert of_shared == pytest.approx(of_own, rel=0.02)
-    assert np.array_equal(shared.columns, whole.columns[[whole.indices.index(i) for i in remaining]])
+    columns = [whole.indices.index(index) for index in remaining]
+    assert np.array_equal(shared.columns, whole.columns[columns])
 
 
 def test_what_changes_no_flight_at_a_bound_goes_back(dragged):
