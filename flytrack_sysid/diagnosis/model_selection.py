@@ -1,6 +1,7 @@
 """Select effects: drop unneeded ones, and swap rivals in that explain more."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ from scipy import stats
 from flytrack_env.dynamics import collective_thrust
 from flytrack_env.effects import takes_motors
 from flytrack_sysid.diagnosis.result import TWO_SIDED_95
-from flytrack_sysid.inference.parameters import TAUS, range_of
+from flytrack_sysid.inference.parameters import TAUS, THRUST_COEFFS, range_of
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import (
     ALL_BASE_CAUSES,
@@ -39,6 +40,9 @@ MAX_RIVALS = 3  # of an effect that are refitted
 NEARLY, NEAR_SHARE, PROBE_SHARE = 60.0, 0.15, 0.25
 DRAGS = ("linear_drag", "quadratic_drag")  # laws of a force of the air, which a wind moves
 MOVING_AIR = next(one for one in CANDIDATES if one.effect == "wind" and "wind.v_x" in one.fields)
+# Of a craft whose motors are commanded.
+LOAD_EFFECT, LOAD = "motors", ("motors.load",)
+THRUST_AND_INERTIA = (*THRUST_COEFFS, *(f"motors.radius_{axis}" for axis in "xyz"))
 MIN_BLOCKS = 3.0  # that tell of a parameter, effectively: Student's t of fewer is unbounded
 CLEARLY_CHEAPER = 0.5  # of cost and price: swaps that save less would go back and forth
 
@@ -274,6 +278,44 @@ def with_moving_air(state: SearchState, model: FittedModel) -> list[FittedModel]
     return [state.fitted(one.joined_by(MOVING_AIR), one.vector) for one in still]
 
 
+def held_for_load(state: SearchState, model: FittedModel) -> tuple[SearchState, FittedModel] | None:
+    """Return a state and a model with a load in place of other thrust and inertia, if as likely.
+
+    A load at the centre of mass is exactly a smaller thrust with smaller inertias. These are free
+    in the base, so that the load alone gains nothing beside them. They are held at nominal then.
+
+    Args:
+        state: of the search, of a craft whose motors are commanded.
+        model: of its effects.
+    """
+    problem = state.problem
+    load = next(one for one in candidates_for(problem) if one.fields == LOAD)
+    is_held = not {*THRUST_AND_INERTIA}.isdisjoint(state.held)  # loaded, or a torque is not seen
+    if is_held or LOAD_EFFECT in state.refused or not model.lacks(load):
+        return None
+    state, linearization = state.linearized(model.vector)
+    changed = [one.fields for one in base_changes(state, linearization, model).values()]
+    if sum(not {*THRUST_AND_INERTIA}.isdisjoint(fields) for fields in changed) < 2:
+        return None
+    thrust = [
+        commanded_thrust(problem, one[problem.parameter_indices(THRUST_COEFFS)]).sum()
+        for one in (problem.start, model.vector)
+    ]
+    if min(thrust) <= 0.0:
+        return None
+    held = replace(state, held=(*state.held, *THRUST_AND_INERTIA), linearization=None)
+    vector = problem.at_start(model.vector, THRUST_AND_INERTIA)
+    vector[problem.parameter_indices(LOAD)] = thrust[0] / thrust[1] - 1.0
+    loaded = held.fitted(model.joined_by(load), problem.clipped(vector))
+    limit = model.cost + PER_PARAMETER * len(THRUST_AND_INERTIA)
+    return (held, loaded) if loaded.cost < limit else None
+
+
+def has_load(model: FittedModel) -> bool:
+    """Return whether a model has a load."""
+    return any({*LOAD} <= {*candidate.fields} for candidate in model.candidates)
+
+
 def price(model: FittedModel) -> float:
     """Return a model's cost and the price of its effects."""
     return model.cost + PER_PARAMETER * model.num_priced
@@ -360,6 +402,7 @@ class Marginal:
         weights = np.eye(len(self.information)) if weights is None else weights
         influence = solve(self.information, weights.T)
         told = np.einsum("ps,bpq,qs->bs", influence, self.by_block, influence, optimize=True)
+        told = np.maximum(told, 0.0)  # rounding
         share = told / np.maximum(told.sum(axis=0), 1e-300)
         num_blocks = np.maximum(1.0 / np.maximum(np.square(share).sum(axis=0), 1e-9), MIN_BLOCKS)
         spread = np.square(self.scores @ influence).sum(axis=0) * num_blocks / (num_blocks - 1.0)

@@ -73,13 +73,27 @@ Veto = Callable[[Selection, Problem], list[str]]
 def select(state: SearchState, base: FittedModel, model: FittedModel) -> Selection:
     """Swap or remove effects while that helps."""
     state, model, ablations = model_selection.select_effects(state, model)
-    return Selection(state, base, model, ablations)
+    selection = Selection(state, base, model, ablations)
+    return loaded(selection) if takes_motors(state.problem.like.effects) else selection
+
+
+def loaded(selection: Selection) -> Selection:
+    """Return the selection with a load, where that explains other thrust and inertia as well."""
+    trial = model_selection.held_for_load(selection.state, selection.model)
+    if trial is None:
+        return selection
+    state, model, ablations = model_selection.select_effects(*trial)
+    if not model_selection.has_load(model):
+        return selection
+    start = state.problem.at_start(selection.base.vector, model_selection.THRUST_AND_INERTIA)
+    return Selection(state, state.fitted((), start), model, ablations)
 
 
 def reject(selection: Selection, effects: Sequence[str]) -> Selection:
     """Return the selection without some effects, which stay refused."""
     state, model = selection.state, selection.model
-    state = replace(state, refused=(*state.refused, *effects))
+    held = () if model_selection.LOAD_EFFECT in effects else state.held
+    state = replace(state, refused=(*state.refused, *effects), held=held)
     for effect in effects:
         model = model_selection.without_effect(state, model, effect)
     state, model, ablations = model_selection.select_effects(state, model)

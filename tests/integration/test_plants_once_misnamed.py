@@ -7,8 +7,11 @@ the suite misspec-v1. Each chose a rule since.
 import pytest
 
 from benchmarks.diagnosis import Trial, make_log
+from benchmarks.motors import nominal_model
 from flytrack_bench.misspec.suite import load_log_suite
 from flytrack_sysid.diagnosis import diagnose
+from tests.support.motor_flights import flown
+from tests.support.motor_models import crafts
 
 pytestmark = pytest.mark.slow
 SEED = 6101
@@ -57,3 +60,19 @@ def test_a_lag_at_zero_does_not_shorten_a_delay() -> None:
     for effect, name in (("command_delay", "delay_s"), ("second_order_rates", "roll_s")):
         low, high = found[effect][name].ci95
         assert low < truth.effects[effect][name] < high
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        # Base parameters that are free explain a mass, too: as a thrust scale and three inertias.
+        ({"mass": 0.88}, ("load", 0.1)),
+        # A load is not added to what explains the flight without other thrust and inertia.
+        ({"thrust": [6.0, 6.0, 5.4, 6.0]}, ("rear_left", 0.9)),
+    ],
+)
+def test_one_number_of_a_craft_whose_motors_are_commanded(changes, expected) -> None:
+    log, name = flown(crafts(**changes), duration_s=30.0), expected[0]
+    (cause,) = diagnose(log, nominal_model(crafts())).causes
+    assert cause.effect == "motors" and set(cause.parameters) == {name}
+    assert cause.parameters[name].value == pytest.approx(expected[1], rel=0.05)
