@@ -16,7 +16,7 @@ from flytrack_sysid.diagnosis import model_selection
 from flytrack_sysid.diagnosis import unexplained as unknown
 from flytrack_sysid.diagnosis.result import Unexplained
 from flytrack_sysid.inference.chunks import AXES
-from flytrack_sysid.inference.problem import Problem, split_blocks
+from flytrack_sysid.inference.problem import SEARCHED, Problem, split_blocks
 from flytrack_sysid.inference.record import Record
 from flytrack_sysid.inference.score_test import ALL_BASE_CAUSES, change_threshold, threshold
 from flytrack_sysid.inference.search import FittedModel, SearchState
@@ -90,14 +90,18 @@ def loaded(selection: Selection) -> Selection:
 
 
 def reject(selection: Selection, effects: Sequence[str]) -> Selection:
-    """Return the selection without some effects, which stay refused."""
+    """Return the selection without some effects, which stay refused even if it has not all."""
     state, model = selection.state, selection.model
-    held = () if model_selection.LOAD_EFFECT in effects else state.held
-    state = replace(state, refused=(*state.refused, *effects), held=held)
-    for effect in effects:
+    base = selection.base
+    if model_selection.has_load(model) and model_selection.LOAD_EFFECT in effects:
+        # Thrust and inertia are free again, which were held for the load.
+        state = replace(state, held=unseen_in_chunks(state.problem.chunks, state.problem.like))
+        base = state.fitted((), base.vector)
+    state = replace(state, refused=(*state.refused, *effects))
+    for effect in (one for one in effects if one in model.effects):
         model = model_selection.without_effect(state, model, effect)
     state, model, ablations = model_selection.select_effects(state, model)
-    return Selection(state, selection.base, model, ablations)
+    return Selection(state, base, model, ablations)
 
 
 def apply_vetoes(selection: Selection, test: Problem) -> tuple[Selection, dict[str, str]]:
@@ -271,20 +275,31 @@ def rests(record: Record) -> np.ndarray:
     return np.asarray(moved.max(axis=-1) <= REST_SHARE * np.abs(sticks).max(axis=-1))
 
 
+def stick_laws(problem: Problem) -> list[str]:
+    """Return the laws of the sticks for which dynamics of the rate loop can pass.
+
+    Where motors are commanded, there are none.
+    """
+    if takes_motors(problem.like.effects):
+        return []
+    laws = [effect for effect in SEARCHED if effect.search.follows_sticks]
+    if problem.counts[..., AXES[0], 1].any():  # attitude tells a gyro from any rate loop
+        laws = [law for law in laws if "gyro" not in law.hooks]
+    return [law.name for law in laws]
+
+
 def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
     """Reject laws of the sticks that do not hold while these rest, each or all together.
 
     A law that holds in transients only stands for dynamics that are not in the list of effects. For
     example, feedforward turns faster than commanded on the way to full stick, as a scale and a
     saturation would, but not while the stick stays there. Where turns are left unexplained, laws
-    that this log never shows at rest are rejected, too. Where motors are commanded, there are none.
+    that this log never shows at rest are rejected, too. So are those that the model lacks: the next
+    one would pass for the same dynamics.
     """
     state, model = selection.state, selection.model
-    if takes_motors(state.problem.like.effects):
-        return []
-    laws = [name for name in selection.ablations if BY_NAME[name].search.follows_sticks]
-    if state.problem.counts[..., AXES[0], 1].any():  # attitude tells a gyro from any rate loop
-        laws = [name for name in laws if "gyro" not in BY_NAME[name].hooks]
+    laws = [name for name in selection.ablations if name in stick_laws(state.problem)]
+    others = [name for name in stick_laws(state.problem) if name not in laws]
     if not laws:
         return []
     at_rest = rests(state.problem.chunks.record)
@@ -300,7 +315,10 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
         for ablation in ablations
     ]
     if any(contradicted):
-        return [name for name, is_false in zip(laws, contradicted, strict=True) if is_false]
+        return [
+            *(law for law, is_false in zip(laws, contradicted, strict=True) if is_false),
+            *others,
+        ]
     without = ablations[0].without
     for name in laws[1:]:  # a scale needs the saturation that undoes it, and vice versa
         without = model_selection.without_effect(state, without, name)
@@ -308,7 +326,7 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
     inflation = max(ablation.inflation for ablation in ablations)
     are_turns_unexplained = any(name.startswith("rate:") for name in selection.unexplained.shares)
     is_unseen = expected < HELD_OUT_SHOWN * inflation and are_turns_unexplained
-    return laws if is_unseen or is_contradicted(gain, expected, inflation) else []
+    return [*laws, *others] if is_unseen or is_contradicted(gain, expected, inflation) else []
 
 
 def turned_by_unseen_torque(selection: Selection, test: Problem) -> list[str]:

@@ -104,7 +104,8 @@ class SearchState:
         problem: the rows to learn from, with the noise.
         unobservable: effects that need channels the log lacks.
         refused: effects that vetoes have rejected.
-        held: base parameters that the log does not show, and that stay nominal.
+        held: base parameters that stay nominal: the log does not show them, or a load stands in
+            their place.
         linearization: the last one along everything, kept because slopes are expensive.
     """
 
