@@ -329,6 +329,10 @@ def _motors_as_commands(
     low, high = (
         parameters.get(name) or MOTOR_DEFAULTS[name] for name in ("MOT_PWM_MIN", "MOT_PWM_MAX")
     )
+    if low >= high:
+        raise LogError(
+            f"{source}: MOT_PWM_MIN, MOT_PWM_MAX: found {low:g} and {high:g}, expected a range"
+        )
     named = tuple(f"RCOU.{column}" for column in columns)
     convert = lambda table: np.clip((table.matrix(named) - low) / (high - low), 0.0, 1.0)  # noqa: E731
     return Channel("RCOU", "motors", named, convert)
