@@ -20,7 +20,6 @@ from flytrack_env.effects import BY_NAME, acts
 from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis.diagnose import (
     Split,
-    held_out_under,
     refined_within_range,
     split,
     summarize,
@@ -30,7 +29,7 @@ from flytrack_sysid.diagnosis.result import DRIFT, Cause, Diagnosis, Estimated, 
 from flytrack_sysid.diagnosis.size import is_notable
 from flytrack_sysid.diagnosis.summary import classify, effect_causes, mean_factor, mean_thrust
 from flytrack_sysid.diagnosis.unexplained import find_unexplained
-from flytrack_sysid.diagnosis.vetoes import Selection
+from flytrack_sysid.diagnosis.vetoes import Selection, held_out_under
 from flytrack_sysid.inference import noise as noises
 from flytrack_sysid.inference import search
 from flytrack_sysid.inference.parameters import THRUST_COEFFS

@@ -27,7 +27,6 @@ from flytrack_sysid.diagnosis.motion_choice import (
     estimate_motion,
 )
 from flytrack_sysid.diagnosis.onset import (
-    active_windows,
     at_end,
     describe_changes,
     find_spans,
@@ -40,10 +39,10 @@ from flytrack_sysid.diagnosis.result import Cause, Diagnosis
 from flytrack_sysid.diagnosis.size import split_by_size
 from flytrack_sysid.diagnosis.vetoes import (
     CONTRADICTED,
-    EXPLAINED_BY_CHANGE,
     Selection,
     apply_vetoes,
     examined,
+    held_out_under,
     reject,
     select,
 )
@@ -150,8 +149,9 @@ def diagnose(
                 state, base = begun(parts)
                 selection = select(*extended(state, base, base))
         report(2, len(STAGES))
-        selection, rejected = vetoed_in_time(selection, parts)
+        selection = with_changes(selection, parts.test, parts.log)
         test = held_out_under(selection, parts.test)
+        selection, rejected = apply_vetoes(selection, test)
         report(3, len(STAGES))
         vetted = refined_within_range(selection, rejected, test, parts)
         report(4, len(STAGES))
@@ -237,12 +237,6 @@ def split(
     return Split(logged, motion_estimate, corrected, mask, train, test, as_logged, tuple(warnings))
 
 
-def held_out_under(selection: Selection, test: Problem) -> Problem:
-    """Return the problem of held-out rows with a selection's noise and effect windows."""
-    problem = selection.state.problem
-    return replace(test.with_noise(problem.noise), windows=problem.windows)
-
-
 class VettedModel(NamedTuple):
     """A selection after its vetoes and its refinement.
 
@@ -257,30 +251,6 @@ class VettedModel(NamedTuple):
     rejected: Mapping[str, str]
     refused: tuple[Cause, ...]
     refined: Refined
-
-
-def vetoed_in_time(selection: Selection, parts: Split) -> tuple[Selection, dict[str, str]]:
-    """Return a selection with its changes within the log, after its vetoes, and these by effect.
-
-    A change may hide behind an effect that held-out rows contradict. So changes are searched for
-    again without this effect. Where one is there, it is what the held-out rows contradicted.
-    """
-    selection = with_changes(selection, parts.test, parts.log)
-    selection, rejected = apply_vetoes(selection, held_out_under(selection, parts.test))
-    gone = contradicted(rejected)
-    if gone:
-        later = with_changes(selection, parts.test, parts.log)
-        if later is not selection:
-            selection, further = apply_vetoes(later, held_out_under(later, parts.test))
-            rejected |= further
-            if active_windows(selection):
-                rejected |= dict.fromkeys(gone, EXPLAINED_BY_CHANGE)
-                rejected = {
-                    name: veto
-                    for name, veto in rejected.items()
-                    if name not in selection.model.effects
-                }
-    return selection, rejected
 
 
 def refined_within_range(
@@ -314,12 +284,7 @@ def judged_by_flights(
     Beside something unexplained, the noise of single steps is no measure of a gain. So flights
     judge effects again that held-out single steps contradict.
     """
-    held_out = (CONTRADICTED, EXPLAINED_BY_CHANGE)
-    doubted = [
-        name
-        for name, veto in rejected.items()
-        if veto in held_out and name not in selection.model.effects
-    ]
+    doubted = [name for name in contradicted(rejected) if name not in selection.model.effects]
     if doubted and selection.unexplained.flagged:
         tried = with_effects(selection, doubted)
         refined = refined_by_prediction(tried, parts, doubted)
@@ -330,7 +295,7 @@ def judged_by_flights(
 
 
 def contradicted(rejected: Mapping[str, str]) -> list[str]:
-    """Return the effects that held-out single steps contradict, and no change explains."""
+    """Return the effects that held-out single steps contradict."""
     return [name for name, veto in rejected.items() if veto == CONTRADICTED]
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from flytrack_sysid.diagnosis.result import Estimated
 from flytrack_sysid.diagnosis.unexplained import find_unexplained
-from flytrack_sysid.diagnosis.vetoes import Selection, select
+from flytrack_sysid.diagnosis.vetoes import Selection, held_out_gain, held_out_under, select
 from flytrack_sysid.inference import noise as noises
 from flytrack_sysid.inference.chunks import CHUNK_S, Chunks, count_lead_in
 from flytrack_sysid.inference.parameters import range_of
@@ -432,8 +432,7 @@ def with_changes(selection: Selection, test: Problem, log: FlightLog) -> Selecti
 
 def _with_change(selection: Selection, test: Problem) -> Selection | None:
     """Return the selection with one more change; None if no change is clear."""
-    state, linearization = selection.state.linearized(selection.model.vector)
-    changes = find_changes(linearization, selection.model, (*state.unobservable, *state.refused))
+    changes = changes_beside(selection, test)
     if not changes or changes[0].margin < 0.0 or changes[0].way == "drift":
         return None
     first, near = (
@@ -468,6 +467,30 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
         and -misfit_changes[0] > gain_of_other_dependence(selection)
     )
     return later if is_better else None
+
+
+def changes_beside(selection: Selection, test: Problem) -> list[Hypothesis]:
+    """Return the likeliest changes beside a selected model, or else beside a part of it.
+
+    An effect may hide the change for which it stands. So one without which held-out rows are
+    likelier is left out, if beside it nothing changes.
+    """
+    model, ablations = selection.model, selection.ablations.values()
+    state, linearization = selection.state.linearized(model.vector)
+    held_out = held_out_under(selection, test)
+    doubted = [
+        ablation.without
+        for ablation in ablations
+        if held_out_gain(held_out, ablation.without.vector, model.vector)[0] < 0.0
+    ]
+    changes: list[Hypothesis] = []
+    for one in (model, *doubted):
+        changes = find_changes(
+            linearization.moved(one.vector), one, (*state.unobservable, *state.refused)
+        )
+        if changes and changes[0].margin > 0.0:
+            break
+    return changes
 
 
 def gain_of_other_dependence(selection: Selection) -> float:

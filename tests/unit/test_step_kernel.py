@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import flytrack_env
 from flytrack_env import nominal_parameters
 from flytrack_env.auto_reset import Ended, reset_if_ended
-from flytrack_env.effects import EFFECTS
+from flytrack_env.effects import EFFECTS, stick_fields
 from flytrack_env.fusion import ATTRIBUTES, SWITCH, compute_once, one_kernel
 from flytrack_env.motion import Motion
 from flytrack_env.registration import ENVIRONMENTS, RACES
@@ -21,16 +21,26 @@ from tests.support.compiling import QUICKLY
 from tests.support.stepping import flight, inputs
 
 
-def with_all_effects():
-    """Return an environment whose model has all effects, a third into their ranges."""
-    effects = [inside_ranges(effect, 0.3) for effect in EFFECTS]
+def with_all_effects(commands):
+    """Return an environment whose model has all effects of its commands, a third into their ranges.
+
+    Args:
+        commands: what the effects act on, "sticks" or "motors".
+    """
+    on_motors = commands == "motors"
+    effects = [
+        inside_ranges(effect, 0.3)
+        for effect in EFFECTS
+        if not (stick_fields(effect) if on_motors else effect.takes_motors)
+    ]
     model = nominal_parameters()._replace(motion=Motion.CONTINUOUS).with_effects(*effects)
     return flytrack_env.make("FlyTrack-v0", model=model)
 
 
 VARIANTS = {
     "all wrappers": lambda: flytrack_env.make("FlyTrackRobust-v0", missed_gate="fly_on"),
-    "all effects, continuous": with_all_effects,
+    "all effects of sticks, continuous": partial(with_all_effects, "sticks"),
+    "all effects of motors, continuous": partial(with_all_effects, "motors"),
 }
 
 
