@@ -465,10 +465,16 @@ def with_effects(selection: Selection, effects: Sequence[str]) -> Selection:
 
 
 def _narrowed(selection: Selection, kept: Sequence[Candidate]) -> Selection:
-    """Return the selection with some of its effects only, fitted to single steps again."""
-    model = selection.model
-    removed = [candidate.effect for candidate in model.candidates if candidate not in kept]
-    return _fitted_again(selection, kept, selection.state.problem.without(model.vector, removed))
+    """Return the selection with some of its effects only, fitted to single steps again.
+
+    The fit starts at the base: an effect that is gone may have taken a lag's place, which at its
+    lower bound has no slope that leads back.
+    """
+    vector = selection.base.vector.copy()
+    fields = [field for candidate in kept for field in candidate.fields]
+    indices = selection.state.problem.parameter_indices(fields)
+    vector[indices] = selection.model.vector[indices]
+    return _fitted_again(selection, kept, vector)
 
 
 def _fitted_again(

@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 from benchmarks.diagnosis import model_of
 from flytrack_sysid.diagnosis.flight_errors import FlightTest, errors_at, sample_windows
 from flytrack_sysid.diagnosis.flight_fit import Fit, Target
-from flytrack_sysid.diagnosis.refinement import acting_effects, refine, superfluous
+from flytrack_sysid.diagnosis.refinement import acting_effects, reduced, refine, superfluous
+from flytrack_sysid.diagnosis.vetoes import Selection
 from flytrack_sysid.inference.chunks import cut_chunks
 from flytrack_sysid.inference.free_flight import QUANTITIES
 from flytrack_sysid.inference.parameters import THRUST_COEFFS
@@ -95,6 +96,20 @@ def test_what_flights_do_not_show_is_removed(dragged, candidate, values, doubted
     found = refined(problem, log, earlier.fit.vector, (DRAG, candidate), values, doubted)
     assert [one.effect for one in found.kept] == ["linear_drag"]
     assert found.removed == (candidate.effect,)
+
+
+def test_a_lag_comes_back_when_the_effect_in_its_place_is_gone(dragged):
+    truth, log = scripted(3, 20.0, motion="fine")
+    with jax.enable_x64(True):
+        problem = build_problem(truth, log)
+        state, (roll,) = SearchState(problem), problem.parameter_indices(["tau_roll"])
+        vector = problem.start.copy()
+        vector[roll] = problem.low[roll]  # where no slope leads back
+        base = state.fitted((), problem.start)
+        selection = Selection(state, base, FittedModel((DRAG, BIAS), vector, 0.0, ()), {})
+        found = reduced(selection, dragged[-1]._replace(kept=(BIAS,), fit=None))
+    assert list(found.model.effects) == ["accelerometer_bias"] == list(found.ablations)
+    assert found.model.vector[roll] == pytest.approx(base.vector[roll], rel=0.01)
 
 
 def test_slopes_of_a_fit_lead_to_nearly_the_same_fit_without_an_effect(dragged):
