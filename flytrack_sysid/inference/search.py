@@ -261,8 +261,6 @@ def _step(problem: Problem, current: Linearization) -> tuple[float, Linearizatio
     """
     step, at_once = current.step_inside(), max(NUM_PAIRS // problem.chunks.row.shape[1], 1)
     expected_gain = float(step @ current.score)
-    if expected_gain < MIN_GAIN:
-        return 0.0, current
     best, gain = current, -np.inf
     for first in range(0, len(STEP_SHARES), at_once):
         shares = STEP_SHARES[first : first + at_once]
