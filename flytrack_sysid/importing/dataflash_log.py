@@ -306,6 +306,11 @@ def _motors_as_commands(
 ) -> Channel:
     """Return the channel of four motors' outputs in our order, 0 (off) to 1 (full)."""
     source = f"{path}: message RCOU"
+    frame_class = int(parameters.get("FRAME_CLASS", 0))
+    if frame_class in FRAMES:
+        raise LogError(
+            f"{source}: FRAME_CLASS: found {frame_class} ({FRAMES[frame_class]}), expected 1 (quad)"
+        )
     frame_type = int(parameters.get("FRAME_TYPE", DEFAULT_FRAME_TYPE))
     if frame_type not in ORDERS:
         expected = ", ".join(map(str, ORDERS))

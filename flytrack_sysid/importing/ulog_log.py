@@ -16,7 +16,12 @@ from flytrack_env.effects import Motors
 from flytrack_env.motors import NAMES
 from flytrack_sysid.importing.commands import check_motors_of_autopilot, commands_of_motors
 from flytrack_sysid.importing.decoding import decode
-from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, read_log_file
+from flytrack_sysid.importing.flight import (
+    ImportedFlight,
+    not_a_quadcopter,
+    read_log_file,
+    saturation,
+)
 from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, vector_from
 from flytrack_sysid.log import LogError
@@ -119,6 +124,7 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
     samples, clocks, parameters, remarks = _decode(path, of_motors)
     if of_motors:
         commands = _motors_as_commands(path, samples["motors"], parameters, craft.motors)
+        remarks.append(saturation(commands.values.max(axis=1) >= 1.0))
     else:
         if craft.max_rate_deg_s is None:
             craft = craft._replace(max_rate_deg_s=_full_stick_deg_s(path, parameters))
@@ -158,16 +164,18 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
 
 def _airframe(parameters: dict[str, float]) -> list[str]:
     """Return a note if the log's parameters say that the craft is no quadcopter."""
+    other = _other_craft(parameters)
+    return [not_a_quadcopter(other)] if other else []
+
+
+def _other_craft(parameters: dict[str, float]) -> str | None:
+    """Return what a log's parameters say the craft is, if that is no quadcopter."""
     for kinds, name, divisor in ((AIRFRAMES, "MAV_TYPE", 1), (FRAMES, "SYS_AUTOSTART", 1000)):
         vehicle = kinds.get(int(parameters.get(name, 0)) // divisor)
         if vehicle:
-            return [not_a_quadcopter(f"{vehicle} ({name} {parameters[name]:.0f})")]
+            return f"{vehicle} ({name} {parameters[name]:.0f})"
     num_rotors = int(parameters.get("CA_ROTOR_COUNT", 0))
-    return (
-        [not_a_quadcopter(f"{num_rotors} rotors (CA_ROTOR_COUNT)")]
-        if num_rotors not in (0, 4)
-        else []
-    )
+    return f"{num_rotors} rotors (CA_ROTOR_COUNT)" if num_rotors not in (0, len(NAMES)) else None
 
 
 def _motors_as_commands(
@@ -175,9 +183,9 @@ def _motors_as_commands(
 ) -> Samples:
     """Return the controls of four motors as commands, in our order."""
     topic = f"{path}: topic actuator_motors"
-    num_rotors = int(parameters.get("CA_ROTOR_COUNT", len(NAMES)))
-    if num_rotors != len(NAMES):
-        raise LogError(f"{topic}: found {num_rotors} rotors (CA_ROTOR_COUNT), expected 4")
+    other = _other_craft(parameters)
+    if other:
+        raise LogError(f"{topic}: found {other}, expected a quadcopter")
     places = [
         tuple(np.sign(parameters.get(f"CA_ROTOR{number}_P{axis}", 0.0)) for axis in "XY")
         for number in range(len(NAMES))

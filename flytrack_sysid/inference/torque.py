@@ -93,8 +93,8 @@ def torque_correlations(model: ModelParameters, record: MotorRecord) -> np.ndarr
             break
         for axis in range(len(AXES)):
             pair = given[is_used, axis], found[is_used, axis]
-            if min(map(np.ptp, pair)) > 0.0:
-                best[axis] = np.fmax(best[axis], np.corrcoef(*pair)[0, 1])
+            is_moved = min(map(np.ptp, pair)) > 0.0  # an axis that rests shows nothing
+            best[axis] = np.fmax(best[axis], np.corrcoef(*pair)[0, 1] if is_moved else 0.0)
     return best
 
 
@@ -123,7 +123,8 @@ def unseen_in_chunks(chunks: Chunks, model: ModelParameters) -> tuple[str, ...]:
 
 def torque_notes(log: FlightLog, model: ModelParameters) -> list[str]:
     """Return a note if a log of motors does not show their torque."""
-    if not unseen_in_log(log, model):
+    unseen = unseen_in_log(log, model)
+    if not unseen:
         return []
     values = torque_correlations(model, MotorRecord.of_log(log))
     found = ", ".join(
@@ -131,7 +132,7 @@ def torque_notes(log: FlightLog, model: ModelParameters) -> list[str]:
     )
     return [
         f"{log.source} hardly shows the motors' torque: it correlates with changes of the rates by "
-        f"{found}, expected {MIN_CORRELATION} or more; radii of gyration, lags and centre of mass "
-        "are held at the model's, and damping, single motors and a gyro's scale are not named: log "
-        "motors and gyro faster, or roll and pitch more"
+        f"{found}, expected {MIN_CORRELATION} or more; {', '.join(unseen)} are held at the "
+        "model's, and damping, single motors and a gyro's scale are not named: log motors and gyro "
+        "faster, or roll and pitch more"
     ]

@@ -148,6 +148,7 @@ def test_motors_are_commands_in_our_order(messages, read, parameters, shares):
     [
         (10, {}, "", "message RCOU: found motors at 10 Hz, expected 40 Hz or more"),
         (1, {"FRAME_TYPE": 0.0}, "", "FRAME_TYPE: found 0, expected an X: 1, 3, 12"),
+        (1, {"FRAME_CLASS": 2.0}, "", r"FRAME_CLASS: found 2 .*hexa.*, expected 1"),
         (1, {"SERVO1_FUNCTION": 33.0}, "", "SERVOn_FUNCTION: found 1 motors, expected motors 1 to"),
         (1, {"MOT_PWM_MIN": 2000.0}, "", "MOT_PWM_MAX: found 2000 and 2000, expected a range"),
         (1, {"FRAME_TYPE": 18.0}, '[frame]\ncraft = "iris"', 'expected "out" as the log'),

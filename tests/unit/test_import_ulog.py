@@ -201,8 +201,10 @@ def with_motors(topics, every=1):
 def test_motors_are_commands_in_our_order(topics, read, parameters, shares):
     content = with_motors(topics)
     del content[SETPOINT]  # and full stick need not be known
-    log = read(content, parameters, mapping=OF_MOTORS).log
+    flight = read(content, parameters, mapping=OF_MOTORS)
+    log = flight.log
     assert log.has_motors
+    assert any("a motor at its upper end in 0.00% of the rows" in note for note in flight.notes)
     np.testing.assert_allclose(log["u"][0], 2.0 * np.array(shares) - 1.0, atol=3e-3)
 
 
@@ -210,7 +212,8 @@ def test_motors_are_commands_in_our_order(topics, read, parameters, shares):
     ("every", "parameters", "frame", "message"),
     [
         (25, {}, "", r"topic actuator_motors: found motors at 10 Hz, expected 40 Hz or more"),
-        (1, {"CA_ROTOR_COUNT": 6.0}, "", "found 6 rotors .CA_ROTOR_COUNT., expected 4"),
+        (1, {"CA_ROTOR_COUNT": 6.0}, "", "found 6 rotors .CA_ROTOR_COUNT., expected a quad"),
+        (1, {"MAV_TYPE": 13.0}, "", "found a hexa.*MAV_TYPE 13., expected a quadcopter"),
         (1, {"CA_ROTOR0_PX": 0.1}, "", "found no rotor in each quadrant, expected an X"),
         (1, {"CA_ROTOR0_KM": -0.05}, '[frame]\ncraft = "iris"', 'expected "out" as the log'),
     ],

@@ -211,6 +211,9 @@ def test_a_log_that_hardly_shows_torque_is_told_and_names_no_motor(log):
     noisy = with_channels(log, u=np.clip(log["u"] + rng.normal(0.0, 0.3, log["u"].shape), -1, 1))
     assert not torque_notes(log, model) and not torque_notes(replace(log, has_motors=False), model)
     assert not torque_notes(log.select(slice(60)), model)  # too short to say
+    still = with_channels(log, w=log["w"] * (0.0, 1.0, 1.0))  # roll never moves
+    (note,) = torque_notes(still, model)
+    assert "by roll 0.00, pitch 0." in note and "motors.center_y are held" in note
     (note,) = torque_notes(noisy, model)
     assert "hardly shows the motors' torque" in note and "roll 0." in note
     turned = Candidate("motors", ("motors.rear_left",))
