@@ -28,8 +28,8 @@ SEED = 6101
         ),
         # A delay of thrust that ends in flight stood in for a periodic force.
         (Trial("outside", 1, SEED, "handout"), set(), False),
-        # A fit ended where first order promised nothing, far from the best one. The second law
-        # with the scale is as like the true one.
+        # A fit ended where first order promised nothing, far from the best one. No log tells this
+        # scale from the true rate_expo.
         (
             Trial("three", 7, 6104, "handout"),
             {"rate_scale", "rate_saturation", "motor_imbalance"},
