@@ -282,7 +282,7 @@ def judged_by_flights(
     """Return a selection with the effects that flights may bring back, and its refinement.
 
     Beside something unexplained, the noise of single steps is no measure of a gain. So flights
-    judge effects again that held-out single steps contradict.
+    judge effects again that held-out single steps contradict, if commands predict any of them.
     """
     doubted = [name for name in contradicted(rejected) if name not in selection.model.effects]
     if doubted and selection.unexplained.flagged:

@@ -161,6 +161,8 @@ def refine(
     unrefined = unrefined._replace(flight_test=flight_test)
     if not candidates or not flight_test.is_known.any():
         return unrefined
+    if doubted and not flight_test.matters.any():
+        return unrefined  # flights of which commands predict nothing settle no doubt
     acting = acting_effects(problem, _probed(problem, extended, candidates), candidates, learnt)
     refinement = _Refinement(
         flight_test,

@@ -232,3 +232,13 @@ def test_a_path_that_is_known_without_commands_is_no_evidence(dragged):
             assert (
                 flight_test.matters.mean() > 0.5 if is_evidence else not flight_test.matters.any()
             )
+
+
+def test_flights_without_evidence_settle_no_doubt(dragged):
+    truth, *_ = dragged
+    with jax.enable_x64(True):
+        problem = build_problem(truth, circle())
+    values = {f"linear_drag.{name}": value for name, value in TRUE_DRAG.items()}
+    found = refined(problem, circle(), problem.start, (DRAG,), values, ("linear_drag",))
+    assert found.flight_test.is_known.any() and not found.flight_test.matters.any()
+    assert found.fit is None and found.kept == (DRAG,)
