@@ -36,7 +36,7 @@ TITLES = {"flying": "flying lap", "standing": "standing start"}
 MILLI = 1e3
 HEADER = (
     "track | model | flight | time (s) | free times (s) | starts agree | highest speed (m/s) | "
-    "replay: gates | off (ms) | drift (mm) | touched | on the black box"
+    "replay: off (ms) | drift (mm) | on the black box"
 )
 CONDITIONS = (
     "casadi {casadi}, jax {jax}, one core of {machine}; battery at the start {battery_v:g} V; "
@@ -254,10 +254,8 @@ def _row(flown: Flown, on_black_box: Flown | None) -> tuple[Any, ...]:
         f"{reference.found['free_time_s']:.4f}",
         f"{num_agree} of {len(reference.found['coarse_times_s'])}",
         f"{speeds.max():.1f}",
-        _format_gates(flown),
         f"{MILLI * (replay.time_s - reference.time_s):+.3f}",
         f"{MILLI * replay.drift_m:.2f}",
-        replay.frames_touched,
         "-" if on_black_box is None else _format_gates(on_black_box),
     )
 
