@@ -223,11 +223,41 @@ def select_effects(
             state, model, linearization, [ablated[effect] for effect in effects]
         )
         swaps = [swap for one in ablations.values() for swap in one.swaps.values()]
-        trials = (*swaps, *with_lags_anew(state, model), *with_moving_air(state, model))
+        trials = (
+            *swaps,
+            *with_one_less(state, linearization, model, swaps),
+            *with_lags_anew(state, model),
+            *with_moving_air(state, model),
+        )
         best = min(trials, key=price, default=model)
         if price(best) >= price(model) - CLEARLY_CHEAPER:
             return state, model, ablations
         model = best
+
+
+def with_one_less(
+    state: SearchState,
+    linearization: Linearization,
+    model: FittedModel,
+    swaps: Sequence[FittedModel],
+) -> list[FittedModel]:
+    """Return models that have one effect less than a swap as likely as the model.
+
+    Two effects may do what one rival does alone. A swap of either is no likelier then.
+
+    Args:
+        state: of the search.
+        linearization: of the model, along everything.
+        model: with the effects.
+        swaps: refitted models with a rival instead of an effect.
+    """
+    likely = [one for one in swaps if one.cost < model.cost + EQUIVALENT]
+    return [
+        without_effect(state, swap, kept.effect, linearization.moved(swap.vector))
+        for swap in likely
+        for kept in swap.candidates
+        if kept.effect in model.effects
+    ]
 
 
 def with_lags_anew(state: SearchState, model: FittedModel) -> list[FittedModel]:

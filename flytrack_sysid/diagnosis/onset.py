@@ -333,13 +333,14 @@ def find_spans(selection: Selection, test: Problem, log: FlightLog) -> dict[str,
     }
 
 
+def _named(state: SearchState, model: FittedModel) -> list[Window]:
+    """Return the windows of a model's effects."""
+    return [one for one in state.problem.windows if one.effect in model.effects]
+
+
 def active_windows(selection: Selection) -> list[Window]:
     """Return the windows of a selected model's effects."""
-    return [
-        window
-        for window in selection.state.problem.windows
-        if window.effect in selection.model.effects
-    ]
+    return _named(selection.state, selection.model)
 
 
 def ended(selection: Selection) -> list[str]:
@@ -444,18 +445,18 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     )
     state, model = with_refitted_noise(at_best_row(state, test, model, first.row), model)
     state, base, model = extended(state, state.fitted((), selection.base.vector), model)
-    named = tuple(one for one in state.problem.windows if one.effect in model.effects)
     new_rows, old_rows = (
         {row for one in windows for row in (one.start, one.end)}
-        for windows in (named, selection.state.problem.windows)
+        for windows in (_named(state, model), selection.state.problem.windows)
     )
-    state, rows = windowed(state, named), new_rows - old_rows - {ALWAYS, NEVER}
+    rows = new_rows - old_rows - {ALWAYS, NEVER}
     if rows:
         state = at_best_row(state, test, model, max(rows))
     tried = Selection(state, base, state.fitted(model.candidates, model.vector), {})
     if misfit(tried, test) >= misfit(selection, test):
         return None  # before the effects are selected, which takes longest
     later = select(state, base, tried.model)
+    later = later._replace(state=windowed(later.state, _named(later.state, later.model)))
     misfit_changes = [
         misfit(later, problem) - misfit(selection, problem)
         for problem in (selection.state.problem, test)

@@ -35,6 +35,8 @@ SEED = 6101
             {"rate_scale", "rate_saturation", "motor_imbalance"},
             True,
         ),
+        # An expo and a saturation from then on did what this scale does alone.
+        (Trial("onset", 2, 6106, "handout"), {"rate_scale"}, True),
     ],
 )
 def test_drawn_plants(trial: Trial, names: set[str], is_explained: bool) -> None:
