@@ -44,6 +44,7 @@ MOVING_AIR = next(one for one in CANDIDATES if one.effect == "wind" and "wind.v_
 LOAD_EFFECT, LOAD = "motors", ("motors.load",)
 THRUST_AND_INERTIA = (*THRUST_COEFFS, *(f"motors.radius_{axis}" for axis in "xyz"))
 MIN_BLOCKS = 3.0  # that tell of a parameter, effectively: Student's t of fewer is unbounded
+AT_BOUND_S = 1e-6  # of a lag: a fit may come ever nearer to a bound and never touch it
 CLEARLY_CHEAPER = 0.5  # of cost and price: swaps that save less would go back and forth
 
 
@@ -267,7 +268,7 @@ def with_lags_anew(state: SearchState, model: FittedModel) -> list[FittedModel]:
     effect from the mean of the effect's other times.
     """
     problem, vector = state.problem, model.vector.copy()
-    is_lowest = vector <= problem.low
+    is_lowest = vector - problem.low <= AT_BOUND_S
     starts = {index: problem.start[index] for index in problem.parameter_indices(TAUS)}
     for candidate in model.candidates:
         times = [one.field for one in candidate.probes if range_of(one.field).unit == "s"]

@@ -434,10 +434,28 @@ def total_misfit(chunks: Chunks, residuals: np.ndarray, log_noise: np.ndarray) -
 def fit_noise(chunks: Chunks, residuals: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
     """Return the likeliest log noise, (6, NUM_AXES), of residuals (rows, chunks, NUM_AXES, 2).
 
+    A fit may end where the shortest disturbance passes for the sensor's noise, which is then next
+    to nothing. Such an axis is fitted from the first guess, too.
+    """
+    likelihood, bounds = Likelihood(chunks, residuals), _bounds(chunks)
+    guess = first_guess(chunks, residuals)
+    best, misfit = _descended(likelihood, bounds, guess if start is None else start)
+    is_shortest = best[4] <= np.log(TAU_RANGE_S[0])
+    if start is None or not is_shortest.any():
+        return best
+    other, other_misfit = _descended(likelihood, bounds, np.where(is_shortest, guess, best))
+    return np.where(other_misfit < misfit, other, best)
+
+
+def _descended(
+    likelihood: Likelihood, bounds: tuple[np.ndarray, np.ndarray], start: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the likeliest log noise near another one, and its misfit by axis.
+
     The method is Fisher scoring with Levenberg damping, for each axis by itself.
     """
-    likelihood, (low, high) = Likelihood(chunks, residuals), _bounds(chunks)
-    best = np.clip(first_guess(chunks, residuals) if start is None else start, low, high)
+    low, high = bounds
+    best = np.clip(start, low, high)
     misfit, slopes, curvature = likelihood.misfit(best)
     damping = np.full(NUM_AXES, FIRST_DAMPING)
     for _ in range(MAX_ROUNDS):
@@ -462,7 +480,7 @@ def fit_noise(chunks: Chunks, residuals: np.ndarray, start: np.ndarray | None = 
         expected = 0.5 * np.sum(free_slopes * step, axis=0)
         if np.all(expected < ENOUGH):
             break
-    return best
+    return best, misfit
 
 
 def _bounds(chunks: Chunks) -> tuple[np.ndarray, np.ndarray]:

@@ -37,6 +37,18 @@ SEED = 6101
         ),
         # An expo and a saturation from then on did what this scale does alone.
         (Trial("onset", 2, 6106, "handout"), {"rate_scale"}, True),
+        # The shortest disturbance passed for the noise of the gyro, which is then next to nothing.
+        (
+            Trial("two", 1, 6104, "handout"),
+            {"rate_slew_limit", "thrust_lag_asymmetry"},
+            True,
+        ),
+        # And the time of one axis came ever nearer to 0 s without touching it.
+        (
+            Trial("three", 4, 6106, "handout"),
+            {"rate_slew_limit", "linear_drag", "thrust_lag_asymmetry"},
+            True,
+        ),
     ],
 )
 def test_drawn_plants(trial: Trial, names: set[str], is_explained: bool) -> None:

@@ -104,6 +104,16 @@ def test_the_noise_of_residuals_is_found_again(chunks, disturbed):
     assert np.all(found.coupling[moving] > 0.6)
 
 
+def test_the_shortest_disturbance_does_not_stay_the_noise_of_a_sensor(chunks, disturbed):
+    with jax.enable_x64(True):
+        right = noises.fit_noise(chunks, disturbed)
+        stuck = right.copy()
+        stuck[[0, 3, 4]] = np.log([[1e-4], [300.0], [noises.TAU_RANGE_S[0]]])
+        found = noises.fit_noise(chunks, disturbed, stuck)
+        misfit = [noises.total_misfit(chunks, disturbed, one) for one in (right, found)]
+    assert misfit[1] < misfit[0] + 1.0
+
+
 def test_chunks_are_only_where_something_is_judged(flown):
     truth, log = flown
     judged = (log.time > 7.0) & (log.time < 19.0) | (log.time > 33.0)
