@@ -44,7 +44,6 @@ DISTURBED, DISTURBED_BASE, KEPT_SHARE = 3.0, 10.0, 0.1
 # A stand-in for something unknown explains a part of it. A name that explains this many times what
 # the dependences explain is no stand-in: the dependences are the remainder of its law.
 OUTWEIGHS = 30.0
-LOAD = "motors.load"  # acts on force alone
 
 
 class Selection(NamedTuple):
@@ -335,21 +334,6 @@ def not_seen_at_rest(selection: Selection, test: Problem) -> list[str]:
     return [*laws, *others] if is_unseen or is_contradicted(gain, expected, inflation) else []
 
 
-def turned_by_unseen_torque(selection: Selection, test: Problem) -> list[str]:
-    """Reject single motors, damping and a gyro's scale where the log does not show torque.
-
-    Modelled rates are then those of noise, which a gyro's scale would shrink.
-    """
-    problem, model = selection.state.problem, selection.model
-    turning = [
-        one.effect
-        for one in model.candidates
-        if one.effect == "gyro_scale"
-        or (BY_NAME[one.effect].takes_motors and one.fields != (LOAD,))
-    ]
-    return turning if turning and unseen_in_chunks(problem.chunks, problem.like) else []
-
-
 def is_force_law(effect: str) -> bool:
     """Return whether an effect is a law of a force, which may have the wrong form.
 
@@ -381,7 +365,6 @@ VETOES: tuple[Veto, ...] = (
     stands_in_for_unknown,
     contradicted_on_held_out,
     not_seen_at_rest,
-    turned_by_unseen_torque,
     seen_once,
 )
 CONTRADICTED = contradicted_on_held_out.__name__
@@ -394,6 +377,5 @@ REASONS = {
         "dynamics of the rate loop that no list has would look the same while sticks move; fly "
         "stick_amplitudes, and hold each stick for a second"
     ),
-    "turned_by_unseen_torque": "the log hardly shows the torque of the motors",
     "seen_once": "it gains barely enough where it was fitted, and nothing on held-out rows",
 }

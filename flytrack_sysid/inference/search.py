@@ -104,8 +104,8 @@ class SearchState:
         problem: the rows to learn from, with the noise.
         unobservable: effects that need channels the log lacks.
         refused: effects that vetoes have rejected.
-        held: base parameters that stay nominal: the log does not show them, or a load stands in
-            their place.
+        held: parameters that stay nominal: the log does not show them, or a load stands in their
+            place.
         linearization: the last one along everything, kept because slopes are expensive.
     """
 
@@ -297,7 +297,8 @@ def score_candidates(
     excluded = {*state.unobservable, *state.refused}
     best: dict[str, Scored] = {}
     for candidate in candidates_for(state.problem):
-        if candidate.effect in excluded or not model.lacks(candidate):
+        is_held = not {*state.held}.isdisjoint(candidate.fields)
+        if is_held or candidate.effect in excluded or not model.lacks(candidate):
             continue
         gain = linearization.gain_of(candidate, given)
         if gain is None:

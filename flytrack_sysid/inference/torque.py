@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 
 from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_env.effects import takes_motors
+from flytrack_env.motors import NAMES
 from flytrack_sysid.inference.chunks import Chunks
 from flytrack_sysid.log import FlightLog, usual_step
 from flytrack_sysid.log_voltage import flown_voltages
@@ -28,6 +29,12 @@ FIELDS = {
     "pitch": ("motors.radius_y", "motors.center_x"),
 }
 OF_BOTH = ("motors.radius_z", "motors.up_s", "motors.down_s")
+# What the noise of an unseen axis passes for: modelled rates are of noise then, which a damping or
+# a gyro's scale would shrink.
+OF_EITHER = (
+    *(f"motors.{name}" for name in (*NAMES, "damping_x", "damping_y", "damping_z")),
+    *(f"gyro_scale.{axis}" for axis in "xyz"),
+)
 
 
 class MotorRecord(NamedTuple):
@@ -99,7 +106,7 @@ def torque_correlations(model: ModelParameters, record: MotorRecord) -> np.ndarr
 
 
 def unseen_fields(correlations: np.ndarray) -> tuple[str, ...]:
-    """Return the parameters that a log does not show, by correlations of roll and pitch."""
+    """Return the base parameters that a log does not show, by correlations of roll and pitch."""
     unseen = [
         axis for axis, value in zip(AXES, correlations, strict=True) if value < MIN_CORRELATION
     ]
@@ -115,10 +122,14 @@ def unseen_in_log(log: FlightLog, model: ModelParameters) -> tuple[str, ...]:
 
 
 def unseen_in_chunks(chunks: Chunks, model: ModelParameters) -> tuple[str, ...]:
-    """Return the parameters that chunks do not show; none of a model without motors."""
+    """Return the parameters that chunks do not show, of the base and of effects.
+
+    Without motors there are none.
+    """
     if not takes_motors(model.effects) or "w" not in chunks.measured:
         return ()
-    return unseen_fields(torque_correlations(model, MotorRecord.of_chunks(chunks)))
+    unseen = unseen_fields(torque_correlations(model, MotorRecord.of_chunks(chunks)))
+    return (*unseen, *OF_EITHER) if unseen else ()
 
 
 def torque_notes(log: FlightLog, model: ModelParameters) -> list[str]:
