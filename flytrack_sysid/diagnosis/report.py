@@ -29,6 +29,7 @@ from flytrack_sysid.diagnosis.result import (
     Diagnosis,
     Estimated,
     HalfResponse,
+    Unexplained,
 )
 from flytrack_sysid.diagnosis.traces import Traces, traces
 from flytrack_sysid.log import FlightLog
@@ -218,12 +219,20 @@ def _learned(diagnosis: Diagnosis) -> str:
     return "The extended model has a law for it, learnt from this log."
 
 
+def _dependences(unexplained: Unexplained) -> list[str]:
+    """Return sentences on what the unexplained part varies with."""
+    names = unexplained.depends_on
+    lines = [name.removeprefix("periodic at ") for name in names if name.startswith("periodic")]
+    smooth = [name for name in names if name != "stochastic" and not name.startswith("periodic")]
+    sentences = [f"It depends on {', '.join(smooth)}."] if smooth else []
+    sentences += [f"It swings at {', '.join(lines)}."] if lines else []
+    return sentences + ["It wanders at random, as gusts do."] * ("stochastic" in names)
+
+
 def describe_verdict(diagnosis: Diagnosis) -> Verdict:
     """Return the verdict in a sentence or two."""
     unexplained = diagnosis.unexplained
-    depends = (
-        f" It depends on {', '.join(unexplained.depends_on)}." if unexplained.depends_on else ""
-    )
+    depends = "".join(f" {sentence}" for sentence in _dependences(unexplained))
     if diagnosis.verdict == CONSISTENT:
         return Verdict(
             "The log agrees with the model: the residuals look like sensor noise.", "good"
@@ -422,8 +431,8 @@ def _unexplained_parts(diagnosis: Diagnosis) -> list[Part]:
     if not unexplained.depends_on:
         beyond = _beyond(diagnosis)
         return [Text(f"Nothing more. {beyond}" if beyond else "Nothing: the residuals are noise.")]
-    dependences = ", ".join(unexplained.depends_on)
-    parts: list[Part] = [Text(f"What is left is more than noise. It depends on: {dependences}.")]
+    sentences = " ".join(_dependences(unexplained))
+    parts: list[Part] = [Text(f"What is left is more than noise. {sentences}")]
     if unexplained.shares:
         shares = [
             [name, _number(share) if share < MAX_TIMES_NOISE else f"above {MAX_TIMES_NOISE:g}"]

@@ -260,6 +260,15 @@ def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):
     assert summary.classify((drag,), Unexplained(flagged=True)) == f"{CAUSES_FOUND}+{UNEXPLAINED}"
 
 
+def test_what_remains_is_told_in_sentences(diagnosis):
+    names = ("heading", "command", "periodic at 5.2 Hz", "stochastic")
+    found = replace(diagnosis, causes=(), unexplained=Unexplained(True, names))
+    assert report.describe_verdict(found).text.startswith(
+        "The model is wrong, and no known cause explains it. It depends on heading, command. "
+        "It swings at 5.2 Hz. It wanders at random, as gusts do."
+    )
+
+
 def test_no_manoeuvre_is_recommended_where_none_is_known(diagnosis):
     unseen = NotIdentifiable("wind", 0.1, "m/s", (), "")
     assert "recommended" not in report.text_of(replace(diagnosis, not_identifiable=(unseen,)))
