@@ -217,10 +217,17 @@ def make_scheduler(path: Path, config: Config) -> Any:
 
         def on_trial_result(self, *arguments: Any) -> str:
             action = super().on_trial_result(*arguments)
+            self._store()
+            return str(action)
+
+        def on_trial_complete(self, *arguments: Any) -> None:
+            super().on_trial_complete(*arguments)
+            self._store()
+
+        def _store(self) -> None:
             partial = path.with_suffix(".part")
             self.save(str(partial))
             partial.replace(path)
-            return str(action)
 
         def __setstate__(self, state: dict[str, Any]) -> None:
             self.__dict__.update(state)

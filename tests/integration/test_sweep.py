@@ -91,13 +91,15 @@ def test_asha_remembers_trials_of_before_an_interruption(tmp_path):
     scheduler = make_scheduler(tmp_path / "asha.pkl", config)
     stored = cloudpickle.dumps(scheduler)  # as Ray stores it, before any result
 
-    def result_of(scheduler, name, last_return):
+    def result_of(scheduler, name, last_return, is_last=False):
         trial = SimpleNamespace(trial_id=name)
         scheduler.on_trial_add(None, trial)
         result = {"steps": config.total_timesteps // 8, "last_return": last_return}
-        return scheduler.on_trial_result(None, trial, result)
+        tell = scheduler.on_trial_complete if is_last else scheduler.on_trial_result
+        return tell(None, trial, result)
 
-    assert [result_of(scheduler, name, 9.0) for name in "abc"] == ["CONTINUE"] * 3
+    assert [result_of(scheduler, name, 0.0) for name in "ab"] == ["CONTINUE"] * 2
+    result_of(scheduler, "c", 9.0, is_last=True)
     assert result_of(cloudpickle.loads(stored), "d", 1.0) == "STOP"
     (tmp_path / "asha.pkl").unlink()
     assert result_of(cloudpickle.loads(stored), "d", 1.0) == "CONTINUE"
