@@ -31,6 +31,7 @@ def keep_trace(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return ``fast_jit`` of a function of trees of arrays, with traces stored on the disk.
 
     Traces are stored only where compiled programs are stored, too (``flytrack_env.compile_cache``).
+    A stored trace can be called and jitted, but neither batched nor differentiated.
     """
 
     @functools.wraps(function)
