@@ -244,7 +244,8 @@ def with_one_less(
 ) -> list[FittedModel]:
     """Return models that have one effect less than a swap as likely as the model.
 
-    Two effects may do what one rival does alone. A swap of either is no likelier then.
+    Two effects may do what one rival does alone. A swap of either is no likelier then, and beside
+    the rival the other one hardly shows.
 
     Args:
         state: of the search.
@@ -252,13 +253,18 @@ def with_one_less(
         model: with the effects.
         swaps: refitted models with a rival instead of an effect.
     """
-    likely = [one for one in swaps if one.cost < model.cost + EQUIVALENT]
-    return [
-        without_effect(state, swap, kept.effect, linearization.moved(swap.vector))
-        for swap in likely
-        for kept in swap.candidates
-        if kept.effect in model.effects
-    ]
+    trials = []
+    for swap in swaps:
+        if swap.cost >= model.cost + EQUIVALENT:
+            continue
+        nearby = linearization.moved(swap.vector)
+        trials += [
+            without_effect(state, swap, kept.effect, nearby)
+            for kept in swap.candidates
+            if kept.effect in model.effects
+            and noncentrality(nearby, swap, kept.effect) < threshold(len(kept.fields))
+        ]
+    return trials
 
 
 def with_lags_anew(state: SearchState, model: FittedModel) -> list[FittedModel]:
