@@ -233,7 +233,7 @@ def effect_costs(repeats: int) -> str:
 
 def measure(entries: list[Contestant], repeats: int, warm_up: int = 3) -> dict[str, list[float]]:
     """Return the rates of each contestant, amount per second of its clock, all taking turns."""
-    for entry in entries:
+    for entry in report.progress(entries, "compiled"):
         for _ in range(warm_up):
             entry.run()
     rates: dict[str, list[float]] = {entry.name: [] for entry in entries}
@@ -261,6 +261,7 @@ def main(repeats: int = 7, out: Path | None = None, effects: bool = False) -> No
         costs = effect_costs(repeats)
         report.fill_page(out, "effects_speed", table=costs, repeats=repeats, core=core)
         return
+    print(f"pinned to core {core}; compiles every environment first: minutes", flush=True)
     rates = measure(contestants(), repeats)
     speeds = [
         (name, f"{statistics.median(values):.3g}", report.spread(values, ".3g"))

@@ -192,7 +192,9 @@ def progress(items: Iterable[Item], unit: str, total: int | None = None) -> Iter
         unit: what is counted.
         total: number of items; None: their length, if they have one.
     """
-    return tqdm(items, unit=f" {unit}", total=total, disable=None)
+    from flytrack_env.progress import TerminalBar  # not at the top: it imports JAX
+
+    return TerminalBar(items, unit=f" {unit}", total=total, disable=None)
 
 
 def filled(name: str, /, **values: Any) -> str:
@@ -244,6 +246,8 @@ def record_trials(
 ) -> None:
     """Measure what has no line of this commit yet, and append a line of JSON for each trial.
 
+    Prints a summary of each line, and how many there are.
+
     A line has the trial's fields, the commit, date and machine, and what was measured, or the
     error: a crash is a result too, and the others go on. This process alone writes to the file.
 
@@ -278,6 +282,25 @@ def record_trials(
         results = ((name, measure_trial(*values)) for name, values in arguments.items())
     for name, result in progress(results, "trials", len(remaining)):
         append_line(path, {**remaining[name]._asdict(), **stamp, **result})
+        tqdm.write(f"{name}: {summarize_result(result)}")
+    print(f"{path}: {len(remaining)} lines added; trials with a line of this commit are left out")
+
+
+def summarize_result(result: Line) -> str:
+    """Return the hidden truth of a trial and what was found of it, as text.
+
+    Args:
+        result: what was measured of a trial; an error, or anything without a truth, as well.
+    """
+    parts = []
+    for key in ("truth", "verdict", "causes", "law", "error"):
+        value = result.get(key)
+        if isinstance(value, list):
+            names = (item["effect"] if isinstance(item, dict) else str(item) for item in value)
+            value = ", ".join(names) or "none"
+        if value is not None:
+            parts.append(f"{key}: {value}")
+    return "; ".join(parts) or "measured"
 
 
 def _job_name(trial: Any) -> str:

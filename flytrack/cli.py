@@ -10,8 +10,9 @@ import dataclasses
 import importlib
 import io
 import sys
+import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,6 +20,7 @@ from typing import Annotated, Any, NamedTuple, NoReturn, Union
 
 PROG = "flytrack"
 SHELLS = ("bash", "zsh", "fish")
+LOADING_NOTE_S = 2.0
 REFUSED, STOPPED = (
     2,
     130,
@@ -174,8 +176,9 @@ def call(name: str, words: Sequence[str]) -> None:
     if (CLONE / "firmware").is_dir() and str(CLONE) not in sys.path:
         sys.path.append(str(CLONE))  # an editable installation finds only what a wheel has
     try:
-        asked = words if command.reads_words else read_flags(name, words)
-        run: Callable[[Any], int | None] = load(name, command.run)
+        with loading_note(name):
+            asked = words if command.reads_words else read_flags(name, words)
+            run: Callable[[Any], int | None] = load(name, command.run)
     except NotInstalledError as error:
         if not {"-h", "--help"} & set(words):
             leave(name, REFUSED, f"error: {error}")
@@ -196,6 +199,24 @@ def call(name: str, words: Sequence[str]) -> None:
         leave(name, STOPPED, "stopped")
     if status:
         raise SystemExit(status)
+
+
+@contextlib.contextmanager
+def loading_note(name: str) -> Iterator[None]:
+    """Say on a terminal that a command is being loaded, if that takes long.
+
+    JAX and what builds on it take 3 s to import, and 9 s on a busy machine.
+    """
+    note = threading.Timer(
+        LOADING_NOTE_S, lambda: print(f"{PROG} {name}: loading", file=sys.stderr, flush=True)
+    )
+    note.daemon = True
+    if sys.stderr.isatty():
+        note.start()
+    try:
+        yield
+    finally:
+        note.cancel()
 
 
 def held_output(asked: Any) -> contextlib.AbstractContextManager[None]:

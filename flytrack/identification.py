@@ -81,7 +81,7 @@ def run_import(flags: Import) -> None:
     check_name(flags.out)
     if flags.model_out is not None:
         check_model_name(flags.model_out)
-    with waiting(f"read {len(flags.files)} files"):
+    with waiting(f"read {len(flags.files)} file{'s' * (len(flags.files) > 1)}"):
         found = import_log(flags.files, flags.format, flags.map, not flags.keep_clocks)
     written = [flags.out, flags.out.with_suffix(".import.json")]
     model = None if flags.model_out is None else found.nominal_model()  # before anything is written

@@ -1,7 +1,8 @@
 """Progress of long work: a bar on a terminal, lines elsewhere.
 
 A line comes within 5 s, and then every 10 s, also where the work itself says nothing for minutes,
-as in a compilation. The time left is told once some of the work that counts is done.
+as in a compilation. A bar is drawn again every second. The time left is told once some of the work
+that counts is done.
 
 tqdm comes with the extras.
 """
@@ -17,7 +18,9 @@ from typing import Any, TextIO
 from tqdm import tqdm
 
 FIRST_LINE_S, LINE_EVERY_S = 4.0, 10.0
+REDRAW_EVERY_S = 1.0
 MIN_STEPS = 10  # of a work whose time left is told: a few stages differ too much in length
+FEW_STEPS_FORMAT = "{l_bar}{bar}| {n_fmt} of {total_fmt}{unit} [{elapsed} so far{postfix}]"
 
 
 class LineBar:
@@ -51,7 +54,9 @@ class LineBar:
             self._is_closed.set()
         # A bar that is dropped without an end, as by an error, must not go on writing.
         beat = threading.Thread(
-            target=_write_lines, args=(weakref.ref(self), self._is_closed), daemon=True
+            target=_refresh_until_closed,
+            args=(weakref.ref(self), self._is_closed, FIRST_LINE_S, LINE_EVERY_S),
+            daemon=True,
         )
         beat.start()
 
@@ -106,16 +111,52 @@ def _as_clock(seconds: float) -> str:
     return tqdm.format_interval(seconds)
 
 
-def _write_lines(bar: "weakref.ref[LineBar]", is_closed: threading.Event) -> None:
-    """Write a bar's line until it is closed or gone."""
-    wait_s = FIRST_LINE_S
+def _refresh_until_closed(
+    bar: "weakref.ref[Any]", is_closed: threading.Event, first_s: float, every_s: float
+) -> None:
+    """Refresh a bar after ``first_s``, then every ``every_s``, until it is closed or gone."""
+    wait_s = first_s
     while not is_closed.wait(wait_s):
         alive = bar()
         if alive is None:
             return
         alive.refresh()
-        wait_s = LINE_EVERY_S
+        wait_s = every_s
         del alive
+
+
+class TerminalBar(tqdm):
+    """tqdm's bar, whose clock also runs while the work itself says nothing.
+
+    tqdm draws only when something is counted, so a stage of minutes looks like a program that
+    hangs.
+    """
+
+    def __init__(self, *args: Any, **options: Any):
+        self._is_closed = threading.Event()
+        self._beat = threading.Thread(
+            target=_refresh_until_closed,
+            args=(weakref.ref(self), self._is_closed, REDRAW_EVERY_S, REDRAW_EVERY_S),
+            daemon=True,
+        )
+        super().__init__(*args, **options)
+        if not self.disable:
+            self._beat.start()
+
+    @property
+    def format_dict(self) -> Any:
+        """Return what the bar is drawn from, without a time left if the steps are few."""
+        values = super().format_dict
+        if values["total"] and values["total"] < MIN_STEPS:
+            values["bar_format"] = FEW_STEPS_FORMAT
+        return values
+
+    def close(self) -> None:
+        """End the bar; nothing draws it after that."""
+        self._is_closed.set()
+        if self._beat.is_alive() and self._beat is not threading.current_thread():
+            self._beat.join()
+        super().close()
 
 
 def progress_bar(unit: str, total: int | None = None, **options: Any) -> Any:
@@ -127,7 +168,7 @@ def progress_bar(unit: str, total: int | None = None, **options: Any) -> Any:
         options: of tqdm: ``initial``, ``desc``, ``leave``, ``unit_scale`` and ``disable``.
     """
     if sys.stderr.isatty():
-        return tqdm(unit=f" {unit}", total=total, **options)
+        return TerminalBar(unit=f" {unit}", total=total, **options)
     options.pop("leave", None)  # lines stay
     return LineBar(unit, total, **options)
 

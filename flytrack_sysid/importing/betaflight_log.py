@@ -205,8 +205,8 @@ class _Headers:
         )
         name = effect_of(curve).name
         return [
-            f"commands are setpoints; for a pilot's sticks a model needs the effect {name}: "
-            f"{numbers}"
+            "commands are rate setpoints; a model that is flown with sticks needs the pilot's "
+            f"rates, the effect {name}: {numbers}"
         ]
 
     def thrust_settings(self) -> list[str]:

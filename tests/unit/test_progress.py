@@ -1,4 +1,4 @@
-"""Lines of progress where there is no terminal."""
+"""Progress on a terminal, and lines where there is none."""
 
 import gc
 import io
@@ -8,7 +8,7 @@ import time
 import pytest
 
 from flytrack_env import progress
-from flytrack_env.progress import LineBar, ProgressBar, progress_bar, waiting
+from flytrack_env.progress import LineBar, ProgressBar, TerminalBar, progress_bar, waiting
 
 
 @pytest.fixture
@@ -70,3 +70,40 @@ def test_a_callback_closes_its_bar_with_a_last_line(quick, capsys):
     assert last.startswith("48 of 48 flights, 00:00 so far")
     time.sleep(0.2)
     assert capsys.readouterr().err == ""
+
+
+def open_terminal(monkeypatch):
+    """Return the stream of a terminal on which bars are drawn every 0.05 s.
+
+    Not a fixture: pytest sets stderr anew between set-up and call.
+    """
+    monkeypatch.setattr(progress, "REDRAW_EVERY_S", 0.05)
+    stream = io.StringIO()
+    stream.isatty = lambda: True
+    monkeypatch.setattr("sys.stderr", stream)
+    return stream
+
+
+def test_a_bar_is_drawn_while_the_work_says_nothing_and_guesses_no_end(monkeypatch):
+    terminal = open_terminal(monkeypatch)
+    report = ProgressBar("stages")
+    assert isinstance(report.bar, TerminalBar)
+    report(1, 5)
+    drawn = terminal.getvalue()
+    time.sleep(0.5)
+    silent = terminal.getvalue()[len(drawn) :].split("\r")
+    assert len(silent) >= 3 and all("1 of 5 stages" in text for text in silent[-2:])
+    assert "left" not in silent[-1] and "<" not in silent[-1]
+    report(5, 5)
+    closed = terminal.getvalue()
+    time.sleep(0.2)
+    assert terminal.getvalue() == closed
+
+
+def test_the_time_left_of_many_steps_is_drawn(monkeypatch):
+    terminal = open_terminal(monkeypatch)
+    bar = progress_bar("steps", 100, initial=0)
+    bar.update(50)
+    bar.refresh()
+    assert "50/100 [00:00<00:00" in terminal.getvalue()
+    bar.close()
