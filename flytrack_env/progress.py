@@ -1,7 +1,7 @@
 """Progress of long work: a bar on a terminal, lines elsewhere.
 
 A line comes within 5 s, and then every 10 s, also where the work itself says nothing for minutes,
-as in a compilation. A bar is drawn again every second. The time left is told once some of the work
+as in a compilation. A bar is redrawn every second. The time left is told once some of the work
 that counts is done.
 
 tqdm comes with the extras.

@@ -333,14 +333,14 @@ def find_spans(selection: Selection, test: Problem, log: FlightLog) -> dict[str,
     }
 
 
-def _named(state: SearchState, model: FittedModel) -> list[Window]:
+def windows_of(state: SearchState, model: FittedModel) -> list[Window]:
     """Return the windows of a model's effects."""
     return [one for one in state.problem.windows if one.effect in model.effects]
 
 
 def active_windows(selection: Selection) -> list[Window]:
     """Return the windows of a selected model's effects."""
-    return _named(selection.state, selection.model)
+    return windows_of(selection.state, selection.model)
 
 
 def ended(selection: Selection) -> list[str]:
@@ -447,7 +447,7 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     state, base, model = extended(state, state.fitted((), selection.base.vector), model)
     new_rows, old_rows = (
         {row for one in windows for row in (one.start, one.end)}
-        for windows in (_named(state, model), selection.state.problem.windows)
+        for windows in (windows_of(state, model), selection.state.problem.windows)
     )
     rows = new_rows - old_rows - {ALWAYS, NEVER}
     if rows:
@@ -456,7 +456,7 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     if misfit(tried, test) >= misfit(selection, test):
         return None  # before the effects are selected, which takes longest
     later = select(state, base, tried.model)
-    later = later._replace(state=windowed(later.state, _named(later.state, later.model)))
+    later = later._replace(state=windowed(later.state, windows_of(later.state, later.model)))
     misfit_changes = [
         misfit(later, problem) - misfit(selection, problem)
         for problem in (selection.state.problem, test)
