@@ -651,8 +651,11 @@ def find_unexplained(
         for pattern in lines
     }
     shares |= {f"{pattern.side}: {pattern.name}": pattern.share for pattern in clear}
-    if not shares:
-        stochastic = stochastic_shares(problem, model)
-        shares = {f"{side}: stochastic": size for side, size in stochastic.items()}
+    patterned = {name.partition(":")[0] for name in shares}
+    shares |= {
+        f"{side}: stochastic": size
+        for side, size in stochastic_shares(problem, model).items()
+        if side not in patterned
+    }
     names = [name.split(": ", 1)[1] for name in shares]
     return Unexplained(bool(shares), tuple(dict.fromkeys(names)), shares), clear

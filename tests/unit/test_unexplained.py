@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from flytrack_sysid.diagnosis import unexplained
 from flytrack_sysid.diagnosis.unexplained import SIDES, SideTest, fitted_on
 from flytrack_sysid.inference.chunks import NUM_AXES
 
@@ -24,3 +25,14 @@ def test_a_side_does_not_fit_what_the_other_side_determines() -> None:
     columns = SideTest.of("rate", np.zeros(SHAPE), imbalance[None]).given
     information = float(np.sum(np.square(columns)))
     assert test.noncentrality(columns, np.ones(1)) > 0.99 * information
+
+
+def test_what_wanders_on_one_side_is_told_beside_a_pattern_on_the_other(monkeypatch) -> None:
+    heading = unexplained.Dependence("heading", "force", 90.0, 0.5, np.zeros(0))
+    wandering = {"rate": 0.4, "force": 0.3}
+    monkeypatch.setattr(unexplained, "find_lines", lambda *_: [])
+    monkeypatch.setattr(unexplained, "build_waves", lambda *_: {})
+    monkeypatch.setattr(unexplained, "find_dependences", lambda *_: [heading])
+    monkeypatch.setattr(unexplained, "stochastic_shares", lambda *_: wandering)
+    found, _ = unexplained.find_unexplained(None, None, None)
+    assert found.shares == {"force: heading": 0.5, "rate: stochastic": 0.4}
