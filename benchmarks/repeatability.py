@@ -16,6 +16,9 @@ from time import process_time
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.constants import g as GRAVITY
+from scipy.signal import lfilter, savgol_filter
+from scipy.spatial.transform import Rotation
 
 from benchmarks import hidden
 from benchmarks.diagnosis import AMPLITUDES, SECONDS, model_of
@@ -41,8 +44,9 @@ from flytrack_sysid.split import held_out_rows
 
 LINES = RESULTS / "repeatability.jsonl"
 SHORTEST_S = 14.0
+RATE_POLICIES = "Crazyflie, rate policies"
 CRAFT = {  # and the beginnings of its flights' names
-    "Crazyflie, rate policies": ("crazyflie_rate_flights/",),
+    RATE_POLICIES: ("crazyflie_rate_flights/",),
     "Crazyflie, angle mode, two days": ("cf_utias_angle/",),
     "Crazyflie of ARPL, motors": ("cf_arpl_motors/",),
     "NanoBench, one trajectory twice": ("nanobench/B3_", "nanobench/B9_"),
@@ -50,6 +54,8 @@ CRAFT = {  # and the beginnings of its flights' names
 PLANT = "plant "  # begins the name of a simulated craft
 SEED = 57  # no rule was made on it
 VISIBLE, SEPARABLE = 30.0, 20.0  # lambda and lambda_sep of an effect that a log can show
+SMOOTHED_ROWS = 9  # of the velocity whose slope is the acceleration
+LAGS_S, DELAYS = (0.02, 0.03, 0.04, 0.05, 0.06), range(8)  # of thrust; delays in rows
 
 
 class Trial(NamedTuple):
@@ -229,6 +235,37 @@ def half_responses(lines: Sequence[Line], stick: str) -> str:
     return f"± {half_ms:.1f}; {alike} of {len(pairs)}"
 
 
+def hover_without_model(log: FlightLog) -> float:
+    """Return the stick at which a log's drone neither climbs nor sinks, without the simulator.
+
+    The acceleration along the body's z axis, by differences of the velocity, is fitted by a
+    parabola of the stick after a lag and a delay, the best of a grid.
+    """
+    step_s = float(np.median(np.diff(log.time)))
+    acceleration = savgol_filter(log["v"], SMOOTHED_ROWS, 2, deriv=1, delta=step_s, axis=0)
+    felt = acceleration + np.array([0.0, 0.0, GRAVITY])
+    up = Rotation.from_quat(log["q"], scalar_first=True).apply([0.0, 0.0, 1.0])
+    thrust = np.sum(felt * up, axis=1)
+    fits = []
+    for lag_s in LAGS_S:
+        decay = np.exp(-step_s / lag_s)
+        stick = lfilter([0.0, 1.0 - decay], [1.0, -decay], log["u"][:, 3])
+        for delay in DELAYS:
+            fitted = np.polynomial.Polynomial.fit(stick[: len(stick) - delay], thrust[delay:], 2)
+            error = np.mean(np.square(fitted(stick[: len(stick) - delay]) - thrust[delay:]))
+            fits.append((error, fitted))
+    _, best = min(fits, key=lambda one: one[0])
+    sticks = np.linspace(-1.0, 1.0, 2001)
+    return float(sticks[np.argmin(np.abs(best(sticks) - GRAVITY))])
+
+
+def compare_hovers(lines: Sequence[Line]) -> tuple[list[float], float]:
+    """Return each flight's hover without a model, and its correlation with the diagnosed one."""
+    hovers = [hover_without_model(flights()[line["flight"]].log) for line in lines]
+    diagnosed = [line["lift"]["hover"][0] for line in lines]
+    return hovers, float(np.corrcoef(hovers, diagnosed)[0, 1])
+
+
 def is_in_class(line: Line) -> bool:
     """Return whether the effect that a log shows is a cause, an equivalent or negligible."""
     alike = (name for equivalents in line["causes"].values() for name in equivalents)
@@ -250,6 +287,7 @@ def write_page() -> None:
         for name, is_alike in compare_values(pairs_of(by_craft[craft]))
         if not is_alike
     )
+    hovers, correlation = compare_hovers(by_craft[RATE_POLICIES])
     plants = [line for line in lines if line["craft"].startswith(PLANT)]
     by_craft["Simulated, each plant twice"] = plants
     shown = [line for line in plants if line["effect"]]
@@ -270,6 +308,10 @@ def write_page() -> None:
         found=sum(map(is_in_class, shown)),
         shown=len(shown),
         apart=", ".join(f"`{name}` {count}" for name, count in apart.most_common(5)),
+        lowest=f"{min(hovers):.2f}",
+        highest=f"{max(hovers):.2f}",
+        correlation=f"{correlation:.2f}",
+        num_flights=len(hovers),
         seconds=f"{np.median([line['cpu_s'] for line in lines]):.0f}",
         commit=lines[-1]["commit"],
     )

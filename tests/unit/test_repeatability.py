@@ -1,8 +1,10 @@
 """Diagnoses of flights of one craft are compared by names, classes and intervals."""
 
+import numpy as np
 import pytest
 
-from benchmarks.repeatability import agree, compare, is_same_class
+from benchmarks.repeatability import agree, compare, hover_without_model, is_same_class
+from flytrack_sysid import FlightLog
 from tests.support.tables import table
 
 
@@ -36,3 +38,23 @@ def test_a_craft_counts_pairs_values_and_widths():
     flights, *alike, overlapping, roll, pitch, _, _ = compare(lines)
     assert (flights, alike, overlapping) == (3, 3 * ["1 of 3"], "4 of 6")
     assert (roll, pitch) == ("± 1.0; 1 of 3", "none")
+
+
+def test_the_hover_of_a_log_is_found_without_a_model():
+    """The thrust of a drone that stays level is 8 + 4 u m/s^2 after a lag of 0.03 s."""
+    step_s, rng = 0.01, np.random.default_rng(0)
+    stick = np.repeat(rng.uniform(-0.5, 1.0, 100), 20)
+    thrust, climb = np.zeros((2, len(stick)))
+    applied = stick[0]
+    for row in range(1, len(stick)):
+        applied += (stick[row - 1] - applied) * -np.expm1(-step_s / 0.03)
+        thrust[row] = 8.0 + 4.0 * applied
+        climb[row] = climb[row - 1] + step_s * (thrust[row] - 9.80665)
+    level = np.zeros((len(stick), 3))
+    channels = {
+        "u": np.c_[level, stick],
+        "v": np.c_[level[:, :2], climb],
+        "q": np.tile([1.0, 0.0, 0.0, 0.0], (len(stick), 1)),
+    }
+    log = FlightLog(step_s * np.arange(len(stick)), channels, np.zeros(len(stick), int))
+    assert hover_without_model(log) == pytest.approx((9.80665 - 8.0) / 4.0, abs=0.01)
