@@ -78,6 +78,13 @@ for env in (RecordVideo(film, "videos", lambda number: True, video_length=30), w
     env.step(env.action_space.sample())
     env.close()
 """
+RENDER_RECIPE = """
+import sys
+from rattler_build import Stage0Recipe, VariantConfig
+(rendered,) = Stage0Recipe.from_file(sys.argv[1]).render(VariantConfig())
+assert rendered.recipe.to_dict()["build"]["noarch"] == "python"
+print("rendered", rendered.recipe.package.name, rendered.recipe.package.version)
+"""
 FLY_BY_HAND = """
 import pygame
 from flytrack.cli import main
@@ -185,6 +192,13 @@ def wheel(session: nox.Session, extra: str) -> None:
         for use in USES[extra]:
             is_command = use.startswith(("flytrack ", "python "))
             session.run(*(shlex.split(use) if is_command else ("python", "-c", use)), env=HEADLESS)
+
+
+@nox.session(tags=["wheel"])
+def recipe(session: nox.Session) -> None:
+    """Read and render the conda recipe as rattler-build does, without its channels."""
+    session.install("py-rattler-build")
+    session.run("python", "-c", RENDER_RECIPE, str(ROOT / "conda" / "recipe.yaml"))
 
 
 @nox.session(tags=["versions"], python=["3.11", "3.12", "3.13"])
