@@ -157,7 +157,7 @@ def measure(trial: Trial) -> Line:
         "half_responses_s": {
             stick: [response.time, *response.ci95]
             for stick, response in diagnosis.half_response_s.get("extended", {}).items()
-            if response.ci95 is not None
+            if response.ci95 is not None and np.isfinite(response.ci95[1])
         },
     }
 

@@ -3,6 +3,7 @@
 The section has sentences for pilots, a picture and tables.
 """
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -86,7 +87,8 @@ def describe_responses(by_model: Mapping[str, Mapping[str, Record]]) -> str:
         time_s = response["time"]
         if response["ci95"] is None:
             return f"{1e3 * time_s:.0f}"
-        half_s = response["ci95"][1] - time_s
+        highest = response["ci95"][1]
+        half_s = math.inf if highest is None else highest - time_s
         return "not determined" if half_s > time_s else f"{1e3 * time_s:.0f} ± {1e3 * half_s:.0f}"
 
     def format_times(model: str) -> str:

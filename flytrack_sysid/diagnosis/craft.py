@@ -23,6 +23,8 @@ from flytrack_sysid.response import FULL_STEP, SMALL_STEP, half_responses
 
 SLOPE_STEP = 1e-3  # of a parameter's scale
 THRUST_FACTOR = "thrust_scale.factor"
+AT_TOP = 1e-6  # of a parameter's scale: this near to the top of its range it is there
+SHAPES_S = 1e-6  # a parameter that changes a time by less, over its scale, does not shape it
 MIDDLE = 0.5  # of a battery's voltages, from empty to full
 
 
@@ -55,7 +57,11 @@ def summarize_half_responses(
     refined: Refined,
     vectors: Mapping[str, np.ndarray],
 ) -> dict[str, dict[str, HalfResponse]]:
-    """Return the times to half response by model and stick; the extended model's with intervals."""
+    """Return the times to half response by model and stick; the extended model's with intervals.
+
+    An interval has no upper end where no fitted parameter shapes the response, or where one that
+    does ended at the top of its range: the log then shows at most that the response is not faster.
+    """
     problem, indices = refined.problem, free_indices(model, refined)
     least_lag_s = LAG_STEP * float(np.median(problem.chunks.record.step_s))
     nudged, step = problem.nudged(vectors["extended"], indices, SLOPE_STEP, least_lag_s)
@@ -64,14 +70,18 @@ def summarize_half_responses(
     extended = small[list(vectors).index("extended")]
     slopes = np.nan_to_num((small[len(vectors) :] - extended) / step[:, None]).T
     halves = propagated(slopes, linearization, model, refined)
+    scale = problem.scale[indices]
+    is_at_top = (problem.high - vectors["extended"])[indices] < AT_TOP * scale
+    shapes = np.abs(slopes) * scale > SHAPES_S
+    is_open = (halves == 0.0) | shapes[:, is_at_top].any(axis=1)
     result = {
         name: dict(zip(STICKS, map(HalfResponse, small_s.tolist(), full_s.tolist()), strict=True))
         for name, small_s, full_s in zip(vectors, small, full, strict=False)
     }
-    for (stick, response), half in zip(result["extended"].items(), halves.tolist(), strict=True):
-        result["extended"][stick] = replace(
-            response, ci95=(max(response.time - half, 0.0), response.time + half)
-        )
+    highest = np.where(is_open, np.inf, extended + halves)
+    for stick, low, high in zip(STICKS, extended - halves, highest.tolist(), strict=True):
+        response = result["extended"][stick]
+        result["extended"][stick] = replace(response, ci95=(max(float(low), 0.0), high))
     return result
 
 

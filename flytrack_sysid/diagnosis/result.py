@@ -204,7 +204,8 @@ class HalfResponse:
     Attributes:
         time: time for a small step.
         full_stick: time for a step to full stick.
-        ci95: 95 % interval of ``time``; None if the model was not fitted.
+        ci95: 95 % interval of ``time``, to infinity if the log does not limit it; None if the model
+            was not fitted.
     """
 
     time: float

@@ -12,6 +12,7 @@ from benchmarks.diagnosis import model_of
 from flytrack.cli import main
 from flytrack_env.effects import LinearDrag
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, onset, vetoes
+from flytrack_sysid.diagnosis.craft import summarize_half_responses
 from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
 from flytrack_sysid.diagnosis.flight_fit import Fit
 from flytrack_sysid.diagnosis.learned import improves_flights
@@ -37,7 +38,8 @@ from flytrack_sysid.inference.chunks import (
 from flytrack_sysid.inference.parameters import DRAIN, THRUST_COEFFS
 from flytrack_sysid.inference.problem import Problem, Window
 from flytrack_sysid.inference.record import make_record
-from flytrack_sysid.inference.search import SearchState
+from flytrack_sysid.inference.score_test import Linearization
+from flytrack_sysid.inference.search import FittedModel, SearchState
 from flytrack_sysid.log_file import save_log
 from tests.support.compiling import programs
 from tests.support.hidden_flights import scripted
@@ -350,6 +352,22 @@ def test_values_at_the_end_of_their_range_are_beyond_the_list(state, field, valu
     assert found[0].beyond.startswith(f"{name} at most {value:g}" if is_warned_of else "")
     warned = [one for one in collect_warnings(problem, found, []) if "beyond the list" in one]
     assert len(warned) == is_warned_of and bool(found[0].beyond) == is_warned_of
+
+
+def test_a_response_that_ends_at_the_top_of_its_range_has_no_upper_limit(state):
+    """A yaw as slow as the search allows may be slower; a roll in the middle is determined."""
+    state, _ = state.linearized(state.problem.start)
+    problem, vector = state.problem, state.problem.start.copy()
+    index = problem.names.index("tau_yaw")
+    vector[index] = problem.high[index]
+    model = FittedModel((), vector, 0.0, tuple(state.base_indices))
+    linearization = Linearization(problem, problem.slopes(vector, state.all_indices))
+    refined = Refined((), None, None, (), {}, problem, None)
+    found = summarize_half_responses(linearization, model, refined, {"extended": vector})
+    roll, _, yaw, _ = found["extended"].values()
+    assert 0.0 < roll.ci95[1] - roll.time < 0.01
+    assert yaw.time == pytest.approx(problem.high[index] * np.log(2.0), rel=1e-3)
+    assert yaw.ci95[0] <= yaw.time and yaw.ci95[1] == np.inf
 
 
 def test_a_value_that_no_flight_depends_on_is_not_told(state):

@@ -188,7 +188,12 @@ def diagnosis(flown, measured):
         source="<script>flight</script>",
         sha256=measured.sha256,
         warnings=("something to know",),
-        half_response_s={"extended": {"roll": HalfResponse(0.0281, 0.0402, (0.0276, 0.0286))}},
+        half_response_s={
+            "extended": {
+                "roll": HalfResponse(0.0281, 0.0402, (0.0276, 0.0286)),
+                "yaw": HalfResponse(0.347, 0.347, (0.3, np.inf)),
+            }
+        },
     )
 
 
@@ -209,6 +214,7 @@ def test_page_says_all_and_loads_nothing(tmp_path, diagnosis, measured):
         "flies 80 % closer after 1 s (0.1 m instead of 0.5 m on held-out flight; "
         "by the refitted base 20 %, the named effects 60 %)",
         "28.1 ± 0.5 (40)",
+        "not determined",
         "&lt;script&gt;flight",
     ):
         assert words in text.replace("&#x27;", "'"), words
