@@ -60,6 +60,7 @@ from flytrack_sysid.inference.score_test import (
 from flytrack_sysid.inference.search import FittedModel, SearchState, channels_for
 
 LOOSE = 0.5  # of the prior's width: a parameter with a wider interval is not determined
+NO_WIDTH = 1e-9  # of a parameter's scale: no flight depends on a value with a narrower interval
 SCALE_TWINS = (
     "thrust_curve",
 )  # mass, payload, battery and motors all scale the thrust over the mass
@@ -470,7 +471,7 @@ def with_refined_values(
         values = dict(cause.parameters)
         for field in fields:
             index, name = problem.names.index(field), field.split(".")[-1]
-            if half.get(index) == 0.0 and len(values) > 1:
+            if half.get(index, np.inf) < NO_WIDTH * problem.scale[index] and len(values) > 1:
                 values.pop(name, None)  # no flight depends on it
             elif index in half:
                 value, low, high = (

@@ -376,7 +376,8 @@ def test_a_value_that_no_flight_depends_on_is_not_told(state):
     indices = tuple(problem.parameter_indices([f"command_delay.{name}" for name in names]))
     moved = problem.start.copy()
     moved[indices[0]] = 0.01
-    fit = Fit(moved, indices, np.diag([1e-6, 0.0]), np.array([1e-3, 0.0]), np.zeros(1), NO_SLOPES)
+    half = np.array([1e-3, 1e-19])  # what solving leaves of a column of zeros
+    fit = Fit(moved, indices, np.diag(half**2), half, np.zeros(1), NO_SLOPES)
     told = {name: Estimated(0.01, (0.0, 0.02), "s") for name in names}
     cause = replace(CAUSE, effect="command_delay", parameters=told)
     refined = Refined((), fit, None, (), {}, problem, None)
