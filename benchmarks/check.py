@@ -11,7 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import process_time
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 from zlib import crc32
 
 import numpy as np
@@ -41,7 +41,7 @@ from flytrack_sysid.log import FlightLog
 
 LINES = RESULTS / "check.jsonl"
 Part = Literal["clean", "faults", "fixes", "pairs", "simulators", "measured"]
-PARTS: tuple[Part, ...] = ("clean", "faults", "fixes", "pairs", "simulators", "measured")
+PARTS: tuple[Part, ...] = get_args(Part)
 OUTCOMES = ("exact", "partial", "unexplained", "false", "missed")
 FIXED = ("equal", "ambiguous", "left", "wrong", "missed")
 MAX_ALTERNATIVES = 4
@@ -85,16 +85,15 @@ def cached_flight(seed: int, number: int) -> Flight:
 
 
 @lru_cache(1)
-def flights_at(data: Path) -> dict[str, FlightLog]:
-    """Return the measured flights below a folder, by name; empty if there is none."""
-    imported = measured_flights(data) if data.is_dir() else ()
-    return {name: one.log for name, one in imported}
+def measured_logs() -> dict[str, FlightLog]:
+    """Return the measured flights by name; empty if there are none."""
+    return {name: one.log for name, one in measured_flights(DATA)}
 
 
 def measure(trial: Trial) -> Line:
     """Check a log or a plant and compare what is found with the truth."""
     if trial.part == "measured":
-        log = flights_at(DATA)[trial.name]
+        log = measured_logs()[trial.name]
         return {"truth": [], "shown": True, **compare(check_log(log), ())}
     if trial.part == "simulators":
         simulator = next(one for one in SIMULATORS if one.name == trial.name)
@@ -208,7 +207,7 @@ def plan_trials(parts: Iterable[Part], logs: int, seed: int, model: bool) -> lis
     if "simulators" in parts:
         trials += [Trial("simulators", simulator.name, 0, seed, False) for simulator in SIMULATORS]
     if "measured" in parts:
-        trials += [Trial("measured", name, 0, seed, False) for name in flights_at(DATA)]
+        trials += [Trial("measured", name, 0, seed, False) for name in measured_logs()]
     return trials
 
 
