@@ -9,7 +9,6 @@ docs/results/scaling.jsonl; ``page`` writes docs/results/scaling.md from the las
 
 import csv
 import logging
-import math
 import os
 import shutil
 import socket
@@ -46,7 +45,7 @@ from benchmarks.report import (
     spread,
     write_page,
 )
-from flytrack_bench.hidden.draws import SUDDEN
+from flytrack_bench.hidden.draws import SUDDEN, draw_larger_size
 from flytrack_env.jobs import run_jobs
 from flytrack_env.model_file import save_model
 from flytrack_sysid.fleet import DIAGNOSED, Change, Flight, diagnose_fleet, find_flights
@@ -78,9 +77,7 @@ def draw_craft(rng: np.random.Generator, has_cause: bool) -> tuple[hidden.Truth,
     """Return a plant, and what it is from ``BEGINS_IN`` on: with a cause of the larger sizes."""
     truth = replace(hidden.draw_base(rng), motion="fine")
     name = str(rng.choice(SUDDEN))
-    drawn = hidden.EFFECTS[name]
-    size = hidden.log_uniform(math.sqrt(drawn.low * drawn.high), drawn.high, rng)
-    effects = {name: hidden.draw_effect(name, rng, size)}
+    effects = {name: hidden.draw_effect(name, rng, draw_larger_size(name, rng))}
     return truth, replace(truth, effects=effects) if has_cause else truth
 
 
