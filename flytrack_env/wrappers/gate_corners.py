@@ -20,7 +20,7 @@ from flytrack_env.randomness import Draws, seeds_of
 from flytrack_env.state import Action, Drone
 from flytrack_env.wrappers.camera_view import CameraView
 
-NUM_GATES, NUM_CORNERS = 2, 4
+NUM_CORNERS = 4
 # Latency and time between frames together: 25 frames a second, or 50 that are 20 ms late. Each step
 # remembered costs 0.04 of a plain step.
 MAX_AGE_S = 0.04
@@ -218,15 +218,6 @@ class GateCorners(CameraView):
             *(jnp.clip(part * scale, -limit, limit) for part in force_b),
             *kept["battery"],
         ]
-
-    def view(self, state: CornersState, params: EnvParams) -> list[list[Pixel]]:
-        """Return where the frame that is observed shows the corners, without the detector's errors.
-
-        Per gate, top left, top right, bottom right and bottom left.
-        """
-        pose, _ = self._frame(state, params)
-        sides = ((1.0, 1.0),) * NUM_GATES
-        return self._project(pose, sides, state, params)
 
     def _frame(self, state: CornersState, params: EnvParams) -> tuple[CameraPose, jax.Array]:
         """Return where the camera was when the observed frame was exposed, and its number.
