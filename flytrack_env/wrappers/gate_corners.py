@@ -239,28 +239,23 @@ class GateCorners(CameraView):
             )
         return compute_once(pose), frame
 
-    def _project(
-        self, pose: CameraPose, sides: Any, state: CornersState, params: EnvParams
-    ) -> list[list[Pixel]]:
-        """Return the corners of both gates; sides: of each, as ``opening_corners`` takes them."""
+    def _detect(self, state: CornersState, params: EnvParams) -> list[jax.Array]:
+        """Return the detector's rows: per gate the corners' coordinates, then their flags."""
         own, race = self.own_params(params), self.race(state)
+        pose, frame = self._frame(state, params)
+        draws = Draws(compute_once(seeds_of(state.word, frame)))
+        sides = compute_once(_draw_sides(own, draws))
+        scales = compute_once((2.0 / own.width_px, 2.0 / own.height_px))
         axes = compute_once(camera.camera_axes(pose.quat, own.pitch_deg))
         gates = [
             camera.opening_corners(axes, pose.pos_w, gate, *side)
             for gate, side in zip((race.gate, race.next_gate), sides, strict=True)
         ]
-        pixels = [[camera.project(corner, own.lens) for corner in corners] for corners in gates]
-        return compute_once(pixels)
-
-    def _detect(self, state: CornersState, params: EnvParams) -> list[jax.Array]:
-        """Return the detector's rows: per gate the corners' coordinates, then their flags."""
-        own = self.own_params(params)
-        pose, frame = self._frame(state, params)
-        draws = Draws(compute_once(seeds_of(state.word, frame)))
-        sides = compute_once(_draw_sides(own, draws))
-        scales = compute_once((2.0 / own.width_px, 2.0 / own.height_px))
+        pixels_of_gates = compute_once(
+            [[camera.project(corner, own.lens) for corner in corners] for corners in gates]
+        )
         rows: list[jax.Array] = []
-        for gate, pixels in enumerate(self._project(pose, sides, state, params)):
+        for gate, pixels in enumerate(pixels_of_gates):
             missed = _draw_missed(own, draws, gate)
             corners = []
             for index, pixel in enumerate(pixels):
