@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple, get_args
 from zlib import crc32
 
 import numpy as np
-from scipy.stats import beta
+from scipy.stats import binomtest
 
 from benchmarks.real.crazyflie import DATA
 from benchmarks.report import (
@@ -187,11 +187,6 @@ def is_same(change: Any, true: Change) -> bool:
     return abs(float(change.value) - true.value) <= tolerance
 
 
-def upper_bound(count: int, total: int) -> float:
-    """Return the one-sided 95 % upper bound of a share, by Clopper and Pearson."""
-    return 1.0 if count == total else float(beta.ppf(0.95, count + 1, total - count))
-
-
 def plan_trials(parts: Iterable[Part], logs: int, seed: int, model: bool) -> list[Trial]:
     """Return the trials; those of a flight follow each other."""
     trials = []
@@ -258,7 +253,10 @@ def write_page() -> None:
             for channel, kind, _ in (line["alternatives"] or [[]])[0]
         )
         named = ", ".join(f"{name} ({count})" for name, count in pairs.most_common())
-        bound = f"{100.0 * upper_bound(len(wrong), len(flown)):.1f} %" if flown else ""
+        bound = ""
+        if flown:  # one-sided, by Clopper and Pearson
+            interval = binomtest(len(wrong), len(flown), alternative="less").proportion_ci(0.95)
+            bound = f"{100.0 * interval.high:.1f} %"
         clean.append([kind, len(flown), len(wrong), bound, named])
     faults = [
         count_outcomes(name, [line for line in by_part["faults"] if name in (line["name"], "all")])
