@@ -109,7 +109,7 @@ class Plant:
     is_frozen: bool
 
 
-class LogSuite(Fields, frozen=True):
+class LogSuite(Fields):
     """A suite of logs, as its file has it.
 
     Attributes:
