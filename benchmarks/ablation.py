@@ -227,7 +227,6 @@ def write_page() -> None:
     flights = [line for line in lines if line["row"] == MEASURED]
     plants = [line for line in lines if line["row"] != MEASURED]
     rules = count_by_rule(plants)
-    scores = ["score lower without it", "score higher"]
     fill_page(
         RESULTS / "ablation.md",
         "ablation",
@@ -236,16 +235,15 @@ def write_page() -> None:
         seconds=f"{SECONDS:g}",
         seed=SEED,
         table=table(
-            ["rule", "plants on which it fires", DIFFER, *scores], [row for row in rules if row[1]]
+            "rule | plants on which it fires | outcomes that differ without it | "
+            "score lower without it | score higher",
+            [row for row in rules if row[1]],
         ),
         silent=", ".join(row[0] for row in rules if not row[1]),
         flights=count_whole(flights),
         shortest=f"{SHORTEST_S:g}",
         measured=", ".join(f"{row[0]} {row[1]}" for row in count_by_rule(flights) if row[1]),
     )
-
-
-DIFFER = "outcomes that differ without it"
 
 
 def count_whole(lines: list[Line]) -> int:

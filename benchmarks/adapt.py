@@ -18,12 +18,12 @@ from baselines.purejaxrl_ppo import Checkpoint, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint_env import plant_env
 from baselines.purejaxrl_ppo.flights import fly_many
 from benchmarks import report
-from benchmarks.diagnosis import model_of
+from benchmarks.diagnosis import MOTION_OF, model_of
 from benchmarks.loop.plants import draw_base
 from benchmarks.report import Line
 from flytrack_bench import load_suite
 from flytrack_bench.hidden import MOTIONS, HiddenPlant
-from flytrack_env import Motion, nominal_parameters
+from flytrack_env import nominal_parameters
 from flytrack_env.effects import BY_NAME
 from flytrack_env.model_file import model_as_json, model_from_json
 from flytrack_loop import race
@@ -38,7 +38,6 @@ LINES = report.RESULTS / "adapt.jsonl"
 POLICY, DT_S, NUM_LAPS, NUM_STEPS = "robust", 0.01, 25, 1000
 PLANT, UNCHANGED = "plant", "unchanged"
 NUM_PLANTS, NUM_UNCHANGED = 8, 20
-AS_MODELS = {"handout": "euler", "semi_implicit": "semi_implicit", "fine": "continuous"}
 ENTRIES = ("nothing", "refitted base", "adapted")
 STARTS, START_SEED = 256, 7
 
@@ -256,7 +255,7 @@ def measure_unchanged(trial: Trial) -> Line:
     """Return what is made of a plant without effects that the policy claims to be made for."""
     rng = np.random.default_rng([trial.seed, trial.number, NUM_UNCHANGED])
     truth = replace(draw_base(rng), motion=trial.motion)
-    model = model_of(truth)._replace(motion=Motion(AS_MODELS[trial.motion]))
+    model = model_of(truth)._replace(motion=MOTION_OF[trial.motion])
     policy = load_checkpoint(POLICY)
     policy = policy._replace(meta={**policy.meta, "model": model_as_json(model)})
     log = fly(HiddenPlant(truth), policy, trial.seconds, trial.seed + trial.number)

@@ -8,7 +8,7 @@ the shipped black box, whose states are seen through the same camera.
 
 import statistics
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -49,25 +49,20 @@ def project_corners(image: Image, position: Any, quaternion: Any, gate: Any) -> 
     return coordinates, jnp.stack([jnp.asarray(pixel.is_visible) for pixel in pixels])
 
 
-class Poses(NamedTuple):
-    """Poses about the course; positions and quaternions are float32, for both cameras."""
+def draw_poses(
+    count: int,
+) -> tuple[Any, ray_caster.Gates, np.ndarray, np.ndarray, np.ndarray]:
+    """Draw poses about the course; return it, its gates, positions, quaternions and gate numbers.
 
-    course: Any
-    gates: ray_caster.Gates
-    positions: np.ndarray
-    quaternions: np.ndarray
-    indices: np.ndarray
-
-
-def draw_poses(count: int) -> Poses:
-    """Draw poses about the course."""
+    Positions and quaternions are float32, for both cameras.
+    """
     from flytrack_env import FlyTrack
 
     env = FlyTrack()
     gates = ray_caster.read_gates(env.track)
     positions, quaternions, indices = ray_caster.draw_poses(SEED, count, gates)
     pose = positions.astype(np.float32), quaternions.astype(np.float32)
-    return Poses(env.default_params.course, gates, *pose, indices)
+    return env.default_params.course, gates, *pose, indices
 
 
 def corner_figures(num_poses: int) -> list[report.Figure]:

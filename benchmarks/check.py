@@ -11,11 +11,11 @@ from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import process_time
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 from zlib import crc32
 
 import numpy as np
-from scipy.stats import beta
+from scipy.stats import binomtest
 
 from benchmarks.real.crazyflie import DATA
 from benchmarks.report import (
@@ -41,7 +41,7 @@ from flytrack_sysid.log import FlightLog
 
 LINES = RESULTS / "check.jsonl"
 Part = Literal["clean", "faults", "fixes", "pairs", "simulators", "measured"]
-PARTS: tuple[Part, ...] = ("clean", "faults", "fixes", "pairs", "simulators", "measured")
+PARTS: tuple[Part, ...] = get_args(Part)
 OUTCOMES = ("exact", "partial", "unexplained", "false", "missed")
 FIXED = ("equal", "ambiguous", "left", "wrong", "missed")
 MAX_ALTERNATIVES = 4
@@ -85,16 +85,15 @@ def cached_flight(seed: int, number: int) -> Flight:
 
 
 @lru_cache(1)
-def flights_at(data: Path) -> dict[str, FlightLog]:
-    """Return the measured flights below a folder, by name; empty if there is none."""
-    imported = measured_flights(data) if data.is_dir() else ()
-    return {name: one.log for name, one in imported}
+def measured_logs() -> dict[str, FlightLog]:
+    """Return the measured flights by name; empty if there are none."""
+    return {name: one.log for name, one in measured_flights(DATA)}
 
 
 def measure(trial: Trial) -> Line:
     """Check a log or a plant and compare what is found with the truth."""
     if trial.part == "measured":
-        log = flights_at(DATA)[trial.name]
+        log = measured_logs()[trial.name]
         return {"truth": [], "shown": True, **compare(check_log(log), ())}
     if trial.part == "simulators":
         simulator = next(one for one in SIMULATORS if one.name == trial.name)
@@ -188,11 +187,6 @@ def is_same(change: Any, true: Change) -> bool:
     return abs(float(change.value) - true.value) <= tolerance
 
 
-def upper_bound(count: int, total: int) -> float:
-    """Return the one-sided 95 % upper bound of a share, by Clopper and Pearson."""
-    return 1.0 if count == total else float(beta.ppf(0.95, count + 1, total - count))
-
-
 def plan_trials(parts: Iterable[Part], logs: int, seed: int, model: bool) -> list[Trial]:
     """Return the trials; those of a flight follow each other."""
     trials = []
@@ -208,7 +202,7 @@ def plan_trials(parts: Iterable[Part], logs: int, seed: int, model: bool) -> lis
     if "simulators" in parts:
         trials += [Trial("simulators", simulator.name, 0, seed, False) for simulator in SIMULATORS]
     if "measured" in parts:
-        trials += [Trial("measured", name, 0, seed, False) for name in flights_at(DATA)]
+        trials += [Trial("measured", name, 0, seed, False) for name in measured_logs()]
     return trials
 
 
@@ -259,7 +253,10 @@ def write_page() -> None:
             for channel, kind, _ in (line["alternatives"] or [[]])[0]
         )
         named = ", ".join(f"{name} ({count})" for name, count in pairs.most_common())
-        bound = f"{100.0 * upper_bound(len(wrong), len(flown)):.1f} %" if flown else ""
+        bound = ""
+        if flown:  # one-sided, by Clopper and Pearson
+            interval = binomtest(len(wrong), len(flown), alternative="less").proportion_ci(0.95)
+            bound = f"{100.0 * interval.high:.1f} %"
         clean.append([kind, len(flown), len(wrong), bound, named])
     faults = [
         count_outcomes(name, [line for line in by_part["faults"] if name in (line["name"], "all")])

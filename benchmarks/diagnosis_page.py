@@ -19,12 +19,11 @@ from benchmarks.report import (
     share_figure,
     table,
 )
+from flytrack_bench.misspec.scores import OTHER_LAW
 
 CONTROLS = ("clean", "heavy", "coloured", "gusts")
 SHOWN, SEPARATE, HIDDEN = 30.0, 20.0, 8.0  # lambda
 NOTABLE = 0.2  # of the noise: error that a new flight shows
-# The plants have other laws for these (flytrack_bench/hidden), so that their parameters differ.
-OTHER_LAW = ("translational_lift", "rate_saturation", "ground_effect")
 USUAL_RATE, CLOCK, CLOCK_WITHIN_S = 100, "mocap_latency", 0.002
 ONSET_WITHIN_S = 1.0
 VISIBLE = 10.0  # standard deviations of an effect outside the list: it was there, and flown
@@ -205,7 +204,7 @@ def flown(lines: list[Line], motion: str, rate: int) -> list[Line]:
     return [line for line in lines if (line["motion"], line["rate"]) == (motion, rate)]
 
 
-def count_names(header: str, pairs: Iterable[tuple[str, str]]) -> str:
+def count_names(pairs: Iterable[tuple[str, str]]) -> str:
     """Return a table of truths and how often each was given which name."""
     counts: dict[str, Counter[str]] = {}
     for truth, name in pairs:
@@ -214,7 +213,7 @@ def count_names(header: str, pairs: Iterable[tuple[str, str]]) -> str:
         (truth, names.total(), ", ".join(f"{name} {n}" for name, n in names.most_common()))
         for truth, names in sorted(counts.items())
     ]
-    return table(header, rows)
+    return table("truth | plants | named", rows)
 
 
 def misses(lines: list[Line]) -> str:
@@ -261,7 +260,7 @@ def main() -> None:
         visible=VISIBLE,
         figures=figures_of_motions(lines),
         rates=figures_of_rates(lines),
-        names=count_names("truth | plants | named", [*singles, *outside]),
+        names=count_names([*singles, *outside]),
         misses=misses(lines),
     )
 

@@ -20,8 +20,9 @@ SETTINGS: dict[str, Any] = {
     "num_envs": 256,
     "num_steps": 32,
     "num_minibatches": 16,
+    "learning_rate": 1e-3,
+    "gate_margin": 0.0,
 }
-RATES: dict[str, Any] = {"learning_rate": 1e-3, "gate_margin": 0.0}
 ROWS = 8  # of the table
 
 
@@ -35,7 +36,7 @@ def main(
 
     steps: of the environments. seed: of the training. runs: folder of its checkpoint. out: page.
     """
-    config = Config(total_timesteps=steps, **SETTINGS, **RATES)
+    config = Config(total_timesteps=steps, **SETTINGS)
     final, metrics = train_policy(runs, config, seed, ENV_ID)
     parts = {
         name: np.array_split(metrics[name], ROWS)
@@ -50,7 +51,7 @@ def main(
         out,
         "mask_learning",
         curve=report.table("steps, until | return | gates passed | steps of an episode", rows),
-        settings=report.list_settings(SETTINGS | RATES),
+        settings=report.list_settings(SETTINGS),
         seed=seed,
         seconds=f"{final.meta['seconds']:.0f}",
     )

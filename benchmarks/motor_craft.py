@@ -64,10 +64,10 @@ class State(NamedTuple):
     speeds: Any
 
 
-def hovering(crafts: Crafts, height_m: float = 2.0) -> State:
-    """Return level crafts at rest whose motors turn as for a hover."""
+def hovering(crafts: Crafts) -> State:
+    """Return level crafts at rest at 2 m whose motors turn as for a hover."""
     count = len(crafts.mass)
-    pos = np.tile(height_m * UP, (count, 1))
+    pos = np.tile(2.0 * UP, (count, 1))
     speed = speed_for(crafts, crafts.mass * GRAVITY / crafts.thrust.sum(axis=1))
     identity, zeros = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
     return State(pos, zeros, identity, zeros, np.repeat(speed[:, None], 4, axis=1))

@@ -61,11 +61,6 @@ class Wrench(NamedTuple):
     torque: float
 
 
-def read_flights(files: Sequence[Path], layout: str) -> Imported:
-    """Return flights as one log, a segment each."""
-    return import_log(list(files), "csv", layout)
-
-
 def start_rows(log: FlightLog) -> np.ndarray:
     """Return the rows from which flights of ``HORIZON`` rows stay within their segment."""
     settled = round(SETTLED_S / float(np.median(np.diff(log.time))))
@@ -211,10 +206,10 @@ def main(
     where the model is written.
     """
     fixed = {name: float(value) for name, value in (pair.split("=") for pair in fix)}
-    flights = read_flights(train, layout)
+    flights = import_log(train, "csv", layout)
     settings: dict[str, Any] = {"effects": effects, "fixed": fixed}
     if test:
-        results = [predicted(flights, read_flights(test, layout), **settings)]
+        results = [predicted(flights, import_log(test, "csv", layout), **settings)]
     else:
         results = leave_one_out(flights, **settings)
     print(table_of(results))

@@ -9,7 +9,6 @@ docs/results/scaling.jsonl; ``page`` writes docs/results/scaling.md from the las
 
 import csv
 import logging
-import math
 import os
 import shutil
 import socket
@@ -21,7 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
@@ -46,7 +45,7 @@ from benchmarks.report import (
     spread,
     write_page,
 )
-from flytrack_bench.hidden.draws import SUDDEN
+from flytrack_bench.hidden.draws import SUDDEN, draw_larger_size
 from flytrack_env.jobs import run_jobs
 from flytrack_env.model_file import save_model
 from flytrack_sysid.fleet import DIAGNOSED, Change, Flight, diagnose_fleet, find_flights
@@ -58,7 +57,9 @@ SEED = 61  # no rule was made on it
 BEGINS_IN = 12  # flight
 WITH_CAUSE = 3  # craft
 LIMIT_S = 900.0
-PARTS = ("devices", "rounding", "fleet", "fleet_on_cluster", "sweep_on_cluster", "overhead")
+Part = Literal[
+    "devices", "rounding", "fleet", "fleet_on_cluster", "sweep_on_cluster", "overhead", "page"
+]
 JOB_S, JOBS = 10.0, 8
 # On paper: docs/results/gpu.md, recipe gpu on an H200; numbers of a row beside the observation; and
 # what is assumed, a network card of 400 Gbit/s for each GPU and 50 us for a message between them.
@@ -76,9 +77,7 @@ def draw_craft(rng: np.random.Generator, has_cause: bool) -> tuple[hidden.Truth,
     """Return a plant, and what it is from ``BEGINS_IN`` on: with a cause of the larger sizes."""
     truth = replace(hidden.draw_base(rng), motion="fine")
     name = str(rng.choice(SUDDEN))
-    drawn = hidden.EFFECTS[name]
-    size = hidden.log_uniform(math.sqrt(drawn.low * drawn.high), drawn.high, rng)
-    effects = {name: hidden.draw_effect(name, rng, size)}
+    effects = {name: hidden.draw_effect(name, rng, draw_larger_size(name, rng))}
     return truth, replace(truth, effects=effects) if has_cause else truth
 
 
@@ -473,7 +472,7 @@ def write_results() -> None:
         for one in (last_of("fleet") or {"told": []})["told"]
     ]
     commits = ", ".join(
-        f"{part} {one['commit']}" for part in PARTS if (one := last_of(part)) is not None
+        f"{part} {one['commit']}" for part in get_args(Part) if (one := last_of(part)) is not None
     )
     values = {
         name: f"{value:,.0f}" if value >= 100.0 else f"{value:.3g}"
@@ -488,16 +487,13 @@ def write_results() -> None:
         machine=source.get("machine", ""),
         seed=SEED,
         **{name: fleet.get(name, 0) for name in ("craft", "flights", "seconds")},
-        logs=fleet.get("craft", 0) * fleet.get("flights", 0),
         **values,
     )
     write_page(RESULTS / "scaling.md", text)
 
 
 def main(
-    part: Literal[
-        "devices", "rounding", "fleet", "fleet_on_cluster", "sweep_on_cluster", "overhead", "page"
-    ],
+    part: Part,
     craft: int = 10,
     flights: int = 20,
     seconds: float = 20.0,

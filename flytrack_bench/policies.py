@@ -83,7 +83,7 @@ def load_policy(where: str) -> Policy:
         return policy_of(checkpoint, Path(where).name, digest)
     found = import_object(where, "policy", PolicyError)
     network = found if hasattr(found, "act") else Function(found)
-    space = flytrack_env.FlyTrack().observation_space(flytrack_env.FlyTrack().default_params)
+    space = flytrack_env.FlyTrack().observation_space()
     try:
         action = jax.eval_shape(
             lambda observation: network.act(None, network.first_memory(), observation)[1],

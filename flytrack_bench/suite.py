@@ -4,7 +4,7 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from msgspec import Meta
 
@@ -20,6 +20,7 @@ FOLDER = Path(__file__).parent / "suites"
 MAX_BYTES = 2**20
 CRAFT_FIELDS = ("tau", "coeffs", "max_rate", "drain", "mass", "gravity", "effects")
 Count = Annotated[int, Meta(ge=0)]
+File = TypeVar("File", bound=Fields)
 
 
 class SuiteError(ValueError):
@@ -78,6 +79,26 @@ def digest_of(content: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
+def read_suite(path: Path, kind: type[File]) -> File:
+    """Return the content of a suite's file as a struct, which has a ``digest``.
+
+    Raises:
+        SuiteError: a file that cannot be read, or one that was changed since it was written.
+    """
+    try:
+        content = json.loads(read_at_most(path, MAX_BYTES))
+    except OSError as error:
+        raise SuiteError(f"{path}: cannot be read: {error_text(error)}") from error
+    except (ValueError, RecursionError) as error:
+        raise SuiteError(f"{path}: not a suite: {error_text(error)}") from error
+    file = convert(str(path), content, kind, SuiteError)
+    if digest_of(content) != content["digest"]:
+        raise SuiteError(
+            f"{path}: digest: does not belong to the content, so that the file was changed"
+        )
+    return file
+
+
 def load_suite(name_or_path: str | Path) -> Suite:
     """Return a shipped suite by name, or that of a ``.json`` file.
 
@@ -92,17 +113,7 @@ def load_suite(name_or_path: str | Path) -> Suite:
         if str(name_or_path) not in known:
             expected = f"one of {', '.join(known)}, or a .json file"
             raise SuiteError(f"suite: found {str(name_or_path)!r}, expected {expected}")
-    try:
-        content = json.loads(read_at_most(path, MAX_BYTES))
-    except OSError as error:
-        raise SuiteError(f"{path}: cannot be read: {error_text(error)}") from error
-    except (ValueError, RecursionError) as error:
-        raise SuiteError(f"{path}: not a suite: {error_text(error)}") from error
-    file = convert(str(path), content, _SuiteFile, SuiteError)
-    if digest_of(content) != file.digest:
-        raise SuiteError(
-            f"{path}: digest: does not belong to the content, so that the file was changed"
-        )
+    file = read_suite(path, _SuiteFile)
     tasks = tuple(_task(path, task) for task in file.tasks)
     return Suite(file.name, file.digest, file.seed, file.starts, file.laps, file.steps, tasks)
 

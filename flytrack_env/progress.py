@@ -13,7 +13,7 @@ import time
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, TextIO
+from typing import Any
 
 from tqdm import tqdm
 
@@ -32,7 +32,6 @@ class LineBar:
         initial: how much was done before.
         desc: what is done.
         unit_scale: numbers are written with k and M.
-        stream: of the lines.
         disable: nothing is written, but what ``write`` is given.
     """
 
@@ -43,11 +42,10 @@ class LineBar:
         initial: int = 0,
         desc: str = "",
         unit_scale: bool = False,
-        stream: TextIO | None = None,
         disable: bool = False,
     ):
         self.unit, self.total, self.n, self.desc = unit, total, initial, desc
-        self._is_large, self._stream, self._postfix = unit_scale, stream or sys.stderr, ""
+        self._is_large, self._postfix = unit_scale, ""
         self._began_s = self._counted_from_s = time.monotonic()
         self._initial, self._written, self._is_closed = initial, "", threading.Event()
         if disable:
@@ -80,7 +78,7 @@ class LineBar:
     def line(self) -> str:
         """Return the line that is written."""
         now_s = time.monotonic()
-        parts = [f"{_as_clock(now_s - self._began_s)} so far"]
+        parts = [f"{tqdm.format_interval(now_s - self._began_s)} so far"]
         if self.unit and not self.total:
             parts.insert(0, f"{self.n} {self.unit}")
         elif self.total:
@@ -89,26 +87,21 @@ class LineBar:
             done, is_known = self.n - self._initial, self.total >= MIN_STEPS
             if done > 0 and is_known:
                 each_s = (now_s - self._counted_from_s) / done
-                parts.append(f"{_as_clock(each_s * (self.total - self.n))} left")
+                left_s = each_s * (self.total - self.n)
+                parts.append(f"{tqdm.format_interval(left_s)} left")
         text = ", ".join(filter(None, (*parts, self._postfix)))
         return f"{self.desc}: {text}" if self.desc else text
 
     def refresh(self) -> None:
         """Write the line."""
         self._written = self.line()
-        self._stream.write(f"{self._written}\n")
-        self._stream.flush()
+        print(self._written, file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """End the lines; one more is written if any was."""
         if not self._is_closed.is_set() and self._written and self.total:
             self.refresh()
         self._is_closed.set()
-
-
-def _as_clock(seconds: float) -> str:
-    """Return a time as minutes and seconds."""
-    return tqdm.format_interval(seconds)
 
 
 def _refresh_until_closed(

@@ -80,29 +80,15 @@ def gates_of(course: Course) -> Gates:
     left = np.cross(up, forward)
 
     def corners(half_edge: Scalar) -> np.ndarray:
-        return squares(centres, left, up, np.asarray(half_edge, float))
+        half = np.asarray(half_edge, float)[:, None]
+        return np.stack([centres + half * (a * left + b * up) for a, b in SQUARE], axis=1)
 
     return Gates(centres, forward, corners(frames.half_frame), corners(frames.half_opening))
 
 
-def squares(
-    centres: np.ndarray, first: np.ndarray, second: np.ndarray, half_edge: np.ndarray
-) -> np.ndarray:
-    """Return the corners of squares, (n, 4, 3).
-
-    Args:
-        centres: (n, 3), m.
-        first: (n, 3), unit vectors along one edge.
-        second: the same along the other edge.
-        half_edge: (n,), m.
-    """
-    half = half_edge[:, None]
-    return np.stack([centres + half * (a * first + b * second) for a, b in SQUARE], axis=1)
-
-
 def rotations(quaternions: np.ndarray) -> np.ndarray:
     """Return rotations (..., 3, 3), body to world, of unit quaternions (..., 4), scalar first."""
-    return Rotation.from_quat(np.roll(quaternions, -1, axis=-1)).as_matrix()
+    return Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
 
 
 def ground_grid(low: np.ndarray, high: np.ndarray, spacing_m: float) -> np.ndarray:

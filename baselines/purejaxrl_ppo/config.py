@@ -1,7 +1,6 @@
 """Every hyperparameter of a training run, from the command line, a TOML file or a checkpoint."""
 
 import dataclasses
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,11 +11,10 @@ from msgspec import Meta
 
 from flytrack_env.messages import error_text, quote_name
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
-from flytrack_env.validation import convert
+from flytrack_env.validation import MAX_NUMBER, Finite, Positive, convert
 
 MAX_COUNT, MAX_STEPS = 2**31 - 1, 2**62  # JAX counts with 32 bits; steps are counted in Python
 MAX_WIDTH, MAX_LAYERS = 2**16, 16  # a network of thousands of layers takes minutes to build
-MAX_FLOAT = sys.float_info.max
 
 
 class ConfigError(ValueError):
@@ -43,9 +41,7 @@ Count = Annotated[
 ]
 PositiveInt = Annotated[int, Meta(ge=1, le=MAX_COUNT)]
 Width = Annotated[int, Meta(ge=1, le=MAX_WIDTH)]
-FiniteFloat = Annotated[float, Meta(ge=-MAX_FLOAT, le=MAX_FLOAT)]
-PositiveFloat = Annotated[float, Meta(gt=0, le=MAX_FLOAT)]
-NonNegativeFloat = Annotated[float, Meta(ge=0, le=MAX_FLOAT)]
+NonNegativeFloat = Annotated[float, Meta(ge=0, le=MAX_NUMBER)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 
 
@@ -81,23 +77,23 @@ class Config:
     ones."""
     num_minibatches: PositiveInt = 64
     """Gradient steps per pass."""
-    learning_rate: PositiveFloat = 3e-3
+    learning_rate: Positive = 3e-3
     """Adam's step size at the start."""
     final_learning_rate_fraction: Fraction = 0.02
     """The step size falls linearly to this fraction of it at the end."""
-    adam_eps: PositiveFloat = 1e-5
+    adam_eps: Positive = 1e-5
     """Added to the root in Adam's denominator."""
     gamma: Fraction = 0.99
     """Discount per step."""
     gae_lambda: Fraction = 0.95
     """Decay of the advantage estimator."""
-    clip_eps: PositiveFloat = 0.2
+    clip_eps: Positive = 0.2
     """Clipping range of the probability ratio and of the value change."""
     entropy_coef: NonNegativeFloat = 0.0
     """Weight of the entropy bonus."""
     value_coef: NonNegativeFloat = 0.5
     """Weight of the value loss."""
-    max_grad_norm: PositiveFloat = 1.0
+    max_grad_norm: Positive = 1.0
     """Global norm to which gradients are clipped."""
     hidden_sizes: Annotated[tuple[Width, ...], Meta(min_length=1, max_length=MAX_LAYERS)] = (64, 64)
     """Widths of the hidden layers, tanh, of actor and critic each."""
@@ -115,11 +111,11 @@ class Config:
     """Weight of the mean squared error of the state that a linear layer reads from what the policy
     knows; 0: no such layer. Needs critic_sees_state. The error teaches the memory to hold position,
     velocity and attitude long before rewards would."""
-    initial_std: PositiveFloat = 0.5
+    initial_std: Positive = 0.5
     """Initial standard deviation of the actions, independent of the state. PureJaxRL: 1."""
     min_std: NonNegativeFloat = 0.05
     """Floor of that standard deviation. PureJaxRL: 0, no floor."""
-    initial_action: tuple[FiniteFloat, ...] = (0.0, 0.0, 0.0, -0.2)
+    initial_action: tuple[Finite, ...] = (0.0, 0.0, 0.0, -0.2)
     """Mean action of the untrained policy: sticks centred, thrust about that of hovering.
     PureJaxRL: zeros. Its length is the number of actions; unused where actions are discrete."""
     bootstrap_at_truncation: bool = True

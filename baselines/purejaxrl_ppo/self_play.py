@@ -125,10 +125,6 @@ def make_training_params(env: Versus, config: Config, settings: Settings) -> Ver
     return params._replace(race=params.race._replace(flight=flight, rules=rules))
 
 
-def _replace_row(row: int, rows: jax.Array, new: jax.Array) -> jax.Array:
-    return rows.at[row].set(new)
-
-
 def train(
     start: Checkpoint, race: MultiDroneRace, config: Config, settings: Settings
 ) -> Iterator[tuple[int, Any, Metrics]]:
@@ -174,13 +170,14 @@ def train(
         runner, metrics = train_phase(runner, params)
         learner = runner.train_state.params
         oldest = 1 + phase % settings.num_past
-        replace_oldest = partial(_replace_row, oldest)
-        pool = jax.tree.map(replace_oldest, params.opponents[0], learner)
+        pool = jax.tree.map(
+            lambda rows, new, row=oldest: rows.at[row].set(new), params.opponents[0], learner
+        )
         params = params._replace(opponents=(pool,))
         yield (phase + 1) * settings.updates_per_phase, learner, metrics
 
 
-@partial(jax.jit, static_argnames=("race", "network", "num_laps"))
+@partial(jax.jit, static_argnames=("race", "network"))
 def fly_races(
     race: MultiDroneRace,
     network: ActorCritic,
@@ -188,7 +185,6 @@ def fly_races(
     opponent: Any,
     slot: int,
     keys: jax.Array,
-    num_laps: int = NUM_LAPS,
 ) -> tuple[jax.Array, jax.Array]:
     """Race the learner against an opponent from the start grid, both with their mean actions.
 
@@ -199,7 +195,6 @@ def fly_races(
         opponent: parameters.
         slot: of the learner on the grid, 0 in front.
         keys: of the races, (num_races,).
-        num_laps: of a race.
 
     Returns: When each drone finishes (num_races, 2), s, infinity if never; whether drones collide
         before anyone finishes (num_races,).
@@ -221,7 +216,7 @@ def fly_races(
         is_racing = jnp.isinf(finish_s).all(axis=1)
         has_collided = has_collided | (info["collision"].any(axis=1) & is_racing)
         time_s = time_s + jnp.where(info["lap_completed"], info["lap_time_s"], 0.0)
-        finish_s = jnp.where(info["lap_completed"] & (info["laps"] == num_laps), time_s, finish_s)
+        finish_s = jnp.where(info["lap_completed"] & (info["laps"] == NUM_LAPS), time_s, finish_s)
         return (observations, states, time_s, finish_s, has_collided), None
 
     nobody = jnp.zeros(len(keys), bool)

@@ -20,7 +20,6 @@ from baselines.purejaxrl_ppo.config import (
     Config,
     ConfigError,
     OptionalPath,
-    PositiveFloat,
     read_config,
 )
 from baselines.purejaxrl_ppo.tracking import LOCAL, Tracker, end_unfinished, local_uri
@@ -31,6 +30,7 @@ from flytrack_env.jobs import connected
 from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.progress import progress_bar
 from flytrack_env.toml_file import TomlError, parse_toml, read_text
+from flytrack_env.validation import Positive
 
 METRIC = "last_return"  # dense from the start, where success is 0 for long
 LISTS = ("choice", "grid_search")  # of values; the others are ranges of numbers
@@ -67,7 +67,7 @@ class Flags:
         str | None, tyro.conf.arg(metavar="HOST:PORT|auto", help_behavior_hint=OPTIONAL)
     ] = None
     """A Ray cluster; by default this machine."""
-    cpus_per_trial: PositiveFloat = 1.0
+    cpus_per_trial: Positive = 1.0
     """Cores of a trial."""
     gpus_per_trial: float = 0.0
     """GPUs of a trial; 0.25: four trials share one."""

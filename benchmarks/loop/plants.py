@@ -60,10 +60,6 @@ def draw_base(rng: np.random.Generator) -> Truth:
     return Truth(
         tau=tuple(float(tau * factor) for tau, factor in zip(nominal.tau, factors, strict=True)),
         coeffs=tuple(float(thrust * value) for value in nominal.thrust_coeffs),
-        max_rate=tuple(float(rate) for rate in nominal.max_rate),
-        drain=float(nominal.battery_drain_v_per_min),
-        mass=float(nominal.m),
-        gravity=float(nominal.g),
     )
 
 

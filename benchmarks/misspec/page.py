@@ -6,7 +6,6 @@ each plant whose names the diagnosis missed, it computes what the log could show
 """
 
 import json
-from pathlib import Path
 
 from scipy.stats import binomtest
 
@@ -160,7 +159,7 @@ def main() -> None:
     logs = {name: len(result["logs"]) for name, result in found.items()}
     source = report.provenance()
     report.fill_page(
-        Path(report.RESULTS / "misspec.md"),
+        report.RESULTS / "misspec.md",
         "misspec",
         commit=source["commit"],
         date=source["date"],

@@ -26,7 +26,6 @@ class State(NamedTuple):
     Attributes:
         applied: lagged sticks, (n, 4).
         slope: of them (1/s), (n, 4).
-        volt: battery (V), (n,).
         attitude: body to world, n.
         vel_w: m/s, (n, 3).
         pos_w: m, (n, 3).
@@ -39,7 +38,6 @@ class State(NamedTuple):
 
     applied: np.ndarray
     slope: np.ndarray
-    volt: np.ndarray
     attitude: Rotation
     vel_w: np.ndarray
     pos_w: np.ndarray
@@ -74,7 +72,6 @@ def state_of(
     return State(
         applied,
         slope,
-        volt,
         attitude,
         vel_w,
         pos_w,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import jax
@@ -24,7 +25,7 @@ from benchmarks.real.crazyflie import (
     error_ratios,
     load_flights,
 )
-from benchmarks.real.section import Record, diagnose_log, import_mapped
+from benchmarks.real.section import Record, diagnose_log
 from benchmarks.report import table
 from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_sysid import FlightLog, import_log
@@ -42,10 +43,8 @@ BETAFLIGHT = "betaflight_acro_log"
 # Every third policy, by its number, is for judging.
 TRAINING = ("48", "49", "52", "53", "67", "68", "70", "71")
 HELD_OUT = ("50", "66", "69")
-QUAD, GECKO_MAPPING = (
-    Path(__file__).with_name("mappings").joinpath(f"{name}.toml").read_text(encoding="utf-8")
-    for name in ("betaflight", "gecko")
-)
+MAPPINGS = Path(__file__).with_name("mappings")
+QUAD, GECKO_MAPPING = MAPPINGS / "betaflight.toml", MAPPINGS / "gecko.toml"
 GECKO, GECKO_FILE = "bf_gecko", "btfl_002.bbl"
 BEFORE_S, AFTER_S = 0.3, 0.1  # of the setpoints that the best linear law knows
 HORIZON, TARGETS = "0.25", {"refitted_base": 0.8, "arx": 1.1}
@@ -74,7 +73,7 @@ def gecko(data: Path) -> Record:
 
     The second half of the flight is held out.
     """
-    flight = import_mapped(data / GECKO / GECKO_FILE, "betaflight", GECKO_MAPPING)
+    flight = import_log(data / GECKO / GECKO_FILE, "betaflight", GECKO_MAPPING)
     log = flight.log
     held_out = log.time > 0.5 * (log.time[0] + log.time[-1])
     diagnosis, record = diagnose_log(log, flight.nominal_model(), held_out)
@@ -125,8 +124,19 @@ def gecko_part(record: Record) -> str:
         figures=report.figures_table(figures),
         best_linear=np.rad2deg(record["best_linear_rad_per_s"]),
         errors=table(heads, rows),
-        mapping=GECKO_MAPPING,
+        mapping=GECKO_MAPPING.read_text(encoding="utf-8"),
     )
+
+
+def nanobench_flights(
+    data: Path, names: Sequence[str], mapping: str
+) -> tuple[FlightLog, ModelParameters]:
+    """Return flights of NanoBench as one log, of the same length each, and the nominal model."""
+    files = [data / NANOBENCH / f"{name}.csv.gz" for name in names]
+    flight = import_log(files, "csv", mapping)
+    starts_s = flight.log.time[flight.log.is_start()]
+    log = flight.log.select(flight.log.time - starts_s[flight.log.segment] < SECONDS)
+    return log, flight.nominal_model()
 
 
 def nanobench(data: Path) -> Record:
@@ -138,14 +148,11 @@ def nanobench(data: Path) -> Record:
     the flights and judged on the other, so that every flight is held out once.
     """
     names = " ".join(HALVES).split()
-    files = [data / NANOBENCH / f"{name}.csv.gz" for name in names]
-    flight = import_log(files, "csv", NANOBENCH)
-    starts_s = flight.log.time[flight.log.is_start()]
-    log = flight.log.select(flight.log.time - starts_s[flight.log.segment] < SECONDS)
+    log, nominal = nanobench_flights(data, names, NANOBENCH)
     folds = []
     for half in HALVES:
         held_out = np.isin(log.segment, [names.index(name) for name in half.split()])
-        diagnosis, record = diagnose_log(log, flight.nominal_model(), held_out)
+        diagnosis, record = diagnose_log(log, nominal, held_out)
         with jax.enable_x64(True):
             windows = make_windows(log, held_out, SPACING_S, MAX_WINDOWS)
             base, extended = (
@@ -205,8 +212,10 @@ def payload_flights(
     data: Path, names: Sequence[str], mass_kg: float
 ) -> tuple[FlightLog, ModelParameters]:
     """Return logs as one, and the nominal model of a mass."""
-    mapping = PAYLOAD_MAPPING.format(mass_kg=mass_kg)
-    flight = import_mapped([data / name for name in names], "usd", mapping)
+    with TemporaryDirectory() as folder:
+        mapping = Path(folder) / "mapping.toml"
+        mapping.write_text(PAYLOAD_MAPPING.format(mass_kg=mass_kg), encoding="utf-8")
+        flight = import_log([data / name for name in names], "usd", mapping)
     return flight.log, flight.nominal_model()
 
 
@@ -300,7 +309,7 @@ def crazyflie(data: Path) -> Record:
 
 def betaflight(data: Path) -> Record:
     """Return the diagnosis of the Betaflight log; held out are the last of every four blocks."""
-    flight = import_mapped(data / BETAFLIGHT / "shortLog.BFL", "betaflight", QUAD)
+    flight = import_log(data / BETAFLIGHT / "shortLog.BFL", "betaflight", QUAD)
     return diagnose_log(flight.log, flight.nominal_model())[1]
 
 
@@ -353,6 +362,6 @@ CRAFTS = {
         "Betaflight quadcopter with 6S, one acro flight",
         BETAFLIGHT,
         betaflight,
-        lambda record: f"With this mapping:\n\n```toml\n{QUAD}```",
+        lambda record: f"With this mapping:\n\n```toml\n{QUAD.read_text(encoding='utf-8')}```",
     ),
 }

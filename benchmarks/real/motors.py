@@ -23,6 +23,7 @@ from benchmarks.real.black_boxes import (
     rows_of,
     with_pose,
 )
+from benchmarks.real.crafts import MAPPINGS, nanobench_flights
 from benchmarks.real.crazyflie import DATA, MAX_WINDOWS
 from benchmarks.real.section import diagnose_log
 from flytrack_sysid import FitError, fit, import_log
@@ -37,7 +38,6 @@ from flytrack_sysid.inference.free_flight import (
 )
 from flytrack_sysid.inference.torque import MotorRecord, torque_correlations
 
-MAPPINGS = Path(__file__).parent / "mappings"
 HORIZON = HORIZONS_S.index(0.25)
 RATES = QUANTITIES.index("rates")
 SPACING_S = 0.1
@@ -46,7 +46,6 @@ LAGS = {"motors.up_s": 0.02, "motors.down_s": 0.03}
 PHOENIX = "crazyflie_rate_flights/seed00048_log1.csv.gz"
 NANOBENCH_LEARNT = ("B8_star_fast_rep1", "B9_trefoil_fast_rep14")
 NANOBENCH_HELD = ("B7_oval_fast_rep1", "B10_lissajous_fast_rep1")
-NANOBENCH_S = 17.0  # of each flight
 NANOBENCH_ERRORS = (("position_m", "0.5"), ("attitude_rad", "0.25"), ("rates_rad_per_s", "0.25"))
 
 
@@ -131,14 +130,11 @@ def nanobench() -> dict[str, Any]:
 
     The ratios are of held-out errors of both extended models, motors over sticks.
     """
-    files = [DATA / "nanobench" / f"{name}.csv.gz" for name in (*NANOBENCH_LEARNT, *NANOBENCH_HELD)]
     records = {}
     for kind, mapping in (("motors", "nanobench_motors"), ("sticks", "nanobench")):
-        flight = import_log(files, "csv", mapping)
-        starts_s = flight.log.time[flight.log.is_start()]
-        log = flight.log.select(flight.log.time - starts_s[flight.log.segment] < NANOBENCH_S)
+        log, nominal = nanobench_flights(DATA, (*NANOBENCH_LEARNT, *NANOBENCH_HELD), mapping)
         held_out = log.segment >= len(NANOBENCH_LEARNT)
-        records[kind] = diagnose_log(log, flight.nominal_model(), held_out)[1]
+        records[kind] = diagnose_log(log, nominal, held_out)[1]
         print(kind, records[kind]["sentence"], f"{records[kind]['cpu_s']:.0f} CPU s", flush=True)
     errors = {kind: record["diagnosis"]["prediction"]["errors"] for kind, record in records.items()}
     ratios = {

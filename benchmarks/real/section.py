@@ -5,10 +5,9 @@ The section has sentences for pilots, a picture and tables.
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax
@@ -21,7 +20,7 @@ from benchmarks.report import commit_of_checkout, table
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
-from flytrack_sysid import FlightLog, Imported, diagnose, import_log
+from flytrack_sysid import FlightLog, diagnose
 from flytrack_sysid.diagnosis import Diagnosis
 from flytrack_sysid.diagnosis.report import describe_verdict
 
@@ -56,14 +55,6 @@ def diagnose_log(
         "sentence": describe_verdict(diagnosis).text,
         "diagnosis": diagnosis.as_json(),
     }
-
-
-def import_mapped(files: Path | Sequence[Path], kind: str, mapping: str) -> Imported:
-    """Return logs imported with a mapping that is given as text."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "mapping.toml"
-        path.write_text(mapping, encoding="utf-8")
-        return import_log(files, kind, path)
 
 
 def format_number(value: float | None, unit: str = "1") -> str:

@@ -1,7 +1,6 @@
 """Flights as CSV files, which a mapping reads; ``mapping.toml`` reads them as they are."""
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -21,11 +20,13 @@ def write_csv(path: Path, log: FlightLog) -> None:
 
 
 def import_csv(path: Path, mapping: str) -> FlightLog:
-    """Return the log that a mapping, given as text, reads; its clocks stay as they are."""
-    with TemporaryDirectory() as folder:
-        file = Path(folder) / "mapping.toml"
-        file.write_text(mapping, encoding="utf-8")
-        return import_log(path, "csv", file, align=False).log
+    """Return the log that a mapping, given as text, reads; its clocks stay as they are.
+
+    The mapping is written beside the log.
+    """
+    file = path.with_suffix(".toml")
+    file.write_text(mapping, encoding="utf-8")
+    return import_log(path, "csv", file, align=False).log
 
 
 def is_equal(log: FlightLog, true: FlightLog) -> bool:

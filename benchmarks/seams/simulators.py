@@ -150,13 +150,13 @@ class Simulator:
 
 
 TO_NUMBERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "wxyz": lambda matrix: Rotation.from_matrix(matrix).as_quat()[[3, 0, 1, 2]],
+    "wxyz": lambda matrix: Rotation.from_matrix(matrix).as_quat(scalar_first=True),
     "xyzw": lambda matrix: Rotation.from_matrix(matrix).as_quat(),
     "euler": lambda matrix: Rotation.from_matrix(matrix).as_euler("xyz"),
     "columns": lambda matrix: matrix.T.ravel(),
 }
 FROM_NUMBERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "wxyz": lambda numbers: Rotation.from_quat(numbers[[1, 2, 3, 0]]).as_matrix(),
+    "wxyz": lambda numbers: Rotation.from_quat(numbers, scalar_first=True).as_matrix(),
     "xyzw": lambda numbers: Rotation.from_quat(numbers).as_matrix(),
     "euler": lambda numbers: Rotation.from_euler("xyz", numbers).as_matrix(),
     "columns": lambda numbers: numbers.reshape(3, 3).T,

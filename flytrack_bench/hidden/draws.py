@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flytrack_bench.hidden import GRAVITY, STICKS, Gust, Truth
+from flytrack_bench.hidden import STICKS, Gust, Truth
 
 Values = dict[str, float]
 Rng = np.random.Generator
@@ -180,7 +180,7 @@ def draw_base(rng: Rng) -> Truth:
         volt,
         both,
     )
-    return Truth(tau, tuple(float(value) for value in coeffs), gravity=GRAVITY)
+    return Truth(tau, tuple(float(value) for value in coeffs))
 
 
 def draw_effect(name: str, rng: Rng, size: float | None = None, has_drag: bool = False) -> Values:
@@ -197,6 +197,12 @@ def draw_effect(name: str, rng: Rng, size: float | None = None, has_drag: bool =
     if name == "wind" and has_drag:
         return {key.replace("a_", "v_"): AIR_PER_PUSH * value for key, value in values.items()}
     return values
+
+
+def draw_larger_size(name: str, rng: Rng) -> float:
+    """Return a size of an effect from the larger half of its range."""
+    drawn = EFFECTS[name]
+    return log_uniform(math.sqrt(drawn.low * drawn.high), drawn.high, rng)
 
 
 def with_effects(truth: Truth, names: tuple[str, ...], rng: Rng) -> Truth:
@@ -221,8 +227,7 @@ def draw_gust(rng: Rng) -> Gust:
 def draw_onset(rng: Rng, seconds: float) -> Truth:
     """Return a plant with one effect, of the larger half of sizes, that begins within a log."""
     truth, name = draw_base(rng), str(rng.choice(SUDDEN))
-    drawn = EFFECTS[name]
-    size = log_uniform(math.sqrt(drawn.low * drawn.high), drawn.high, rng)
+    size = draw_larger_size(name, rng)
     onset_s = seconds * float(rng.uniform(*ONSET_SHARE))
     return replace(truth, effects={name: draw_effect(name, rng, size)}, onset_s=onset_s)
 

@@ -7,8 +7,6 @@ rounded to the resolution of the sensors, so that the last bits of another machi
 library do not change a digest, unless a value lies on the edge of two roundings.
 """
 
-import json
-import math
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -19,11 +17,11 @@ import numpy as np
 from flytrack_bench.hidden import Truth
 from flytrack_bench.hidden.draws import (
     DRAGS,
-    EFFECTS,
     NAMES,
     draw_base,
     draw_effect,
     draw_gust,
+    draw_larger_size,
     draw_onset,
     log_uniform,
 )
@@ -31,11 +29,10 @@ from flytrack_bench.hidden.flights import fly
 from flytrack_bench.hidden.noise import measure
 from flytrack_bench.hidden.outside import KINDS, draw_outside
 from flytrack_bench.hidden.truth import MOTIONS
-from flytrack_bench.suite import FOLDER, MAX_BYTES, SuiteError, digest_of
+from flytrack_bench.suite import FOLDER, MAX_BYTES, SuiteError, digest_of, read_suite
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.files import read_at_most
-from flytrack_env.messages import error_text
-from flytrack_env.validation import Fields, Positive, Text, convert
+from flytrack_env.validation import Fields, Positive, Text
 from flytrack_sysid.log import FlightLog
 
 NAME = "misspec-v1"
@@ -112,9 +109,8 @@ class Plant:
     is_frozen: bool
 
 
-@dataclass(frozen=True)
-class LogSuite:
-    """A suite of logs.
+class LogSuite(Fields):
+    """A suite of logs, as its file has it.
 
     Attributes:
         name: of the suite.
@@ -125,11 +121,11 @@ class LogSuite:
         sha256: of each log, by its id.
     """
 
-    name: str
-    digest: str
+    name: Text
+    digest: Text
     seed: int
-    seconds: float
-    unseen_seconds: float
+    seconds: Positive
+    unseen_seconds: Positive
     sha256: dict[str, str]
 
     def chosen(self, ids: tuple[str, ...]) -> tuple[str, ...]:
@@ -189,15 +185,13 @@ def draw_truth(drawn: Drawn, seconds: float, rng: np.random.Generator) -> Truth:
         truth = replace(truth, outside=draw_outside(rng, drawn.names[0], amplitude))
     elif drawn.names:
         has_drag = any(name in DRAGS for name in drawn.names)
-        effects = {name: draw_effect(name, rng, _size(name, rng), has_drag) for name in drawn.names}
+        effects = {
+            name: draw_effect(name, rng, draw_larger_size(name, rng), has_drag)
+            for name in drawn.names
+        }
         truth = replace(truth, effects=effects)
     gust = draw_gust(rng) if drawn.noise == "gusts" else None
     return replace(truth, gust=gust, motion=drawn.motion)
-
-
-def _size(name: str, rng: np.random.Generator) -> float:
-    low, high = EFFECTS[name].low, EFFECTS[name].high
-    return log_uniform(math.sqrt(low * high), high, rng)
 
 
 def measured(clean: FlightLog, noise: str, rng: np.random.Generator) -> FlightLog:
@@ -230,15 +224,6 @@ def cut_flights(unseen: FlightLog) -> tuple[Flights, np.ndarray]:
     return Flights(step_s, past, commands), unseen["p"][starts + steps]
 
 
-class _SuiteFile(Fields):
-    name: Text
-    digest: Text
-    seed: int
-    seconds: Positive
-    unseen_seconds: Positive
-    sha256: dict[str, str]
-
-
 def is_log_suite(name_or_path: str) -> bool:
     """Return whether a name or a file is that of a suite of logs."""
     path = _path_of(name_or_path)
@@ -251,19 +236,7 @@ def load_log_suite(name_or_path: str) -> LogSuite:
     Raises:
         SuiteError: a file that cannot be read, or one that was changed since it was written.
     """
-    path = _path_of(name_or_path)
-    try:
-        content: Any = json.loads(read_at_most(path, MAX_BYTES))
-    except (OSError, ValueError, RecursionError) as error:
-        raise SuiteError(f"{path}: not a suite: {error_text(error)}") from error
-    file = convert(str(path), content, _SuiteFile, SuiteError)
-    if digest_of(content) != file.digest:
-        raise SuiteError(
-            f"{path}: digest: does not belong to the content, so that the file was changed"
-        )
-    return LogSuite(
-        file.name, file.digest, file.seed, file.seconds, file.unseen_seconds, file.sha256
-    )
+    return read_suite(_path_of(name_or_path), LogSuite)
 
 
 def _path_of(name_or_path: str) -> Path:

@@ -101,7 +101,7 @@ def plots_of(trajectory: Trajectory, race: FlownRace | None) -> list[Plot]:
     for column, name in enumerate(Action._fields):
         plots.append(Plot(f"action/{name}", f"{name} action", trajectory.actions[:, column]))
         plots.append(Plot(f"applied/{name}", f"{name} applied", applied[:, column]))
-    attitudes = Rotation.from_quat(np.roll(states[:, QUATERNION], -1, axis=1))
+    attitudes = Rotation.from_quat(states[:, QUATERNION], scalar_first=True)
     angles_deg = np.unwrap(attitudes.as_euler("ZYX", degrees=True), period=360.0, axis=0)
     for name, values in zip(("yaw", "pitch", "roll"), angles_deg.T, strict=True):
         plots.append(Plot(f"orientation/{name}", f"{name} [deg]", values))

@@ -1,6 +1,6 @@
 """Another camera and detector in every episode."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 
@@ -9,8 +9,8 @@ from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.params import EnvParams
 from flytrack_env.quaternion import Scalar
 from flytrack_env.randomness import Draws
-from flytrack_env.state import Action, Drone
-from flytrack_env.wrappers.base import Wrapper, WrapperError, layers_of
+from flytrack_env.wrappers.base import WrapperError, layers_of
+from flytrack_env.wrappers.episode_draws import DrawnState, EpisodeDraws
 from flytrack_env.wrappers.gate_corners import CornersParams, GateCorners
 
 RANGES = {
@@ -34,14 +34,7 @@ class DetectorRandomizationParams(NamedTuple):
     error_factor_low: Scalar = 0.0
 
 
-class DetectorState(NamedTuple):
-    """The inner state, and the word that the episode's detector is drawn from."""
-
-    inner: Any
-    word: jax.Array
-
-
-class DetectorRandomization(Wrapper):
+class DetectorRandomization(EpisodeDraws):
     """Draw the camera's mounting and lens, and the detector's errors, anew in every episode.
 
     The ranges are ``params.wrappers["detector_randomization"]``, about the camera and the detector
@@ -76,35 +69,13 @@ class DetectorRandomization(Wrapper):
             )
             self.corners.check_params(self.corners.with_own_params(params, end))
 
-    def begin(
-        self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0
-    ) -> DetectorState:
-        """Return the state of an episode that begins, its detector decided by the seed."""
-        word = Draws(seed).word(self.key)
-        inner = self.env.begin(drone, gate_index, self._drawn(word, params), seed)
-        return DetectorState(inner, word)
-
-    def advance(
-        self, state: DetectorState, command: Action, params: EnvParams
-    ) -> tuple[DetectorState, jax.Array, jax.Array, dict[str, Any]]:
-        """Return the outcome of the inner environment with this episode's detector."""
-        inner, reward, terminated, info = self.env.advance(
-            state.inner, command, self._drawn(state.word, params)
-        )
-        return DetectorState(inner, state.word), reward, terminated, info
-
-    def observe_drone(
-        self, drone: Drone, state: DetectorState, params: EnvParams
-    ) -> list[jax.Array]:
-        """Return the inner observation by this episode's detector."""
-        return self.env.observe_drone(drone, state.inner, self._drawn(state.word, params))
-
-    def detector(self, state: DetectorState, params: EnvParams) -> CornersParams:
+    def detector(self, state: DrawnState, params: EnvParams) -> CornersParams:
         """Return the camera and detector that a state's episode is flown with."""
-        own: CornersParams = self.corners.own_params(self._drawn(state.word, params))
+        own: CornersParams = self.corners.own_params(self.drawn(state.word, params))
         return own
 
-    def _drawn(self, word: jax.Array, params: EnvParams) -> EnvParams:
+    def drawn(self, word: jax.Array, params: EnvParams) -> EnvParams:
+        """Return parameters with the camera and detector of an episode."""
         ranges, detector = self.own_params(params), self.corners.own_params(params)
         draws, low = Draws(word), ranges.error_factor_low
         errors = {

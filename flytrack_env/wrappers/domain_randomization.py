@@ -23,8 +23,9 @@ from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.params import RANGES, EnvParams
 from flytrack_env.quaternion import Scalar
 from flytrack_env.randomness import Draws
-from flytrack_env.state import Action, Drone
-from flytrack_env.wrappers.base import Wrapper, WrapperError
+from flytrack_env.state import Drone
+from flytrack_env.wrappers.base import WrapperError
+from flytrack_env.wrappers.episode_draws import DrawnState, EpisodeDraws
 
 EFFECT_FACTORS = (1e-6, 1e6)
 NOT_DRAWN: Any = None  # in the place of a parameter's bound: not drawn
@@ -63,13 +64,6 @@ class RandomizationParams(NamedTuple):
         Wind(3.0, 3.0, NOT_DRAWN, a_x=NOT_DRAWN, a_y=NOT_DRAWN, a_z=NOT_DRAWN),
         LinearDrag(0.5, 0.5, 0.3),
     )
-
-
-class RandomizedState(NamedTuple):
-    """The inner state, and the word that this episode's model is drawn from."""
-
-    inner: Any
-    word: jax.Array
 
 
 def sample_model(
@@ -115,7 +109,7 @@ def _draw(
     return known._replace(**values)
 
 
-class DomainRandomization(Wrapper):
+class DomainRandomization(EpisodeDraws):
     """Fly every episode with a model drawn around the given one.
 
     The ranges are ``params.wrappers["domain_randomization"]``, a ``RandomizationParams``. The
@@ -154,45 +148,19 @@ class DomainRandomization(Wrapper):
             )
         _check_ranges(ranges, params, self.env.plant.delay_steps)
 
-    def model(self, state: RandomizedState, params: EnvParams) -> ModelParameters:
+    def model(self, state: DrawnState, params: EnvParams) -> ModelParameters:
         """Return the model that a state's episode is flown with."""
-        model = self.env.model(state.inner, self._drawn(state.word, params))
+        model = self.env.model(state.inner, self.drawn(state.word, params))
         return model._replace(tau=jnp.stack(list(model.tau)))
 
-    def _drawn(self, word: jax.Array, params: EnvParams) -> EnvParams:
+    def drawn(self, word: jax.Array, params: EnvParams) -> EnvParams:
+        """Return parameters with the model of an episode."""
         ranges = self.own_params(params)
         return params.replace(model=sample_model(word, params.model, ranges))
 
     def sample_start(self, seed: jax.Array, params: EnvParams) -> tuple[Drone, jax.Array]:
         """Return a start of the drone that the episode will be flown with."""
-        return self.env.sample_start(seed, self._drawn(self._word(seed), params))
-
-    def _word(self, seed: Any) -> jax.Array:
-        return Draws(seed).word(self.key)
-
-    def begin(
-        self, drone: Drone, gate_index: Any, params: EnvParams, seed: Any = 0
-    ) -> RandomizedState:
-        """Return the state of an episode that begins, its model decided by the seed."""
-        word = self._word(seed)
-        return RandomizedState(
-            self.env.begin(drone, gate_index, self._drawn(word, params), seed), word
-        )
-
-    def observe_drone(
-        self, drone: Drone, state: RandomizedState, params: EnvParams
-    ) -> list[jax.Array]:
-        """Return the inner environment's observation, with this episode's model."""
-        return self.env.observe_drone(drone, state.inner, self._drawn(state.word, params))
-
-    def advance(
-        self, state: RandomizedState, command: Action, params: EnvParams
-    ) -> tuple[RandomizedState, jax.Array, jax.Array, dict[str, Any]]:
-        """Return the outcome of the inner environment with this episode's model."""
-        inner, reward, terminated, info = self.env.advance(
-            state.inner, command, self._drawn(state.word, params)
-        )
-        return RandomizedState(inner, state.word), reward, terminated, info
+        return self.env.sample_start(seed, self.drawn(self.word(seed), params))
 
 
 def _check_ranges(ranges: RandomizationParams, params: EnvParams, delay_steps: int) -> None:

@@ -20,7 +20,7 @@ from flytrack_env.randomness import Draws, seeds_of
 from flytrack_env.state import Action, Drone
 from flytrack_env.wrappers.camera_view import CameraView
 
-NUM_GATES, NUM_CORNERS = 2, 4
+NUM_CORNERS = 4
 # Latency and time between frames together: 25 frames a second, or 50 that are 20 ms late. Each step
 # remembered costs 0.04 of a plain step.
 MAX_AGE_S = 0.04
@@ -219,15 +219,6 @@ class GateCorners(CameraView):
             *kept["battery"],
         ]
 
-    def view(self, state: CornersState, params: EnvParams) -> list[list[Pixel]]:
-        """Return where the frame that is observed shows the corners, without the detector's errors.
-
-        Per gate, top left, top right, bottom right and bottom left.
-        """
-        pose, _ = self._frame(state, params)
-        sides = ((1.0, 1.0),) * NUM_GATES
-        return self._project(pose, sides, state, params)
-
     def _frame(self, state: CornersState, params: EnvParams) -> tuple[CameraPose, jax.Array]:
         """Return where the camera was when the observed frame was exposed, and its number.
 
@@ -248,28 +239,23 @@ class GateCorners(CameraView):
             )
         return compute_once(pose), frame
 
-    def _project(
-        self, pose: CameraPose, sides: Any, state: CornersState, params: EnvParams
-    ) -> list[list[Pixel]]:
-        """Return the corners of both gates; sides: of each, as ``opening_corners`` takes them."""
+    def _detect(self, state: CornersState, params: EnvParams) -> list[jax.Array]:
+        """Return the detector's rows: per gate the corners' coordinates, then their flags."""
         own, race = self.own_params(params), self.race(state)
+        pose, frame = self._frame(state, params)
+        draws = Draws(compute_once(seeds_of(state.word, frame)))
+        sides = compute_once(_draw_sides(own, draws))
+        scales = compute_once((2.0 / own.width_px, 2.0 / own.height_px))
         axes = compute_once(camera.camera_axes(pose.quat, own.pitch_deg))
         gates = [
             camera.opening_corners(axes, pose.pos_w, gate, *side)
             for gate, side in zip((race.gate, race.next_gate), sides, strict=True)
         ]
-        pixels = [[camera.project(corner, own.lens) for corner in corners] for corners in gates]
-        return compute_once(pixels)
-
-    def _detect(self, state: CornersState, params: EnvParams) -> list[jax.Array]:
-        """Return the detector's rows: per gate the corners' coordinates, then their flags."""
-        own = self.own_params(params)
-        pose, frame = self._frame(state, params)
-        draws = Draws(compute_once(seeds_of(state.word, frame)))
-        sides = compute_once(_draw_sides(own, draws))
-        scales = compute_once((2.0 / own.width_px, 2.0 / own.height_px))
+        pixels_of_gates = compute_once(
+            [[camera.project(corner, own.lens) for corner in corners] for corners in gates]
+        )
         rows: list[jax.Array] = []
-        for gate, pixels in enumerate(self._project(pose, sides, state, params)):
+        for gate, pixels in enumerate(pixels_of_gates):
             missed = _draw_missed(own, draws, gate)
             corners = []
             for index, pixel in enumerate(pixels):

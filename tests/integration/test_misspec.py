@@ -4,6 +4,7 @@ import json
 from collections import Counter
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -41,7 +42,9 @@ def drag():
 
 def test_a_log_drawn_again_is_the_frozen_one(drag):
     assert drag.is_frozen and drag.log.sha256 == SUITE.sha256[drag.id]
-    others = [replace(SHORT, seed=seed).plant("00").log.sha256 for seed in (1, 1, 2)]
+    others = [
+        msgspec.structs.replace(SHORT, seed=seed).plant("00").log.sha256 for seed in (1, 1, 2)
+    ]
     assert others[0] == others[1] != others[2]
 
 

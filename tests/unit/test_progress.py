@@ -25,13 +25,12 @@ def test_lines_come_while_the_work_says_nothing(quick, capsys):
     assert len(lines) >= 3 and set(lines) == {"read 2 files: 00:00 so far"}
 
 
-def test_a_bar_that_is_dropped_writes_no_more(quick):
-    stream = io.StringIO()
-    bar = LineBar("steps", 100, stream=stream)
+def test_a_bar_that_is_dropped_writes_no_more(quick, capsys):
+    bar = LineBar("steps", 100)
     del bar
     gc.collect()
     time.sleep(0.3)
-    assert stream.getvalue() == ""
+    assert capsys.readouterr().err == ""
 
 
 def test_a_bar_that_is_disabled_writes_nothing(quick, capsys):
@@ -45,7 +44,7 @@ def test_a_bar_that_is_disabled_writes_nothing(quick, capsys):
 def test_the_time_left_is_told_once_it_is_known_and_the_clock_does_not_jump(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
-    bar = LineBar("steps", 20_000_000, desc="compile", unit_scale=True, stream=io.StringIO())
+    bar = LineBar("steps", 20_000_000, desc="compile", unit_scale=True)
     now[0] = 20.0
     assert bar.line() == "compile: 0.00 of 20.0M steps, 00:20 so far"
     bar.set_description("train")
@@ -54,7 +53,7 @@ def test_the_time_left_is_told_once_it_is_known_and_the_clock_does_not_jump(monk
     bar.set_postfix_str("return 1.0")
     assert bar.line() == "train: 5.00M of 20.0M steps, 00:30 so far, 00:30 left, return 1.0"
     bar.close()
-    few = LineBar("stages", 5, stream=io.StringIO())
+    few = LineBar("stages", 5)
     few.update(2)
     assert not re.search("left", few.line())
     few.close()

@@ -13,9 +13,9 @@ from benchmarks.published import (
     errors_of,
     held,
     predicted,
-    read_flights,
     start_rows,
 )
+from flytrack_sysid import import_log
 from tests.support.motor_models import crafts
 from tests.support.tables import table
 
@@ -66,7 +66,7 @@ def write(folder, layout, seed, duration_s, noise):
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_layout_is_read_as_it_is_documented(layout, tmp_path):
     path, log = write(tmp_path, layout, 0, 3.0, 0.0)
-    found = read_flights([path], layout)
+    found = import_log(path, "csv", layout)
     assert found.log.has_motors and not found.problems
     rows = np.searchsorted(LAYOUTS[layout][1] * np.arange(len(log)), found.log.time + 1e-9) - 1
     for name in found.log.channels:
@@ -89,7 +89,7 @@ def test_a_layout_is_read_as_it_is_documented(layout, tmp_path):
 def test_the_truth_of_a_dry_run_is_found(layout, tmp_path):
     seconds = 40.0 if layout == "idsia_nanodrone" else 20.0
     train, test = (
-        read_flights([write(tmp_path, layout, seed, length, 0.3)[0]], layout)
+        import_log(write(tmp_path, layout, seed, length, 0.3)[0], "csv", layout)
         for seed, length in ((1, seconds), (2, 10.0))
     )
     result = predicted(train, test)
