@@ -44,6 +44,11 @@ def folder(tmp_path_factory):
     (folder / "folder").mkdir()
     (folder / "file").write_text("")
     (folder / "own.py").write_text(OWN)
+    suite = (
+        (ROOT / "flytrack_bench" / "suites" / "misspec-v1.json").read_text().replace("60.0", "61.0")
+    )
+    (folder / "settings.toml").write_text("[gamma]\nchoice = [0.9]\n")
+    (folder / "changed.json").write_text(suite)
     whole = load_checkpoint(write_checkpoint(folder / "policy.safetensors"))
     meta = {name: value for name, value in whole.meta.items() if name != "model"}
     save_checkpoint(folder / "no_model.safetensors", whole.params, whole.config, meta)

@@ -14,10 +14,8 @@ from flytrack_bench.misspec import Answer, AnswerError, Flights, load_log_suite,
 from flytrack_bench.misspec.answer import diagnose_log, fly_model, log_of
 from flytrack_bench.misspec.door import show
 from flytrack_bench.misspec.suite import LogSuite, draw_all
-from flytrack_bench.suite import FOLDER, SuiteError
 from flytrack_env.motion import Motion
 from flytrack_sysid import load_log
-from tests.support.refusals import refused
 
 MOODY = "tests.support.misspec_methods:moody"
 MOTIONS = {
@@ -193,17 +191,3 @@ def test_predictions_of_another_shape_are_refused():
     flights = Flights(0.01, {"p": np.zeros((2, 101, 3))}, np.zeros((2, 150, 4)))
     with pytest.raises(AnswerError, match=r"predict: found shape \(2, 2\)"):
         Answer(predict=lambda flights: np.zeros((2, 2))).as_json(flights)
-
-
-def test_flags_that_do_not_belong_together_are_refused(capsys, tmp_path):
-    refused(capsys, "bench", "--suite", "v1", "--method", MOODY)
-    refused(capsys, "bench", "--suite", "misspec-v1")
-    refused(capsys, "bench")
-    refused(capsys, "bench", "--policy", "champion", "--limit-s", "9")
-    refused(capsys, "bench", "--suite", "misspec-v1", "--method", MOODY, "--address", "local")
-    refused(capsys, "bench", "--suite", "misspec-v1", "--method", MOODY, "--policy", "champion")
-    with pytest.raises(SuiteError, match="found '60', expected some of 00 to 59"):
-        SUITE.chosen(("60",))
-    path = tmp_path / "changed.json"
-    path.write_text((FOLDER / "misspec-v1.json").read_text().replace("60.0", "61.0"))
-    assert "digest" in refused(capsys, "bench", "--suite", path, "--method", MOODY)
