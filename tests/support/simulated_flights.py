@@ -44,12 +44,13 @@ def flown(
     effects = parameters if type(parameters) is tuple else (parameters,)
     full = model._replace(effects=ALL_NEUTRAL.effects).with_effects(*effects)
     commands = held(1) if commands is None else np.asarray(commands, np.float32)
-    padded = np.zeros((NUM_STEPS, 4), np.float32)
-    padded[: len(commands)] = commands
-    padded[len(commands) :] = commands[-1]
-    return np.asarray(fly(drone_with() if drone is None else drone, padded, full), float)[
-        : len(commands)
-    ]
+    flight = fly(drone_with() if drone is None else drone, padded(commands), full)
+    return np.asarray(flight, float)[: len(commands)]
+
+
+def padded(commands, num_steps=NUM_STEPS):
+    """Return commands of which the last is held, so that all flights are of one program."""
+    return np.pad(commands, ((0, num_steps - len(commands)), (0, 0)), mode="edge")
 
 
 def flown_by(plant, model, start, commands):

@@ -12,7 +12,7 @@ from flytrack_env.motion import Motion
 from flytrack_env.state import Action, unpack
 from tests.support.handout_plant import rotation
 from tests.support.hidden_flights import LOW_START, flown_in_floats, state_of
-from tests.support.simulated_flights import fly
+from tests.support.simulated_flights import fly, padded
 
 MASS, GRAVITY, DRAIN = 1.2, 9.81, 1.3
 TAU = np.array([0.03, 0.05, 0.08, 0.04])
@@ -57,10 +57,11 @@ def flown(model, dt, start=START):
     All flights have one length and the same effects: one program is compiled for a motion.
     """
     commands = np.repeat(held_commands(), round(COMMAND_S / dt), axis=0)
-    padded = np.pad(commands, ((0, LONGEST - len(commands)), (0, 0)), mode="edge")
     full = model._replace(effects=EVERY.effects).with_effects(*model.effects)
     with jax.enable_x64(True):
-        rows = np.asarray(fly(unpack(jnp.asarray(start)), padded, full, dt))[: len(commands)]
+        rows = np.asarray(fly(unpack(jnp.asarray(start)), padded(commands, LONGEST), full, dt))[
+            : len(commands)
+        ]
     return rows[:, :21], rows[:, 21:24], rows[:, 24:27]
 
 
