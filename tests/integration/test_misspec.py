@@ -28,13 +28,16 @@ DRAWN = draw_all(SUITE.seed)
 SHORT = LogSuite("short", "none", SUITE.seed, 4.0, 3.0, dict.fromkeys(("00", "01", "02", "03"), ""))
 
 
-def ids_of(row, noise="sensors"):
-    return [f"{i:02}" for i, drawn in enumerate(DRAWN) if (drawn.row, drawn.noise) == (row, noise)]
+def first_id(**fields):
+    """Return the id of the first plant that was drawn with such fields."""
+    is_such = (fields.items() <= drawn._asdict().items() for drawn in DRAWN)
+    return f"{list(is_such).index(True):02}"
 
 
 @pytest.fixture(scope="module")
 def drag():
-    return SUITE.plant(next(f"{i:02}" for i, one in enumerate(DRAWN) if "linear_drag" in one.names))
+    (number, *_) = (i for i, one in enumerate(DRAWN) if "linear_drag" in one.names)
+    return SUITE.plant(f"{number:02}")
 
 
 def test_a_log_drawn_again_is_the_frozen_one(drag):
@@ -75,9 +78,7 @@ def test_what_a_method_is_given_does_not_hold_the_truth(drag, tmp_path):
 def test_flights_of_clean_plants_end_where_the_nominal_model_flies():
     """In each motion, by NumPy of the rivals and the equations of the hidden drone."""
     for motion, of_package in MOTIONS.items():
-        plant = SHORT.plant(
-            next(f"{i:02}" for i, one in enumerate(DRAWN) if one[1:4:2] == ("clean", motion))
-        )
+        plant = SHORT.plant(first_id(row="clean", motion=motion))
         model = plant.model._replace(motion=of_package)
         ends_w = fly(model, plant.flights, lambda state: np.zeros((2, len(state.thrust), 3)))
         # Of 10 ms by the midpoint rule, where the hidden drone has parts of 1 ms.
@@ -88,15 +89,13 @@ def test_flights_of_clean_plants_end_where_the_nominal_model_flies():
 
 @pytest.mark.slow
 def test_the_packages_free_flight_agrees_and_does_not_see_the_end():
-    plant = SHORT.plant(
-        next(f"{i:02}" for i, one in enumerate(DRAWN) if one[1:4:2] == ("clean", "fine"))
-    )
+    plant = SHORT.plant(first_id(row="clean", motion="fine"))
     ends_w = fly_model(plant.model._replace(motion=Motion.CONTINUOUS), plant.flights)
     assert np.abs(ends_w - plant.ends_w).max() < 1e-3
 
 
 def test_the_distortion_test_flags_drag_and_no_clean_flight(drag):
-    clean = SUITE.plant(ids_of("clean")[0])
+    clean = SUITE.plant(first_id(row="clean", noise="sensors"))
     assert random_distortion(drag.log, drag.model).flagged
     assert not random_distortion(clean.log, clean.model).flagged
 

@@ -100,11 +100,8 @@ def test_right_logs_of_any_noise_contradict_nothing(truth):
     rng = np.random.default_rng(5)
     for seed in range(210):
         start = 150 * (seed % 7)
-        log, factor = truth.select(slice(start, start + 1000)), 10.0 ** rng.uniform(-1.0, 1.0)
-        shaken = noisy(log, seed)
-        channels = {name: log[name] + factor * (shaken[name] - log[name]) for name in log.channels}
-        channels["q"] /= np.linalg.norm(channels["q"], axis=1, keepdims=True)
-        assert find_problems(replace(log, channels=channels)) == [], seed
+        log = truth.select(slice(start, start + 1000))
+        assert find_problems(noisy(log, seed, 10.0 ** rng.uniform(-1.0, 1.0))) == [], seed
 
 
 def test_all_problems_are_listed(logs):

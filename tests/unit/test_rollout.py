@@ -57,7 +57,6 @@ ROWS = npy_bytes(np.zeros((3, 25)))
 BAD_FILES = {
     "cannot be read: ValueError": b"step,x,y,z\n0,1,2,3\n",
     "cannot be read: ValueError: .*75": ROWS[:-8],
-    "found pickled objects": npy_bytes(np.array([[None, None]] * 3, object)),
     "found an array of <U1": npy_bytes(np.full((3, 25), "a")),
     r"found shape \(3, 23\), expected .*\(T, 25\) or \(T, 22\)": npy_bytes(np.zeros((3, 23))),
     r"found shape \(0, 25\), expected .*T >= 1": npy_bytes(np.zeros((0, 25))),
