@@ -1,10 +1,12 @@
 """Random logs, and their columns in files, right or wrong."""
 
+import io
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from flytrack_sysid import load_log, save_log
 from flytrack_sysid.log import CHANNELS, FlightLog
 
 MAPPINGS = Path(__file__).with_name("mappings")
@@ -49,6 +51,26 @@ def write(path, columns):
     rows = zip(*(np.asarray(values).tolist() for values in columns.values()), strict=True)
     lines = [",".join(columns), *(",".join(map(str, row)) for row in rows)]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def npy_bytes(array):
+    """Return one array as a file."""
+    content = io.BytesIO()
+    np.save(content, array)
+    return content.getvalue()
+
+
+def npz_bytes(arrays):
+    """Return arrays as a compressed archive."""
+    content = io.BytesIO()
+    np.savez_compressed(content, **arrays)
+    return content.getvalue()
+
+
+def through_file(log, path):
+    """Return a log as its file has it."""
+    save_log(path, log)
+    return load_log(path)
 
 
 def assert_same_log(found, expected):

@@ -1,6 +1,5 @@
 """Rollout files: what is written comes back, and everything else is refused with a reason."""
 
-import io
 import tracemalloc
 
 import numpy as np
@@ -9,6 +8,7 @@ from numpy.testing import assert_array_equal
 
 from flytrack_env.rollout import RolloutError, load_rollout, save_rollout
 from tests.support.recordings import make_sequence
+from tests.support.written_logs import npy_bytes
 
 
 def make_flight(steps):
@@ -26,12 +26,6 @@ def test_round_trip_is_exact(tmp_path, steps):
         assert array.dtype == np.float32
     rows = np.load(tmp_path / "flight", allow_pickle=False)
     assert_array_equal(rows, np.hstack([states, actions]))
-
-
-def npy_bytes(array):
-    content = io.BytesIO()
-    np.save(content, array)
-    return content.getvalue()
 
 
 def rows_with(value):
