@@ -15,6 +15,7 @@ from flytrack_env.dynamics import step
 from flytrack_env.effects import WIND, CommandDelay, LinearDrag, QuadraticDrag
 from flytrack_env.model_file import model_from_json
 from flytrack_env.motion import Motion
+from flytrack_env.thrust import collective_thrust
 from flytrack_loop import adapt as adapting
 from flytrack_loop.adapt import Adapted, FlightResults, Settings, adapt, describe_adapted, embed
 from flytrack_sysid import LogError
@@ -35,10 +36,9 @@ STICKS = np.linspace(-1.0, 1.0, 9)
 FULL_V = 24.0
 
 
-def thrust(coeffs, stick, volt=FULL_V):
-    """The handout's thrust map."""
-    powers = [np.ones_like(stick), stick, stick**2, stick**3, volt + 0.0 * stick, volt * stick]
-    return np.stack(powers, axis=-1) @ np.asarray(coeffs, float)
+def thrust(coeffs, stick):
+    """Return the thrust of a map at full voltage."""
+    return collective_thrust(stick, FULL_V, coeffs)
 
 
 def diagnosis(extended, joint=Joint(), causes=(CAUSE,), unexplained=Unexplained()):  # noqa: B008
