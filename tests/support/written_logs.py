@@ -35,6 +35,13 @@ def with_channels(log, **channels):
     return replace(log, channels={**log.channels, **channels})
 
 
+def held_still(log, names):
+    """Return a log of which some channels stay as they are in its first row."""
+    return with_channels(
+        log, **{name: np.repeat(log[name][:1], len(log), axis=0) for name in names}
+    )
+
+
 def columns_of(log):
     """Return the columns of a log's file, by name."""
     columns = {"t": log.time.copy(), "segment": log.segment.copy()}
