@@ -32,9 +32,9 @@ from flytrack_sysid.check.frames import (
 from flytrack_sysid.check.pairs import AGREES, CONTRADICTS, MANOEUVRES, STILL, compare_pairs
 from flytrack_sysid.check.samples import sample_changes
 from flytrack_sysid.check.thrust import motor_changes, thrust_changes
-from flytrack_sysid.log import FlightLog
 from tests.support.compiling import programs
 from tests.support.hidden_flights import scripted
+from tests.support.made_flight import noisy
 from tests.support.slow import slow_but
 from tests.support.written_logs import held_still, with_channels
 
@@ -95,17 +95,11 @@ def test_reading_of_a_quaternion_undoes_how_it_was_logged(number):
 
 
 @pytest.fixture(scope="module")
-def planar():
+def planar(truth):
     """Position and velocity of a motion along x and y, with noise."""
-    rng, time = np.random.default_rng(3), 0.01 * np.arange(2000)
-    vel = np.stack([2.0 * np.sin(1.3 * time), 1.5 * np.cos(0.9 * time), 0.0 * time], axis=1)
-    pos = np.cumsum(0.01 * vel, axis=0)
-    channels = {
-        "u": np.zeros((len(time), 4)),
-        "p": pos + rng.normal(0.0, 0.005, pos.shape),
-        "v": vel + rng.normal(0.0, 0.02, vel.shape),
-    }
-    return FlightLog(time, channels, np.zeros(len(time), int))
+    flat = {name: truth[name] * [1.0, 1.0, 0.0] for name in ("p", "v")}
+    log = noisy(with_channels(truth, u=0.0 * truth["u"], **flat), seed=3)
+    return log.without("q", "w", "f", "v_bat")
 
 
 def position_pair(log):
