@@ -8,11 +8,16 @@ import pytest
 from tests.support.black_boxes import random_inputs
 
 
-def make_sequence(steps):
-    """Return a random flight as pairs of state (21,) and action (4,), float32."""
+def make_flight(steps):
+    """Return a random flight: states (T, 21) and actions (T, 4), float32."""
     states, actions = random_inputs(steps, seed=7)
     states[:, 0:3] = np.cumsum(0.1 * states[:, 0:3], axis=0)
-    return list(zip(states, actions, strict=True))
+    return states, actions
+
+
+def make_sequence(steps):
+    """Return the same as pairs of state and action."""
+    return list(zip(*make_flight(steps), strict=True))
 
 
 class Recording:

@@ -7,13 +7,8 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from flytrack_env.rollout import RolloutError, load_rollout, save_rollout
-from tests.support.recordings import make_sequence
+from tests.support.recordings import make_flight
 from tests.support.written_logs import npy_bytes
-
-
-def make_flight(steps):
-    """Return random states (T, 21) and actions (T, 4), float32."""
-    return tuple(map(np.stack, zip(*make_sequence(steps), strict=True)))
 
 
 @pytest.mark.parametrize("steps", [1, 300])
