@@ -37,7 +37,7 @@ from flytrack_sysid.manoeuvres import MANOEUVRES
 from tests.support import black_boxes
 from tests.support.foreign_logs import WRITERS, flying, write_csv
 from tests.support.slow import slow_but
-from tests.support.written_logs import read_mapping
+from tests.support.written_logs import npy_bytes, npz_bytes, read_mapping
 
 CPU_S, MAX_MESSAGE_LENGTH, NUM_FILES, NUM_SLOW_FILES = 10.0, 2000, 60, 3
 TOKENS = (
@@ -102,20 +102,6 @@ def imported(kind, suffix, is_slow=True, **options):
     return Kind(suffix, save, load, LogError, is_slow=is_slow, **options)
 
 
-def npz(arrays):
-    """Return arrays as a compressed archive."""
-    content = io.BytesIO()
-    np.savez_compressed(content, **arrays)
-    return content.getvalue()
-
-
-def npy(array):
-    """Return one array as a file."""
-    content = io.BytesIO()
-    np.save(content, array)
-    return content.getvalue()
-
-
 def hostile_arrays(content):
     """Return archives with pickles, arrays of other sizes than declared, and bombs."""
     arrays = dict(np.load(io.BytesIO(content)))
@@ -125,13 +111,13 @@ def hostile_arrays(content):
         np.zeros(2**27, np.int8),
         np.full(8, 2**31 - 1, np.int32).view("<U1"),
     )
-    odd_arrays = [npz({**arrays, name: value}) for value in odd]
-    header = npz(arrays).replace(b"'shape': (", b"'shape': (9")
+    odd_arrays = [npz_bytes({**arrays, name: value}) for value in odd]
+    header = npz_bytes(arrays).replace(b"'shape': (", b"'shape': (9")
     version = content.replace(b"\x93NUMPY\x01", b"\x93NUMPY\x02")
     unannounced = io.BytesIO()
     with zipfile.ZipFile(unannounced, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr(f"{name}.npy", npy(arrays[name]) + bytes(2**28))
-        archive.getinfo(f"{name}.npy").file_size = len(npy(arrays[name]))
+        archive.writestr(f"{name}.npy", npy_bytes(arrays[name]) + bytes(2**28))
+        archive.getinfo(f"{name}.npy").file_size = len(npy_bytes(arrays[name]))
     return [*odd_arrays, header, content + content, version, unannounced.getvalue()]
 
 
@@ -226,7 +212,7 @@ def damaged_arrays(draw, valid):
     changed.flat[draw(st.integers(0, other.size - 1))] = draw(st.floats())
     odd = [changed, other[:-1], other[None], other.astype(np.int8), np.float64(1.0)]
     new = draw(st.none() | st.sampled_from(odd))
-    return npz(
+    return npz_bytes(
         arrays if new is None else {**arrays, draw(st.sampled_from([name, "../other"])): new}
     )
 

@@ -219,10 +219,12 @@ def test_copies_fly_on_alike_and_apart(is_vector):
     action = np.full(env.action_space.shape, 0.2, np.float32)
     env.step(action)
     copies = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
-    flown = np.stack([*(env.step(action)[0] for _ in range(3)), env.reset()[0]])
-    for copied in copies:
-        again = np.stack([*(copied.step(action)[0] for _ in range(3)), copied.reset()[0]])
-        assert_array_equal(again, flown)
+    flown, *again = (
+        np.stack([*(each.step(action)[0] for _ in range(3)), each.reset()[0]])
+        for each in (env, *copies)
+    )
+    for each in again:
+        assert_array_equal(each, flown)
 
 
 # --- Options of reset ---------------------------------------------------------------------------

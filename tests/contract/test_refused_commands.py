@@ -18,7 +18,7 @@ from flytrack_sysid import save_log
 from tests.support.evaluated import write_checkpoint
 from tests.support.handout_plant import HandoutPlant, excited
 from tests.support.pages import ROOT
-from tests.support.recordings import make_sequence
+from tests.support.recordings import make_flight
 from tests.support.refusals import refused
 from tests.support.tables import table
 from tests.support.written_logs import with_channels
@@ -44,12 +44,16 @@ def folder(tmp_path_factory):
     (folder / "folder").mkdir()
     (folder / "file").write_text("")
     (folder / "own.py").write_text(OWN)
+    suite = (
+        (ROOT / "flytrack_bench" / "suites" / "misspec-v1.json").read_text().replace("60.0", "61.0")
+    )
+    (folder / "settings.toml").write_text("[gamma]\nchoice = [0.9]\n")
+    (folder / "changed.json").write_text(suite)
     whole = load_checkpoint(write_checkpoint(folder / "policy.safetensors"))
     meta = {name: value for name, value in whole.meta.items() if name != "model"}
     save_checkpoint(folder / "no_model.safetensors", whole.params, whole.config, meta)
     save_track(folder / "random.toml", random_track(0))
-    states, actions = (np.stack(part) for part in zip(*make_sequence(3), strict=True))
-    save_rollout(folder / "flight.npy", states, actions)
+    save_rollout(folder / "flight.npy", *make_flight(3))
     np.save(folder / "pickled.npy", np.array([[None, None]] * 3, object), allow_pickle=True)
     log = excited(HandoutPlant())
     wrong = with_channels(log, w=np.rad2deg(log["w"]))

@@ -1,13 +1,11 @@
 """Scripts: manoeuvres, files, the flights that a diagnosis asks for, and collecting them."""
 
-import io
 import json
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from flytrack.cli import main
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid import collect, load_log
 from flytrack_sysid.diagnosis.identifiability import CHUNKS_PER_MANOEUVRE, next_flight
@@ -23,7 +21,9 @@ from flytrack_sysid.script_file import (
 )
 from tests.support.black_boxes import SHIPPED
 from tests.support.handout_plant import HandoutPlant
+from tests.support.refusals import run
 from tests.support.tables import table
+from tests.support.written_logs import npz_bytes
 
 HOVER = hover_action(HandoutPlant().model())
 
@@ -90,10 +90,8 @@ BAD = {
 def test_bad_scripts_are_refused(tmp_path, message):
     script = made("headings")
     arrays = {"kinds": np.array(script.kinds), "starts": script.starts, "commands": script.commands}
-    buffer = io.BytesIO()
-    np.savez(buffer, **{**arrays, **BAD[message]})
     path = tmp_path / "bad.npz"
-    path.write_bytes(buffer.getvalue())
+    path.write_bytes(npz_bytes({**arrays, **BAD[message]}))
     with pytest.raises(ScriptError, match=f"bad.npz: .*{message}"):
         load_script(path)
 
@@ -130,13 +128,11 @@ def test_what_is_no_diagnosis_is_refused(tmp_path, content, message):
 
 def test_commands_plan_and_collect(tmp_path, capsys):
     (tmp_path / "diagnosis.json").write_text(json.dumps(asked(("ground_effect", "low_passes"))))
-    main(["plan", str(tmp_path / "diagnosis.json"), "--out", str(tmp_path / "flight.npz")])
+    script, log = tmp_path / "flight.npz", tmp_path / "log.npz"
+    run("plan", tmp_path / "diagnosis.json", "--out", script)
     assert "low_passes: to settle ground_effect" in capsys.readouterr().out
-    script, log = str(tmp_path / "flight.npz"), tmp_path / "log.npz"
-    main(["collect", "--black-box", str(SHIPPED), "--script", script, "--out", str(log)])
+    run("collect", "--black-box", SHIPPED, "--script", script, "--out", log)
     assert load_log(log)["p"][:, 2].max() < HEIGHTS[0]
     with pytest.raises(SystemExit):
-        main(
-            ["collect", "--black-box", "x", "--script", script, "--minutes", "3", "--out", str(log)]
-        )
+        run("collect", "--black-box", "x", "--script", script, "--minutes", 3, "--out", log)
     assert "not allowed together" in capsys.readouterr().err

@@ -10,14 +10,13 @@ from numpy.testing import assert_allclose
 from baselines.purejaxrl_ppo import load_checkpoint
 from benchmarks import suite as drawn
 from benchmarks.champion import CHAMPION
-from flytrack.cli import main
 from flytrack_bench import Data, DataError, cli, load_policy, load_suite, results, retrain
 from flytrack_bench.policies import Function, Policy, PolicyError
 from flytrack_bench.suite import FOLDER, digest_of
 from flytrack_env.jobs import ClusterError, Outcome
 from flytrack_env.tracks import TrackError, load_track
 from flytrack_loop.adapt import Adapted
-from tests.support.refusals import refused
+from tests.support.refusals import refused, run
 from tests.support.small_suite import CENTRED, hover, write_small_suite
 
 
@@ -48,17 +47,17 @@ def test_the_suite_is_what_its_seed_draws(tmp_path):
 
 
 def test_a_result_repeats_and_is_verified_and_a_forged_one_is_not(small, tmp_path, capsys):
-    out, command = tmp_path / "result.json", ["bench", "--policy", CENTRED, "--suite", str(small)]
-    main([*command, "--out", str(out)])
+    out, command = tmp_path / "result.json", ["bench", "--policy", CENTRED, "--suite", small]
+    run(*command, "--out", out)
     result = json.loads(out.read_text())
     assert all(
         flight["success"] == 0.0 for flights in result["tasks"].values() for flight in flights
     )
-    main([*command, "--verify", str(out)])
+    run(*command, "--verify", out)
     result["tasks"]["flytrack"][0] |= {"success": 1.0, "flying_lap_s": 3.9}
     out.write_text(json.dumps(result))
     with pytest.raises(SystemExit, match="1"):
-        main([*command, "--verify", str(out)])
+        run(*command, "--verify", out)
     assert "flytrack, policy 0" in capsys.readouterr().out
     refused(capsys, *command, "--out", out)  # never overwritten
 

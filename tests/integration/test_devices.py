@@ -13,7 +13,6 @@ import pytest
 
 from baselines.purejaxrl_ppo import Config, devices, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import as_named_arrays
-from baselines.purejaxrl_ppo.train_ppo import main
 
 BATCH = 16 * 24
 SMALL = "--num-envs 16 --num-steps 24 --num-minibatches 4 --hidden-sizes 8 --evaluate-every 0"
@@ -29,20 +28,6 @@ def test_a_batch_that_devices_do_not_divide_is_refused():
         devices.check_divides(few, mesh)
     with pytest.raises(ValueError, match="--devices: found 99, expected 1 to"):
         devices.make_mesh(99)
-
-
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (["--devices", "no"], "--devices: found 'no', expected a number from 1, or all"),
-        (["--num-processes", "2"], "--num-processes and --process: found without --coordinator"),
-    ],
-)
-def test_devices_that_cannot_be_meant_are_refused(flags, message, capsys):
-    with pytest.raises(SystemExit) as left:
-        main(flags)
-    assert left.value.code == 2
-    assert message in capsys.readouterr().err
 
 
 def test_a_coordinator_that_is_none_is_refused(monkeypatch):

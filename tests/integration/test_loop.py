@@ -18,6 +18,7 @@ from flytrack_env import nominal_parameters
 from flytrack_loop import Gap, errors_of, fly_log, race
 from flytrack_loop.stages import log_of_flights, measure_gap
 from flytrack_sysid import save_log
+from tests.support.handout_plant import states_of
 
 
 @pytest.fixture(scope="module")
@@ -38,8 +39,7 @@ def log(flights):
 def test_the_log_is_what_the_plant_did(log, fly_black_box):
     assert 11.0 <= len(log) * 0.01 < 11.0 + 4.5
     row = 200
-    state = np.concatenate([log[name][row] for name in ("p", "v", "a", "q", "w", "uprev", "v_bat")])
-    after = fly_black_box(state.astype(np.float32), log["u"][row].astype(np.float32))
+    after = fly_black_box(states_of(log)[row].astype(np.float32), log["u"][row].astype(np.float32))
     assert_allclose(log["p"][row + 1], after[:3], atol=1e-5)
     assert_allclose(log["w"][row + 1], after[13:16], atol=1e-4)
 

@@ -15,10 +15,8 @@ from flytrack_bench.misspec import Answer, AnswerError, Flights, load_log_suite,
 from flytrack_bench.misspec.answer import diagnose_log, fly_model, log_of
 from flytrack_bench.misspec.door import show
 from flytrack_bench.misspec.suite import LogSuite, draw_all
-from flytrack_bench.suite import FOLDER, SuiteError
 from flytrack_env.motion import Motion
 from flytrack_sysid import load_log
-from tests.support.refusals import refused
 
 MOODY = "tests.support.misspec_methods:moody"
 MOTIONS = {
@@ -31,13 +29,16 @@ DRAWN = draw_all(SUITE.seed)
 SHORT = LogSuite("short", "none", SUITE.seed, 4.0, 3.0, dict.fromkeys(("00", "01", "02", "03"), ""))
 
 
-def ids_of(row, noise="sensors"):
-    return [f"{i:02}" for i, drawn in enumerate(DRAWN) if (drawn.row, drawn.noise) == (row, noise)]
+def first_id(**fields):
+    """Return the id of the first plant that was drawn with such fields."""
+    is_such = (fields.items() <= drawn._asdict().items() for drawn in DRAWN)
+    return f"{list(is_such).index(True):02}"
 
 
 @pytest.fixture(scope="module")
 def drag():
-    return SUITE.plant(next(f"{i:02}" for i, one in enumerate(DRAWN) if "linear_drag" in one.names))
+    (number, *_) = (i for i, one in enumerate(DRAWN) if "linear_drag" in one.names)
+    return SUITE.plant(f"{number:02}")
 
 
 def test_a_log_drawn_again_is_the_frozen_one(drag):
@@ -80,9 +81,7 @@ def test_what_a_method_is_given_does_not_hold_the_truth(drag, tmp_path):
 def test_flights_of_clean_plants_end_where_the_nominal_model_flies():
     """In each motion, by NumPy of the rivals and the equations of the hidden drone."""
     for motion, of_package in MOTIONS.items():
-        plant = SHORT.plant(
-            next(f"{i:02}" for i, one in enumerate(DRAWN) if one[1:4:2] == ("clean", motion))
-        )
+        plant = SHORT.plant(first_id(row="clean", motion=motion))
         model = plant.model._replace(motion=of_package)
         ends_w = fly(model, plant.flights, lambda state: np.zeros((2, len(state.thrust), 3)))
         # Of 10 ms by the midpoint rule, where the hidden drone has parts of 1 ms.
@@ -93,15 +92,13 @@ def test_flights_of_clean_plants_end_where_the_nominal_model_flies():
 
 @pytest.mark.slow
 def test_the_packages_free_flight_agrees_and_does_not_see_the_end():
-    plant = SHORT.plant(
-        next(f"{i:02}" for i, one in enumerate(DRAWN) if one[1:4:2] == ("clean", "fine"))
-    )
+    plant = SHORT.plant(first_id(row="clean", motion="fine"))
     ends_w = fly_model(plant.model._replace(motion=Motion.CONTINUOUS), plant.flights)
     assert np.abs(ends_w - plant.ends_w).max() < 1e-3
 
 
 def test_the_distortion_test_flags_drag_and_no_clean_flight(drag):
-    clean = SUITE.plant(ids_of("clean")[0])
+    clean = SUITE.plant(first_id(row="clean", noise="sensors"))
     assert random_distortion(drag.log, drag.model).flagged
     assert not random_distortion(clean.log, clean.model).flagged
 
@@ -196,17 +193,3 @@ def test_predictions_of_another_shape_are_refused():
     flights = Flights(0.01, {"p": np.zeros((2, 101, 3))}, np.zeros((2, 150, 4)))
     with pytest.raises(AnswerError, match=r"predict: found shape \(2, 2\)"):
         Answer(predict=lambda flights: np.zeros((2, 2))).as_json(flights)
-
-
-def test_flags_that_do_not_belong_together_are_refused(capsys, tmp_path):
-    refused(capsys, "bench", "--suite", "v1", "--method", MOODY)
-    refused(capsys, "bench", "--suite", "misspec-v1")
-    refused(capsys, "bench")
-    refused(capsys, "bench", "--policy", "champion", "--limit-s", "9")
-    refused(capsys, "bench", "--suite", "misspec-v1", "--method", MOODY, "--address", "local")
-    refused(capsys, "bench", "--suite", "misspec-v1", "--method", MOODY, "--policy", "champion")
-    with pytest.raises(SuiteError, match="found '60', expected some of 00 to 59"):
-        SUITE.chosen(("60",))
-    path = tmp_path / "changed.json"
-    path.write_text((FOLDER / "misspec-v1.json").read_text().replace("60.0", "61.0"))
-    assert "digest" in refused(capsys, "bench", "--suite", path, "--method", MOODY)

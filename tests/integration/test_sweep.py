@@ -11,10 +11,8 @@ import pytest
 from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.config import ConfigError
 from baselines.purejaxrl_ppo.sweep import (
-    Flags,
     check_is_shared,
     make_scheduler,
-    prepare,
     read_settings,
 )
 
@@ -62,17 +60,6 @@ def test_settings_that_cannot_be_used_are_refused(tmp_path, text, message):
     with pytest.raises(ConfigError, match=message) as error:
         read_settings(written(tmp_path, text))
     assert "settings.toml" in str(error.value)
-
-
-def test_what_no_trial_could_use_is_refused_before_any(tmp_path):
-    path = written(tmp_path, GRID)
-    for flags, message in (
-        (Flags(path, trials=0, out=tmp_path), "--trials: found 0"),
-        (Flags(path, out=tmp_path, resume=True), "found none: leave --resume out"),
-        (Flags(path, out=tmp_path, track="nowhere"), "nowhere"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            prepare(flags)
 
 
 def test_a_node_that_does_not_see_the_folder_says_so(tmp_path):

@@ -12,7 +12,8 @@ from benchmarks.time_optimal import replay
 from flytrack_env import available_tracks, load_track, nominal_parameters, references
 from flytrack_env.dynamics import step
 from flytrack_env.effects import EFFECTS
-from flytrack_env.state import BATTERY, POSITION, QUATERNION, STATE_SIZE, VELOCITY
+from flytrack_env.state import POSITION, STATE_SIZE, VELOCITY
+from tests.support.black_boxes import random_inputs
 from tests.support.slow import slow_but
 
 SHIPPED = sorted(references.FOLDER.glob("*.npz"))
@@ -34,14 +35,8 @@ def test_the_symbolic_step_is_the_simulators():
     with jax.enable_x64(True):
         exact = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
         simulated = jax.jit(lambda x, u, dt: step(x, u, dt, exact))
-        for _ in range(100):
-            x, u, dt = (
-                rng.normal(size=STATE_SIZE),
-                rng.uniform(-1.0, 1.0, 4),
-                rng.uniform(0.002, 0.04),
-            )
-            x[QUATERNION] /= np.linalg.norm(x[QUATERNION])
-            x[16:20], x[BATTERY] = rng.uniform(-1.0, 1.0, 4), rng.uniform(22.0, 24.0)
+        for x, u in zip(*(rows.astype(float) for rows in random_inputs(100)), strict=True):
+            dt = rng.uniform(0.002, 0.04)
             assert_allclose(
                 traced(x, u, dt).full()[:, 0], simulated(x, u, dt), rtol=0.0, atol=EXACT
             )

@@ -43,10 +43,8 @@ def test_flags_override_the_file_and_the_file_the_defaults(tmp_path):
     assert train_ppo.parse_rewards(settings.reward) == {"progress": 2.0}
 
 
-def test_a_device_chooses_the_recipe_and_must_be_there(monkeypatch, whole, capsys):
+def test_a_device_chooses_the_recipe(monkeypatch, whole):
     assert read("--device", "cpu")[0].hyperparameters == Config()
-    assert call("--device", "gpu") == 2
-    assert "--device: found JAX on the cpu, expected gpu" in capsys.readouterr().err
     monkeypatch.setattr(train_ppo.jax, "default_backend", lambda: "gpu")
     settings, *_ = read("--device", "gpu", "--num-minibatches", 64)
     assert settings.hyperparameters == replace(RECIPES["gpu"], num_minibatches=64)

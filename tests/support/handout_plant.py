@@ -73,6 +73,12 @@ def rotation(quat):
     return matrices.reshape(*quat.shape[:-1], 3, 3)
 
 
+def states_of(log):
+    """Return the states of a log that has all of them, (num_rows, 21)."""
+    names = ("p", "v", "a", "q", "w", "uprev", "v_bat")
+    return np.concatenate([log[name] for name in names], axis=1)
+
+
 def excited(plant, skip=1, repeat=1, jitter=0.0):
     """Return the log of the excitation on a plant, float64, without noise.
 

@@ -47,12 +47,12 @@ def flight(time, late_q_s=0.0, late_v_s=0.0, late_p_s=0.0):
 TIME_S = 0.01 * np.arange(2000)
 
 
-def noisy(log, seed):
-    """Return a log as sensors would have it."""
+def noisy(log, seed, factor=1.0):
+    """Return a log as sensors would have it, with a factor of the usual noise."""
     rng = np.random.default_rng(seed)
     sizes = {"w": 0.05, "f": 0.5, "v": 0.02, "p": 0.005, "q": 0.002}
     channels = {
-        name: values + sizes.get(name, 0.0) * rng.standard_normal(values.shape)
+        name: values + factor * sizes.get(name, 0.0) * rng.standard_normal(values.shape)
         for name, values in log.channels.items()
     }
     channels["q"] /= np.linalg.norm(channels["q"], axis=1, keepdims=True)

@@ -5,15 +5,19 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
+from tests.support.black_boxes import random_inputs
+
+
+def make_flight(steps):
+    """Return a random flight: states (T, 21) and actions (T, 4), float32."""
+    states, actions = random_inputs(steps, seed=7)
+    states[:, 0:3] = np.cumsum(0.1 * states[:, 0:3], axis=0)
+    return states, actions
+
 
 def make_sequence(steps):
-    """Return a random flight as pairs of state (21,) and action (4,), float32."""
-    rng = np.random.default_rng(7)
-    states = rng.normal(size=(steps, 21))
-    states[:, 0:3] = np.cumsum(0.1 * states[:, 0:3], axis=0)
-    states[:, 9:13] /= np.linalg.norm(states[:, 9:13], axis=1, keepdims=True)
-    actions = rng.uniform(-1, 1, (steps, 4))
-    return list(zip(states.astype(np.float32), actions.astype(np.float32), strict=True))
+    """Return the same as pairs of state and action."""
+    return list(zip(*make_flight(steps), strict=True))
 
 
 class Recording:

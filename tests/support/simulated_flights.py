@@ -5,13 +5,22 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_env.dynamics import move, nominal_parameters, read_sensors, sensed
+from flytrack_env.dynamics import ModelParameters, move, nominal_parameters, read_sensors, sensed
 from flytrack_env.effects import EFFECTS, MAX_DELAY_STEPS
 from flytrack_env.plants import Simulator, SimulatorState
 from flytrack_env.state import BATTERY, QUATERNION, Action, pack, unpack, unpack_action
 
 DT, NUM_STEPS = 0.01, 200
 NOMINAL = nominal_parameters()
+# In float64, and no number as another.
+UNEVEN = ModelParameters(
+    tau=np.array([0.03, 0.05, 0.08, 0.04]),
+    thrust_coeffs=np.array([-9.0, -6.0, 3.1, 0.4, 0.9, 1.1]),
+    max_rate=np.array([600.0, 500.0, 130.0]),
+    m=1.2,
+    g=9.81,
+    battery_drain_v_per_min=1.3,
+)
 # Neutral effects change no bit (tests/contract/test_effects.py), so that a test may replace any of
 # them.
 ALL_NEUTRAL = NOMINAL.with_effects(*(effect.parameters() for effect in EFFECTS))
@@ -44,12 +53,13 @@ def flown(
     effects = parameters if type(parameters) is tuple else (parameters,)
     full = model._replace(effects=ALL_NEUTRAL.effects).with_effects(*effects)
     commands = held(1) if commands is None else np.asarray(commands, np.float32)
-    padded = np.zeros((NUM_STEPS, 4), np.float32)
-    padded[: len(commands)] = commands
-    padded[len(commands) :] = commands[-1]
-    return np.asarray(fly(drone_with() if drone is None else drone, padded, full), float)[
-        : len(commands)
-    ]
+    flight = fly(drone_with() if drone is None else drone, padded(commands), full)
+    return np.asarray(flight, float)[: len(commands)]
+
+
+def padded(commands, num_steps=NUM_STEPS):
+    """Return commands of which the last is held, so that all flights are of one program."""
+    return np.pad(commands, ((0, num_steps - len(commands)), (0, 0)), mode="edge")
 
 
 def flown_by(plant, model, start, commands):

@@ -1,10 +1,12 @@
 """Random logs, and their columns in files, right or wrong."""
 
+import io
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from flytrack_sysid import load_log, save_log
 from flytrack_sysid.log import CHANNELS, FlightLog
 
 MAPPINGS = Path(__file__).with_name("mappings")
@@ -33,6 +35,13 @@ def with_channels(log, **channels):
     return replace(log, channels={**log.channels, **channels})
 
 
+def held_still(log, names):
+    """Return a log of which some channels stay as they are in its first row."""
+    return with_channels(
+        log, **{name: np.repeat(log[name][:1], len(log), axis=0) for name in names}
+    )
+
+
 def columns_of(log):
     """Return the columns of a log's file, by name."""
     columns = {"t": log.time.copy(), "segment": log.segment.copy()}
@@ -49,6 +58,26 @@ def write(path, columns):
     rows = zip(*(np.asarray(values).tolist() for values in columns.values()), strict=True)
     lines = [",".join(columns), *(",".join(map(str, row)) for row in rows)]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def npy_bytes(array):
+    """Return one array as a file."""
+    content = io.BytesIO()
+    np.save(content, array)
+    return content.getvalue()
+
+
+def npz_bytes(arrays):
+    """Return arrays as a compressed archive."""
+    content = io.BytesIO()
+    np.savez_compressed(content, **arrays)
+    return content.getvalue()
+
+
+def through_file(log, path):
+    """Return a log as its file has it."""
+    save_log(path, log)
+    return load_log(path)
 
 
 def assert_same_log(found, expected):

@@ -15,6 +15,7 @@ from flytrack_env.dynamics import step
 from flytrack_env.effects import WIND, CommandDelay, LinearDrag, QuadraticDrag
 from flytrack_env.model_file import model_from_json
 from flytrack_env.motion import Motion
+from flytrack_env.thrust import collective_thrust
 from flytrack_loop import adapt as adapting
 from flytrack_loop.adapt import Adapted, FlightResults, Settings, adapt, describe_adapted, embed
 from flytrack_sysid import LogError
@@ -35,10 +36,9 @@ STICKS = np.linspace(-1.0, 1.0, 9)
 FULL_V = 24.0
 
 
-def thrust(coeffs, stick, volt=FULL_V):
-    """The handout's thrust map."""
-    powers = [np.ones_like(stick), stick, stick**2, stick**3, volt + 0.0 * stick, volt * stick]
-    return np.stack(powers, axis=-1) @ np.asarray(coeffs, float)
+def thrust(coeffs, stick):
+    """Return the thrust of a map at full voltage."""
+    return collective_thrust(stick, FULL_V, coeffs)
 
 
 def diagnosis(extended, joint=Joint(), causes=(CAUSE,), unexplained=Unexplained()):  # noqa: B008
@@ -52,6 +52,11 @@ def seen_at(sticks, std_n):
     return np.linalg.inv(rows.T @ rows / std_n**2 + 1e-6 * np.eye(6))
 
 
+def drawn_by(draw, count):
+    """Return that many draws."""
+    return jax.vmap(draw)(jax.random.split(jax.random.key(1), count))
+
+
 def test_only_thrust_that_was_flown_is_the_logs():
     flown = np.linspace(0.6, 1.0, 9)
     truth = np.asarray(NOMINAL.thrust_coeffs, float)
@@ -63,7 +68,7 @@ def test_only_thrust_that_was_flown_is_the_logs():
     mean = np.asarray(models.model.thrust_coeffs, float)
     assert_allclose(thrust(mean, flown), thrust(1.1 * fitted, flown), atol=0.2)
     assert_allclose(thrust(mean, STICKS), 1.1 * thrust(truth, STICKS), atol=1.5)
-    drawn = jax.vmap(models.draw)(jax.random.split(jax.random.key(0), 400))
+    drawn = drawn_by(models.draw, 400)
     maps = np.asarray(drawn.thrust_coeffs, float)
     spread = np.std([thrust(one, STICKS) for one in maps], axis=0)
     assert spread[-1] < 0.1 < 0.5 < spread[0] < 5.0
@@ -74,13 +79,13 @@ def test_draws_have_the_covariance_of_the_log_and_stay_in_range():
     names = ("tau_roll", "linear_drag.d_x", "linear_drag.d_y")
     covariance = np.array([[1e-6, 0.0, 0.0], [0.0, 4e-4, 3e-4], [0.0, 3e-4, 4e-4]])
     models = find_plausible_models(diagnosis(DRAG, Joint(names, covariance)))
-    drawn = jax.vmap(models.draw_vector)(jax.random.split(jax.random.key(1), 4000))
+    drawn = drawn_by(models.draw_vector, 4000)
     own = np.asarray(drawn, float)[:, [names_of(DRAG).index(name) for name in names]]
     assert_allclose(own.mean(axis=0), [NOMINAL.tau[0], 0.3, 0.2], atol=2e-3)
     assert_allclose(np.cov(own.T), covariance, atol=3e-5)
     late = Joint(("command_delay.delay_s",), np.array([[1e-4]]))
     wide = find_plausible_models(diagnosis(NOMINAL.with_effects(CommandDelay(0.005)), late))
-    delays_s = jax.vmap(wide.draw)(jax.random.split(jax.random.key(1), 50)).effects[0].delay_s
+    delays_s = drawn_by(wide.draw, 50).effects[0].delay_s
     assert delays_s.min() == 0.0 < 0.02 < delays_s.max()
 
 
@@ -92,7 +97,7 @@ def test_a_drain_that_no_cause_names_is_that_of_the_model(cause, drain):
         diagnosis(extended, joint, (CAUSE, replace(CAUSE, effect=cause)))
     )
     assert models.model.battery_drain_v_per_min == drain
-    drawn = jax.vmap(models.draw)(jax.random.split(jax.random.key(2), 50))
+    drawn = drawn_by(models.draw, 50)
     assert (np.std(drawn.battery_drain_v_per_min) > 0.1) == (cause == "battery_drain")
 
 

@@ -9,7 +9,7 @@ from flytrack_env.state import APPLIED_ACTION, RATES, Action
 from flytrack_sysid.importing.betaflight_settings import ASSUMED, rate_loop
 from flytrack_sysid.inference.parameters import base_of
 from flytrack_sysid.response import half_response_s
-from tests.support.simulated_flights import NOMINAL, drone_with, fly, held
+from tests.support.simulated_flights import NOMINAL, drone_with, fly, held, padded
 
 RACER = BetaflightLoop(23.0, 23.0, 2.7, 2.8, 0.018, 0.7)
 SECOND = 100  # steps
@@ -30,9 +30,7 @@ def flown(commands, loop=RACER):
     """Return the states (steps, 37) of a craft with the loop, which hovers first."""
     model = NOMINAL._replace(motion=Motion.CONTINUOUS).with_effects(loop)
     start = drone_with(applied=Action(0.0, 0.0, 0.0, -0.22))
-    # All flights have one length, so that one program is compiled.
-    padded = np.pad(commands, ((0, LONGEST - len(commands)), (0, 0)), mode="edge")
-    return np.asarray(fly(start, padded, model))[: len(commands)]
+    return np.asarray(fly(start, padded(commands, LONGEST), model))[: len(commands)]
 
 
 def test_sticks_become_rates_and_hover_stays_one():

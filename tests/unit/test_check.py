@@ -32,11 +32,11 @@ from flytrack_sysid.check.frames import (
 from flytrack_sysid.check.pairs import AGREES, CONTRADICTS, MANOEUVRES, STILL, compare_pairs
 from flytrack_sysid.check.samples import sample_changes
 from flytrack_sysid.check.thrust import motor_changes, thrust_changes
-from flytrack_sysid.log import FlightLog
 from tests.support.compiling import programs
 from tests.support.hidden_flights import scripted
+from tests.support.made_flight import noisy
 from tests.support.slow import slow_but
-from tests.support.written_logs import with_channels
+from tests.support.written_logs import held_still, with_channels
 
 KINDS = ("race", "excitation", "gentle", "hover")
 FRD, NED = "x -y -z", "y x -z"
@@ -95,17 +95,11 @@ def test_reading_of_a_quaternion_undoes_how_it_was_logged(number):
 
 
 @pytest.fixture(scope="module")
-def planar():
+def planar(truth):
     """Position and velocity of a motion along x and y, with noise."""
-    rng, time = np.random.default_rng(3), 0.01 * np.arange(2000)
-    vel = np.stack([2.0 * np.sin(1.3 * time), 1.5 * np.cos(0.9 * time), 0.0 * time], axis=1)
-    pos = np.cumsum(0.01 * vel, axis=0)
-    channels = {
-        "u": np.zeros((len(time), 4)),
-        "p": pos + rng.normal(0.0, 0.005, pos.shape),
-        "v": vel + rng.normal(0.0, 0.02, vel.shape),
-    }
-    return FlightLog(time, channels, np.zeros(len(time), int))
+    flat = {name: truth[name] * [1.0, 1.0, 0.0] for name in ("p", "v")}
+    log = noisy(with_channels(truth, u=0.0 * truth["u"], **flat), seed=3)
+    return log.without("q", "w", "f", "v_bat")
 
 
 def position_pair(log):
@@ -140,8 +134,8 @@ def test_fault_of_half_a_log_is_no_convention(planar):
 # --- explanations ---------------------------------------------------------------------------------
 
 
-def test_channels_that_cannot_be_told_apart_are_alternatives(flights):
-    log = changed(flights["race"], Change("w", "axes", FRD)).log.without("p", "v", "f", "v_bat")
+def test_channels_that_cannot_be_told_apart_are_alternatives(turned_gyro):
+    log = turned_gyro[0].without("p", "v", "f", "v_bat")
     explanations = check_log(with_channels(log, u=0.0 * log["u"])).explanations
     assert set(explanations) == {(Change("q", "body", FRD),), (Change("w", "axes", FRD),)}
 
@@ -204,10 +198,18 @@ def test_right_flight_contradicts_nothing(checks, kind):
     assert CONTRADICTS not in verdicts(check).values()
 
 
-def test_lag_of_one_axis_is_no_rate_curve():
-    """The response of roll is bent, by 0.2 % of its variance, without a curve."""
-    _, log = scripted([74, 105], LENGTH_S, motion="fine")
-    check = check_log(log)
+RIGHT_LOGS = {
+    # The response of roll is bent, by 0.2 % of its variance, without a curve.
+    "a lag of one axis": lambda: scripted([74, 105], LENGTH_S, motion="fine")[1],
+    "of the readme": lambda: collect(blackbox.load(blackbox.SHIPPED), 2.0, seed=0, noise=1.0),
+    "coloured noise": lambda: load_log_suite("misspec-v1").plant("14").log,
+    "heavy-tailed noise": lambda: load_log_suite("misspec-v1").plant("22").log,
+}
+
+
+@pytest.mark.parametrize("name", slow_but(["a lag of one axis"], RIGHT_LOGS))
+def test_right_log_contradicts_nothing(name):
+    check = check_log(RIGHT_LOGS[name]())
     assert check.explanations == () and not check.contradicts
 
 
@@ -388,10 +390,7 @@ def test_files_of_a_flight_that_shows_little(tmp_path, flights, checks):
 
 @pytest.mark.parametrize("missing", ["p", "v", "q", "f", "w", "p v q", "p v q w f v_bat"])
 def test_missing_channels_are_not_compared(flights, missing):
-    log = flights["race"].log
-    for channel in missing.split():
-        log = log.without(channel)
-    check = check_log(log)
+    check = check_log(flights["race"].log.without(*missing.split()))
     assert check.explanations == ()
     compared = {name for pair in check.pairs for name in pair.name.replace(",", "").split()}
     assert not compared & set(missing.split())
@@ -405,9 +404,8 @@ CONSTANT = ["p", "v", "q", "w", "f", "u", "p v q w f u v_bat"]
     CONSTANT,
 )
 def test_constant_channels_name_nothing(flights, constant):
-    log = flights["race"].log
-    first = {name: np.tile(log[name][:1], (len(log), 1)) for name in constant.split()}
-    assert check_log(with_channels(log, **first)).explanations == ()
+    log = held_still(flights["race"].log, constant.split())
+    assert check_log(log).explanations == ()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -423,15 +421,3 @@ def test_stuck_axis_is_said(flights):
     rates[:, 1] = 0.1
     check = check_log(with_channels(log, w=rates))
     assert check.explanations == () and any(one.startswith("w_y: ") for one in check.remarks)
-
-
-@pytest.mark.slow
-def test_the_log_of_the_readme_contradicts_nothing():
-    log = collect(blackbox.load(blackbox.SHIPPED), minutes=2.0, seed=0, noise=1.0)
-    assert not check_log(log).explanations
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("log_id", ["14", "22"])  # coloured and heavy-tailed noise
-def test_a_right_log_in_other_noise_contradicts_nothing(log_id):
-    assert not check_log(load_log_suite("misspec-v1").plant(log_id).log).explanations

@@ -35,9 +35,13 @@ TRAINING = {
 }
 
 
+def initial_params(size=OBSERVATION_SIZE):
+    return make_network(CONFIG).init(jax.random.key(0), jnp.zeros((1, size)))
+
+
 @pytest.fixture(scope="module")
 def params():
-    return make_network(CONFIG).init(jax.random.key(0), jnp.zeros((1, OBSERVATION_SIZE)))
+    return initial_params()
 
 
 @pytest.fixture
@@ -64,8 +68,7 @@ def test_round_trip(path, params):
 @pytest.mark.parametrize("trained_in_64", [False, True])
 def test_checkpoints_load_in_the_other_precision(tmp_path, trained_in_64):
     with jax.enable_x64(trained_in_64):
-        observation = jnp.zeros((1, OBSERVATION_SIZE))
-        params = make_network(CONFIG).init(jax.random.key(0), observation)
+        params = initial_params()
         save_checkpoint(tmp_path / "a.safetensors", params, CONFIG, DESCRIPTION, TRAINING)
     with jax.enable_x64(not trained_in_64):
         loaded = load_checkpoint(tmp_path / "a.safetensors").params
@@ -81,8 +84,7 @@ def test_observations_that_do_not_fit_are_refused(tmp_path, params):
         CheckpointError, match=r"row 1 \(velocity\)\.scale: found 4\.0, expected 5\.0$"
     ):
         load_checkpoint(path).check_fits(env)
-    params = make_network(CONFIG).init(jax.random.key(0), jnp.zeros((1, 5)))
-    save_checkpoint(path, params, CONFIG, {**DESCRIPTION, "observation_size": 5})
+    save_checkpoint(path, initial_params(5), CONFIG, {**DESCRIPTION, "observation_size": 5})
     with pytest.raises(CheckpointError, match=f"size 5 .*{OBSERVATION_SIZE}"):
         load_checkpoint(path).check_fits(env)
 

@@ -11,7 +11,7 @@ from flytrack_env.plants import Simulator
 from flytrack_sysid import CollectError, collect, sensors
 from flytrack_sysid.excitation import HEIGHTS, KINDS, MAX_SPEED
 from flytrack_sysid.split import block_numbers, held_out_rows
-from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
+from tests.support.handout_plant import GRAVITY, HandoutPlant, excited, states_of
 
 NOMINAL = nominal_parameters()
 SAME = HandoutPlant(NOMINAL.tau, NOMINAL.thrust_coeffs, NOMINAL.max_rate)
@@ -25,7 +25,7 @@ def test_log_is_what_the_plant_did(plant):
     # Of a function, one flight is flown after the other.
     assert done == [(number + 1, 24) for number in range(24) if plant is SAME]
     assert log.time.max() <= 2.5 and len(log) > 0.8 * 6000
-    x = np.concatenate([log[name] for name in ("p", "v", "a", "q", "w", "uprev", "v_bat")], axis=1)
+    x = states_of(log)
     after = SAME(x[:-1], log["u"][:-1])
     inside = ~log.is_start()[1:]
     np.testing.assert_allclose(x[1:][inside], after[inside], atol=2e-5)

@@ -8,20 +8,10 @@ from jax.flatten_util import ravel_pytree
 from numpy.testing import assert_allclose
 
 from flytrack_env.battery import Battery
-from flytrack_env.dynamics import ModelParameters, collective_thrust, step
+from flytrack_env.dynamics import collective_thrust, step
 from tests.support.black_boxes import random_inputs
 from tests.support.handout_plant import HandoutPlant
-from tests.support.simulated_flights import NOMINAL
-
-UNEVEN = ModelParameters(
-    tau=np.array([0.03, 0.05, 0.08, 0.02]),
-    thrust_coeffs=np.array([-9.0, -6.0, 3.1, 0.4, 0.9, 1.1]),
-    max_rate=np.array([600.0, 500.0, 130.0]),
-    m=1.2,
-    g=9.81,
-    battery_drain_v_per_min=1.3,
-)
-
+from tests.support.simulated_flights import NOMINAL, UNEVEN
 
 step_all = jax.jit(jax.vmap(step, in_axes=(0, 0, None, None)))
 

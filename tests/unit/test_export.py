@@ -10,23 +10,17 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from baselines.purejaxrl_ppo import export, load_checkpoint
-from baselines.purejaxrl_ppo.checkpoint_env import plant_env
 from baselines.purejaxrl_ppo.export import policy_of
-from baselines.purejaxrl_ppo.flights import start_pose_params
-from flytrack.cli import main
-from flytrack_env import blackbox, make
+from flytrack_env import make
 from flytrack_env.dynamics import lag
-from flytrack_env.state import POSITION, Action, pack, unpack, unpack_action
+from flytrack_env.state import POSITION, Action, unpack, unpack_action
 from flytrack_env.wrappers import NoiseParams, ObservationNoise
 from tests.support.compiled_policy import CompiledPolicy, states_in_box
 from tests.support.evaluated import write_checkpoint
-from tests.support.pages import ROOT
-from tests.support.refusals import refused
+from tests.support.refusals import refused, run
 
 SEED, COUNT = 5, 200
 MAX_ERROR, MAX_LAG_ERROR, MAX_FLOAT64_ERROR = 1e-5, 1e-6, 1e-7
-CHAMPIONS = ROOT / "baselines" / "purejaxrl_ppo" / "champion"
-needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
 # Environment id, track, hidden layers, and flags of the ONNX file.
 CASES = {
     "perfect sensors": ("FlyTrack-v0", "flytrack", (8, 5), []),
@@ -73,7 +67,7 @@ def test_exported_policies_act_as_the_python_one(case, tmp_path, capsys):
     assert np.ptp(actions, axis=0).min() > 0.01, "actions that differ"
 
     header.write_text("old")
-    main(["export", str(path), "--c", str(header)])
+    run("export", path, "--c", header)
     assert f"{header}: {header.stat().st_size} bytes" in capsys.readouterr().out
     if shutil.which("gcc") is not None:
         states, *others = inputs.values()
@@ -91,41 +85,15 @@ def act_by_onnx(checkpoint, flags, inputs):
         "onnxruntime", reason="onnxruntime is not installed (flytrack[dev])"
     )
     path = str(checkpoint.with_name("policy.onnx"))
-    main(["export", str(checkpoint), "--onnx", path, *flags])
+    run("export", checkpoint, "--onnx", path, *flags)
     session = onnxruntime.InferenceSession(path)
     return session.run(None, {given.name: inputs[given.name] for given in session.get_inputs()})[0]
 
 
-@pytest.mark.slow
-@needs_gcc
-def test_the_compiled_champion_races_on_the_black_box_and_counts_its_gates(tmp_path):
-    checkpoint, header = CHAMPIONS / "flytrack.safetensors", tmp_path / "policy.h"
-    main(["export", str(checkpoint), "--c", str(header)])
-    compiled = CompiledPolicy(header)
-    env = plant_env(load_checkpoint(checkpoint), blackbox.load(blackbox.SHIPPED))
-    params = start_pose_params(env.default_params, 1000)
-
-    @jax.jit
-    def step(state, action):
-        state, _, terminated, info = env.step_env(None, state, action, params)[1:]
-        return state, pack(env.drone(state)), env.race(state).gate_index, terminated, info["laps"]
-
-    state = env.reset(jax.random.key(SEED), params)[1]
-    drone, gate = np.asarray(pack(env.drone(state))), np.int32(0)
-    for _ in range(1000):
-        state, moved, index, terminated, laps = step(state, compiled.act([drone], [gate])[0])
-        before, drone = drone, np.asarray(moved)
-        gate = compiled.next_gates([before], [drone], [gate])[0]
-        assert gate == index and not terminated
-        if laps == 1:
-            return
-    pytest.fail("no lap in 10 s")
-
-
-@needs_gcc
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
 def test_a_header_counts_gates_and_lags_as_the_environment_does(tmp_path):
     write_checkpoint(tmp_path / "a.safetensors", "FlyTrack-v0", "split_s", (4,))
-    main(["export", str(tmp_path / "a.safetensors"), "--c", str(tmp_path / "policy.h")])
+    run("export", tmp_path / "a.safetensors", "--c", tmp_path / "policy.h")
     compiled = CompiledPolicy(tmp_path / "policy.h")
     params = make("FlyTrack-v0", track="split_s").default_params
     gates, count = params.course.gates, np.arange(params.course.num_gates)

@@ -20,9 +20,10 @@ from flytrack_sysid.inference.parameters import (
 )
 from flytrack_sysid.sensors import measure
 from flytrack_sysid.split import held_out_rows
+from tests.support import made_flight
 from tests.support.handout_plant import GRAVITY, HandoutPlant, excited
 from tests.support.slow import slow_but
-from tests.support.written_logs import with_channels
+from tests.support.written_logs import held_still, with_channels
 
 PLANT = HandoutPlant()
 DRAG = (0.3, 0.5, 0.2)
@@ -135,13 +136,7 @@ def test_drag_is_found(dragged):
 
 def at_rest(log):
     """Return what a drone on the ground measures while its commands move."""
-    rng = np.random.default_rng(0)
-    channels = {
-        name: values[0] + 0.05 * rng.normal(size=values.shape)
-        for name, values in log.channels.items()
-    }
-    channels["q"] /= np.linalg.norm(channels["q"], axis=1, keepdims=True)
-    return replace(log, channels={**channels, "u": log["u"]})
+    return made_flight.noisy(held_still(log, log.channels.keys() - {"u"}), seed=0)
 
 
 EVERYTHING = dict.fromkeys((*TAUS, *THRUST_COEFFS, DRAIN), 0.1)

@@ -95,6 +95,12 @@ def test_step_after_the_last_state_is_extrapolated():
 ENDS = table("flown_ends")
 
 
+def race_and_end(states, track=TRACK):
+    """Return the race of a flight and why it ended."""
+    race = follow_race(states[:, POSITION], track, last_vel_w=states[-1, VELOCITY])
+    return race, why_ended(states, track, race)
+
+
 @pytest.mark.parametrize("end", ENDS)
 def test_end_is_the_environments(end):
     """The last state before the environment ends a flight shows why."""
@@ -107,9 +113,7 @@ def test_end_is_the_environments(end):
         name.replace("_", " ") for name, happened in causes._asdict().items() if happened[last]
     ]
     assert names == [end]
-    flown = states[: last + 1]
-    race = follow_race(flown[:, POSITION], TRACK, last_vel_w=flown[-1, VELOCITY])
-    assert why_ended(flown, TRACK, race) == end
+    assert race_and_end(states[: last + 1])[1] == end
 
 
 def test_first_gate_is_the_tracks_near_its_start_else_the_one_passed_first():
@@ -132,8 +136,8 @@ def test_two_gates_in_one_step_each_have_their_time_and_end(shift_m, end):
     track = replace(row, gates=(row.gates[0], aside, row.gates[2]))
     states = np.tile(pack(drone_at((0.0, 0.0, 2.0), (20.0, 0.0, 0.0))), (10, 1))
     states[:, 0] = 0.15 + 0.2 * np.arange(10)
-    race = follow_race(states[:, POSITION], track, last_vel_w=states[-1, VELOCITY])
-    assert why_ended(states, track, race) == end
+    race, found = race_and_end(states, track)
+    assert found == end
     num_passed = 1 + (shift_m == 0.0)
     passed = [(gate_pass.time_s, gate_pass.pos_w[0]) for gate_pass in race.passes]
     assert_allclose(passed, [(0.0925, 2.0), (0.0975, 2.1)][:num_passed], atol=1e-5)
@@ -145,5 +149,4 @@ def test_flight_that_goes_on_ended_when_its_steps_did():
     states[-1, BATTERY] = 21.9
     assert why_ended(states, TRACK, follow_race(states[:, POSITION], TRACK)) == "battery empty"
     states[:, BATTERY], states[:, VELOCITY] = 24.0, np.nan  # an unknown velocity ends nothing
-    race = follow_race(states[:, POSITION], TRACK, last_vel_w=states[-1, VELOCITY])
-    assert why_ended(states, TRACK, race) == "all steps flown"
+    assert race_and_end(states)[1] == "all steps flown"

@@ -50,13 +50,12 @@ def acceleration(effect, **state):
     return (flown((effect,), held(), drone) - flown((), held(), drone))[0, 6:9]
 
 
-def test_a_term_along_the_air_brakes_as_its_formula_says():
-    found = acceleration(LearnedLaw(1.0, 0.0, Law((DRAG,))), vel_w=(3.0, 0.0, 0.0))
-    np.testing.assert_allclose(found, [-2.0 * math.exp(-0.5), 0.0, 0.0], atol=1e-4)
-    more = acceleration(LearnedLaw(1.0, 1.0, Law((DRAG,))), vel_w=(3.0, 0.0, 0.0))
-    np.testing.assert_allclose(more, found * 1.9 / 2.0, atol=1e-4)
-    half = acceleration(LearnedLaw(0.5, 0.0, Law((DRAG,))), vel_w=(3.0, 0.0, 0.0))
-    np.testing.assert_allclose(half, 0.5 * found, atol=1e-4)
+@pytest.mark.parametrize(
+    ("scale", "spread", "coefficient"), [(1.0, 0.0, -2.0), (1.0, 1.0, -1.9), (0.5, 0.0, -1.0)]
+)
+def test_a_term_along_the_air_brakes_as_its_formula_says(scale, spread, coefficient):
+    found = acceleration(LearnedLaw(scale, spread, Law((DRAG,))), vel_w=(3.0, 0.0, 0.0))
+    np.testing.assert_allclose(found, [coefficient * math.exp(-0.5), 0.0, 0.0], atol=1e-4)
 
 
 def test_a_product_turns_the_drone():

@@ -35,6 +35,7 @@ from tests.support.written_logs import (
     SUFFIXES,
     columns_of,
     make_log,
+    through_file,
     with_channels,
     write,
 )
@@ -45,11 +46,6 @@ FORCE_PER_VOLT = 35.0 / 16.8  # m/s^2 at full stick
 NOMINAL = nominal_parameters()
 CONTINUOUS = NOMINAL._replace(motion=Motion.CONTINUOUS)
 CASES = table("measured_logs")
-
-
-def through_file(log, path):
-    save_log(path, log)
-    return load_log(path)
 
 
 OPERATIONS = {

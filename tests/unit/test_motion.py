@@ -7,22 +7,18 @@ import pytest
 
 from flytrack_bench.hidden import HiddenDrone, Truth, drone
 from flytrack_env import effects
-from flytrack_env.dynamics import ModelParameters, move
+from flytrack_env.dynamics import move
 from flytrack_env.motion import Motion
 from flytrack_env.state import Action, unpack
 from tests.support.handout_plant import rotation
 from tests.support.hidden_flights import LOW_START, flown_in_floats, state_of
-from tests.support.simulated_flights import fly
+from tests.support.simulated_flights import UNEVEN, fly, padded
 
-MASS, GRAVITY, DRAIN = 1.2, 9.81, 1.3
-TAU = np.array([0.03, 0.05, 0.08, 0.04])
-COEFFS = np.array([-9.0, -6.0, 3.1, 0.4, 0.9, 1.1])
-FULL_RATES = np.array([600.0, 500.0, 130.0])
 DRAG = effects.LinearDrag(0.3, 0.2, 0.1)
 ARM_B = np.array([0.02, -0.01, 0.03])
 SECONDS = 0.6
 COMMAND_S = 0.02  # how long the pilot holds a command
-PLAIN = ModelParameters(TAU, COEFFS, FULL_RATES, MASS, GRAVITY, DRAIN, motion=Motion.CONTINUOUS)
+PLAIN = UNEVEN._replace(motion=Motion.CONTINUOUS)
 DRAGGED = PLAIN.with_effects(DRAG, effects.YawReaction(0.05))
 LOOP = DRAGGED.with_effects(effects.SecondOrderRates(*[0.02] * 3, *[0.6] * 3))
 FULL = LOOP.with_effects(effects.CommandDelay(0.013))
@@ -40,8 +36,8 @@ START = np.array(
     [0, 0, 5, 3, -2, 1, 0, 0, 0, 0.9, 0.1, -0.3, 0.3, 0, 0, 0, 0.1, -0.2, 0.3, 0.2, 23.5]
 )
 START[9:13] /= np.linalg.norm(START[9:13])
-START[13:16] = np.radians(FULL_RATES) * START[16:19]
-AT_REST = state_of(HiddenDrone(Truth(TAU, COEFFS), LOW_START, np.random.default_rng(0)))
+START[13:16] = np.radians(PLAIN.max_rate) * START[16:19]
+AT_REST = state_of(HiddenDrone(Truth(*PLAIN[:2]), LOW_START, np.random.default_rng(0)))
 
 
 def held_commands():
@@ -57,10 +53,11 @@ def flown(model, dt, start=START):
     All flights have one length and the same effects: one program is compiled for a motion.
     """
     commands = np.repeat(held_commands(), round(COMMAND_S / dt), axis=0)
-    padded = np.pad(commands, ((0, LONGEST - len(commands)), (0, 0)), mode="edge")
     full = model._replace(effects=EVERY.effects).with_effects(*model.effects)
     with jax.enable_x64(True):
-        rows = np.asarray(fly(unpack(jnp.asarray(start)), padded, full, dt))[: len(commands)]
+        rows = np.asarray(fly(unpack(jnp.asarray(start)), padded(commands, LONGEST), full, dt))[
+            : len(commands)
+        ]
     return rows[:, :21], rows[:, 21:24], rows[:, 24:27]
 
 
@@ -70,8 +67,9 @@ def reference(model):
     Those of a hidden plant in parts of 0.1 ms, which shares no code with the package.
     """
     laws = {effects.effect_of(law).name: law._asdict() for law in model.effects}
-    arrays = (tuple(map(float, values)) for values in (TAU, COEFFS, FULL_RATES))
-    truth = Truth(*arrays, DRAIN, MASS, GRAVITY, laws, motion="fine", step_s=COMMAND_S)
+    arrays = (tuple(map(float, values)) for values in PLAIN[:3])
+    numbers = (PLAIN.battery_drain_v_per_min, PLAIN.m, PLAIN.g)
+    truth = Truth(*arrays, *numbers, laws, motion="fine", step_s=COMMAND_S)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(drone, "MAX_SUBSTEP_S", 1e-4)
         flight = flown_in_floats(truth, held_commands(), LOW_START)
@@ -113,9 +111,9 @@ def test_a_semi_implicit_force_has_the_attitude_after_the_step():
             move(drone, (), command, 0.01, PLAIN._replace(motion=motion)).after
             for motion in (Motion.EULER, Motion.SEMI_IMPLICIT)
         )
-    thrust = np.linalg.norm(np.array(semi.acc_w) + np.array([0.0, 0.0, GRAVITY]))
+    thrust = np.linalg.norm(np.array(semi.acc_w) + np.array([0.0, 0.0, PLAIN.g]))
     axis = rotation(np.array(semi.quat))[:, 2]
-    np.testing.assert_allclose(semi.acc_w, axis * thrust - [0.0, 0.0, GRAVITY], rtol=1e-12)
+    np.testing.assert_allclose(semi.acc_w, axis * thrust - [0.0, 0.0, PLAIN.g], rtol=1e-12)
     np.testing.assert_array_equal(semi.quat, at_once.quat)
     assert np.abs(np.array(semi.acc_w) - np.array(at_once.acc_w)).max() > 0.1
 

@@ -21,6 +21,7 @@ from flytrack_sysid.inference.parameters import fields_of_sticks
 from flytrack_sysid.inference.score_test import candidates_for, searched_in
 from tests.support.compiling import quick_jit
 from tests.support.motor_models import crafts, model_of
+from tests.support.simulated_flights import padded
 
 DT = 0.01
 TILTED = np.array([[4.0, -0.2, 0.3], [-0.2, 5.0, 0.1], [0.3, 0.1, 8.0]]) * 1e-3
@@ -44,13 +45,11 @@ def _flight(model, start, commands, dt):
 
 
 _program = quick_jit(_flight)
-LONGEST = 200
 
 
 def _flown(model, start, commands, dt=DT):
-    """Return a flight, all of one length, so that one program is compiled."""
-    padded = np.pad(commands, ((0, LONGEST - len(commands)), (0, 0)), mode="edge")
-    return np.asarray(_program(model, start, padded, dt))[: len(commands)]
+    """Return a flight."""
+    return np.asarray(_program(model, start, padded(commands), dt))[: len(commands)]
 
 
 def begun(model, state):
@@ -223,14 +222,8 @@ def test_effects_of_sticks_are_no_candidates_beside_motors():
     assert "command_delay.delay_s" in fields and "gyro_scale.x" in fields
     assert not fields & fields_of_sticks(problem.like)
     assert fields_of_sticks(nominal_parameters()) == set()
-
-
-def test_a_scale_of_the_force_alone_is_not_looked_for():
-    of_motors, of_sticks = (
-        SimpleNamespace(like=model, given_effects=given)
-        for model, given in ((model_of(crafts()), ("motors",)), (nominal_parameters(), ()))
-    )
-    assert "thrust_scale" not in searched_in(of_motors)
+    # Nor is a scale of the force alone.
+    searched = {candidate.effect for candidate in candidates_for(problem)}
+    assert "motors" in searched and "thrust_scale" not in {*searched, *searched_in(problem)}
+    of_sticks = SimpleNamespace(like=nominal_parameters(), given_effects=())
     assert "thrust_scale" in searched_in(of_sticks)
-    searched = {candidate.effect for candidate in candidates_for(of_motors)}
-    assert "motors" in searched and "thrust_scale" not in searched

@@ -159,20 +159,22 @@ def test_an_image_is_seen_by_convolutions_and_flown_by_what_is_stored(tmp_path):
     assert action.shape == (4,) and (np.asarray(action) == again[1]).all()
 
 
+def learnt_in_one_step(reward, **choices):
+    """Return the policy and the value that are learnt in episodes of one step."""
+    network, params = train(Probe(True, reward, **choices), ProbeParams(max_steps_in_episode=1))
+    return network.apply(params, jnp.zeros(2))
+
+
 def test_rewarded_action_is_learnt():
     # Reward 1 - (u - 0.4)^2 on one step: the best mean is 0.4, its value 1 less the variance.
-    env = Probe(True, reward=lambda time, action, length: 1.0 - (action - 0.4) ** 2)
-    network, params = train(env, ProbeParams(max_steps_in_episode=1))
-    policy, value = network.apply(params, jnp.zeros(2))
+    policy, value = learnt_in_one_step(lambda time, action, length: 1.0 - (action - 0.4) ** 2)
     assert float(policy.mode()[0]) == pytest.approx(0.4, abs=0.05)
     variance = float(policy.stddev()[0]) ** 2
     assert float(value) == pytest.approx(1.0 - variance, abs=0.05)
 
 
 def test_rewarded_choice_is_learnt():
-    env = Probe(True, reward=lambda time, action, length: action == 2, num_choices=3)
-    network, params = train(env, ProbeParams(max_steps_in_episode=1))
-    policy, value = network.apply(params, jnp.zeros(2))
+    policy, value = learnt_in_one_step(lambda time, action, length: action == 2, num_choices=3)
     assert float(policy.probs[2]) > 0.95
     assert float(value) == pytest.approx(1.0, abs=0.05)
 

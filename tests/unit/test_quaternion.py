@@ -29,10 +29,14 @@ def columns(array):
     return tuple(jnp.asarray(array[:, i]) for i in range(array.shape[1]))
 
 
+def matrices(quats):
+    """Return the rotation matrices (N, 3, 3) of quaternions."""
+    return np.stack([np.stack(axis, -1) for axis in quats.axes()], axis=-1)
+
+
 def test_axes_turned_vectors_and_products_are_those_of_rotations(quats):
     left, right = Quaternion(*columns(quats)), np.roll(quats, 7, axis=0)
-    axes = np.stack([np.stack(axis, -1) for axis in left.axes()], axis=-1)
-    assert_allclose(axes, rotations(quats).as_matrix(), atol=1e-6)
+    assert_allclose(matrices(left), rotations(quats).as_matrix(), atol=1e-6)
     vectors = np.random.default_rng(1).normal(size=(NUM_CASES, 3))
     rotated = np.stack(left.rotate(Vec3(*columns(vectors))), -1)
     assert_allclose(rotated, rotations(quats).apply(vectors), atol=5e-6)
@@ -49,5 +53,4 @@ def test_from_yaw_tilt_leans_the_thrust_axis_towards_the_heading():
     lean = np.stack([-np.sin(heading), np.cos(heading), np.zeros(NUM_CASES)], -1) * tilt[:, None]
     expected = Rotation.from_euler("z", yaw[:, None]) * Rotation.from_rotvec(lean)
     result = Quaternion.from_yaw_tilt(*map(jnp.asarray, (yaw, tilt, heading)))
-    matrix = np.stack([np.stack(axis, -1) for axis in result.axes()], axis=-1)
-    assert_allclose(matrix, expected.as_matrix(), atol=1e-5)
+    assert_allclose(matrices(result), expected.as_matrix(), atol=1e-5)

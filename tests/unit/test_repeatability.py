@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from benchmarks.repeatability import agree, compare, hover_without_model, is_same_class
-from flytrack_sysid import FlightLog
+from flytrack_sysid.log import log_of_states
+from tests.support.black_boxes import start
+from tests.support.handout_plant import GRAVITY, HandoutPlant
 from tests.support.tables import table
 
 
@@ -42,19 +44,11 @@ def test_a_craft_counts_pairs_values_and_widths():
 
 def test_the_hover_of_a_log_is_found_without_a_model():
     """The thrust of a drone that stays level is 8 + 4 u m/s^2 after a lag of 0.03 s."""
-    step_s, rng = 0.01, np.random.default_rng(0)
-    stick = np.repeat(rng.uniform(-0.5, 1.0, 100), 20)
-    thrust, climb = np.zeros((2, len(stick)))
-    applied = stick[0]
-    for row in range(1, len(stick)):
-        applied += (stick[row - 1] - applied) * -np.expm1(-step_s / 0.03)
-        thrust[row] = 8.0 + 4.0 * applied
-        climb[row] = climb[row - 1] + step_s * (thrust[row] - 9.80665)
-    level = np.zeros((len(stick), 3))
-    channels = {
-        "u": np.c_[level, stick],
-        "v": np.c_[level[:, :2], climb],
-        "q": np.tile([1.0, 0.0, 0.0, 0.0], (len(stick), 1)),
-    }
-    log = FlightLog(step_s * np.arange(len(stick)), channels, np.zeros(len(stick), int))
-    assert hover_without_model(log) == pytest.approx((9.80665 - 8.0) / 4.0, abs=0.01)
+    plant = HandoutPlant(tau=(0.03,) * 4, coeffs=(8.0, 4.0, 0.0, 0.0, 0.0, 0.0))
+    stick = np.repeat(np.random.default_rng(0).uniform(-0.5, 1.0, 100), 20)
+    commands = np.pad(stick[:, None], ((0, 0), (3, 0)))
+    states = [start((0.0, 0.0, 0.0, stick[0]))]
+    for command in commands[:-1]:
+        states.append(plant(states[-1], command))
+    log = log_of_states([(np.array(states), commands)], 0.01)
+    assert hover_without_model(log) == pytest.approx((GRAVITY - 8.0) / 4.0, abs=0.01)

@@ -48,8 +48,7 @@ def test_a_damaged_trace_is_made_again(folder):
     assert trace(np.arange(3.0))[1] == 0
 
 
-def test_nothing_is_written_where_no_program_is_kept(tmp_path):
-    before = getattr(jax.config, FOLDER)
+def test_nothing_is_written_where_no_program_is_kept(folder):
     jax.config.update(FOLDER, None)
     assert trace(np.arange(3.0))[1] == trace(np.arange(3.0))[1] == 1
-    jax.config.update(FOLDER, before)
+    assert not folder.exists()

@@ -13,7 +13,7 @@ from flytrack_env.references import ghost_restarts, ghost_rollout, shipped_refer
 from flytrack_env.rollout import save_rollout
 from flytrack_env.state import POSITION, Action
 from flytrack_env.tracks import build_course, load_track
-from tests.support.recordings import Recording, make_sequence
+from tests.support.recordings import Recording, make_flight, make_sequence
 
 rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra flytrack[viz])")
 viz = importlib.import_module("flytrack_env.viz_rerun")
@@ -43,7 +43,7 @@ def test_handouts_function_has_its_defaults(tmp_path, monkeypatch):
 
 def test_handouts_function_records_the_numbers_that_it_is_given(tmp_path):
     handout = record(tmp_path, make_sequence(100), app_id="test_app")
-    x, u = (np.array(part, float) for part in zip(*make_sequence(100), strict=True))
+    x, u = (part.astype(float) for part in make_flight(100))
     assert_array_equal(handout.series("/world/drone", "Transform3D:translation"), x[:, 0:3])
     rotation = handout.series("/world/drone", "Transform3D:quaternion")
     assert_allclose(rotation, x[:, [10, 11, 12, 9]], atol=1e-6)  # scalar last
