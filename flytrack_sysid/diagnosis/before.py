@@ -24,7 +24,12 @@ from flytrack_sysid.diagnosis.diagnose import (
     split,
     summarize,
 )
-from flytrack_sysid.diagnosis.model_selection import EQUIVALENT, Marginal, ablate_all
+from flytrack_sysid.diagnosis.model_selection import (
+    EQUIVALENT,
+    Marginal,
+    ablate_all,
+    commanded_thrust,
+)
 from flytrack_sysid.diagnosis.result import DRIFT, Cause, Diagnosis, Estimated, Unexplained
 from flytrack_sysid.diagnosis.size import is_notable
 from flytrack_sysid.diagnosis.summary import classify, effect_causes, mean_factor, mean_thrust
@@ -49,7 +54,15 @@ MAX_EFFECTS = 4  # that changed between two logs
 # Sticks jump if the sum of their distances from their low-pass exceeds JUMP. JUMP_S is the time
 # constant of the low-pass; AFTERMATH_S is how long the rows after a jump do not count.
 JUMP, JUMP_S, AFTERMATH_S = 0.5, 0.05, 0.2
+# Share of the earlier log's rows whose thrusts count as flown, from either end, and share of the
+# later log's rows that must lie within: below, the earlier thrust map would be extrapolated.
+FLOWN, SHARED = 0.99, 0.2
+EXPONENT = 0.5  # motors' thrust goes with the 1st to 2nd power of their command
 WORSE = 1.5  # times what was left unexplained before: more than this is new
+NOT_SHARED = (
+    "the logs were flown at other thrusts: each was compared with the model at its own, so that "
+    "a change of the thrust may be an error of the model's curve"
+)
 Logs = FlightLog | Sequence[FlightLog]
 
 
@@ -195,6 +208,7 @@ def diagnose_change(
         warnings=(
             *diagnosis.warnings,
             *(f"{name}: as in the log before, so no change" for name in sorted(unchanged)),
+            *([] if share_thrusts(later, earlier) else [NOT_SHARED]),
         ),
     )
 
@@ -397,6 +411,8 @@ def changed_values(
     """Return the new values of a cause's parameters; none without a clear change."""
     problem, name = later.state.problem, cause.effect
     change = change_between(later, earlier, fields)
+    if tuple(fields) == THRUST_COEFFS and not share_thrusts(later, earlier):
+        return scaled_thrust(name, later, earlier, change)
     indices, vector = problem.parameter_indices(fields), problem.start.copy()
     vector[indices] += change.size
     factor: dict[str, Estimated] = {}  # by which the mean thrust changed
@@ -416,3 +432,49 @@ def changed_values(
     if factor:
         values |= {"factor": factor["mean_factor"]} if name == "thrust_scale" else factor
     return values
+
+
+def share_thrusts(later: Estimate, earlier: Estimate) -> bool:
+    """Return whether the earlier log has flown at the thrusts that the later one commands.
+
+    A thrust map says nothing of commands that its log does not have.
+    """
+    commanded = []
+    for one in (later, earlier):
+        problem = one.state.problem
+        nominal = problem.start[problem.parameter_indices(THRUST_COEFFS)]
+        commanded.append(commanded_thrust(problem, nominal)[problem.counts.any(axis=(2, 3))])
+    low, high = np.quantile(commanded[1], [1.0 - FLOWN, FLOWN])
+    return bool(np.mean((commanded[0] >= low) & (commanded[0] <= high)) > SHARED)
+
+
+def scaled_thrust(
+    name: str, later: Estimate, earlier: Estimate, change: Change
+) -> dict[str, Estimated]:
+    """Return by which factor the thrust changed between logs that share no thrusts.
+
+    The mean thrust of each log is compared with the nominal map at the log's own commands. Its
+    exponent over the command may be wrong by ``EXPONENT``. Empty without a clear change.
+    """
+    factors: list[Estimated] = []
+    nominal_n: list[float] = []
+    for one, marginal in zip((later, earlier), change.marginals, strict=True):
+        problem = one.state.problem
+        slopes = mean_thrust(problem)
+        half_n = float(marginal.half_widths(slopes[None])[0])
+        factors += mean_factor(problem, one.model.vector, half_n).values()
+        nominal_n.append(float(slopes @ problem.start[problem.parameter_indices(THRUST_COEFFS)]))
+    if len(factors) < 2 or min(one.value for one in factors) <= 0.0:
+        return {}
+    now, then = factors
+    ratio = now.value / then.value
+    of_curve = EXPONENT * np.log(nominal_n[0] / nominal_n[1])
+    half = np.hypot(now.half_width / now.value, then.half_width / then.value)
+    most = float(np.exp(np.hypot(half, of_curve)))
+    problem = later.state.problem
+    vector, indices = problem.start.copy(), problem.parameter_indices(THRUST_COEFFS)
+    vector[indices] *= ratio
+    if 1.0 / most < ratio < most or not is_notable(name, problem, vector):
+        return {}
+    key = "factor" if name == "thrust_scale" else "mean_factor"
+    return {key: Estimated(ratio, (ratio / most, ratio * most), "1")}
