@@ -22,7 +22,7 @@ from flytrack_sysid.check.motion import (
     weight_of,
 )
 from flytrack_sysid.kinematics import WINDOWS_S, cut_windows, read_at, segments_of
-from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.log import FlightLog, median_step
 
 COARSE_STEP_S = 0.01  # between rows: a rate loop is slower
 GRID_S = 0.01
@@ -34,7 +34,7 @@ LAGS_S = (0.0, 0.02, 0.04, 0.06, 0.1)
 
 def thinned(log: FlightLog) -> FlightLog:
     """Return the commands and rates of a log, the means over some rows if it is fast."""
-    step_s = float(np.median(usual_step(log)))
+    step_s = median_step(log)
     every = max(1, int(COARSE_STEP_S / step_s))
     if every == 1:
         return log
@@ -60,7 +60,7 @@ def lagged(log: FlightLog, values: np.ndarray, lag_s: float) -> np.ndarray:
         values: (num_rows, n).
         lag_s: time constant.
     """
-    step_s = float(np.median(usual_step(log)))
+    step_s = median_step(log)
     decay = float(np.exp(-step_s / lag_s)) if lag_s > 0.0 else 0.0
     parts = [
         lfilter([0.0, 1.0 - decay], [1.0, -decay], values[rows], axis=0, zi=values[rows][:1])[0]

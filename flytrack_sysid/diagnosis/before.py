@@ -212,7 +212,7 @@ def calm(parts: Split) -> Split:
 
 def _calm(problem: Problem) -> Problem:
     record, counts = problem.chunks.record, problem.chunks.counts
-    step_s = float(np.median(record.step_s))
+    step_s = record.median_step_s
     keep = np.exp(-step_s / JUMP_S)
     sticks = record.command[..., :3]
     lagged = signal.lfilter([1.0 - keep], [1.0, -keep], sticks, axis=0)

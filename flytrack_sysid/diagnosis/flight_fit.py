@@ -163,7 +163,7 @@ class Target(NamedTuple):
     @property
     def step_s(self) -> float:
         """Usual time between rows, s."""
-        return float(np.median(self.windows.record.step_s))
+        return self.windows.record.median_step_s
 
     def linearized(
         self,

@@ -270,7 +270,7 @@ def profile_change(problem: Problem, test: Problem, vector: np.ndarray, row: int
         vector: the model.
         row: at which the change is in ``problem``.
     """
-    step_s = float(np.median(problem.chunks.record.step_s))
+    step_s = problem.chunks.record.median_step_s
     problems = problem, replace(test, windows=problem.windows).with_noise(problem.noise)
     # Residuals with the change after the log, and before it.
     sides = [

@@ -22,7 +22,7 @@ from flytrack_sysid.importing.mapping import Manifest, Mapping, load_mapping
 from flytrack_sysid.importing.table_flight import read_csv
 from flytrack_sysid.importing.ulog_log import read_ulog
 from flytrack_sysid.importing.usd_log import read_usd
-from flytrack_sysid.log import FlightLog, LogError, usual_step
+from flytrack_sysid.log import FlightLog, LogError, median_step
 from flytrack_sysid.log_file import describe
 from flytrack_sysid.plausibility import find_problems
 from flytrack_sysid.resample import SLOW_STEP_S
@@ -155,7 +155,7 @@ def import_log(
     )
     if craft.voltage_v is None and "v_bat" in log and log["v_bat"].min() > 0.0:
         craft = craft._replace(voltage_v=(float(log["v_bat"].min()), float(log["v_bat"].max())))
-    step_s = float(np.median(usual_step(log)))
+    step_s = median_step(log)
     if "w" in log and step_s > SLOW_STEP_S:
         remark = f"body rates at {1.0 / step_s:.3g} Hz: too slow for a rate loop's lag or delay"
         notes += (f"{log.source}: {remark}",)
@@ -241,7 +241,7 @@ def _with_measured_voltage(log: FlightLog) -> tuple[FlightLog, list[str]]:
 
 def _usual_every(log: FlightLog) -> int:
     """Return which share of a log's rows leaves about 500 Hz: one of so many."""
-    return max(1, round(DENSE_STEP_S / float(np.median(usual_step(log)))))
+    return max(1, round(DENSE_STEP_S / median_step(log)))
 
 
 def _is_selected(path: Path, log: FlightLog, mapping: Mapping, every: int) -> np.ndarray:

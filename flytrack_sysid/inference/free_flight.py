@@ -21,7 +21,7 @@ from flytrack_sysid.inference.one_step import SETTLING_S, in_float64
 from flytrack_sysid.inference.record import Filled, Record, build_record, fill_gaps
 from flytrack_sysid.inference.replay import measured_drone, where_true
 from flytrack_sysid.inference.trace_cache import fast_jit
-from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.log import FlightLog, median_step
 from flytrack_sysid.log_voltage import with_voltage
 
 HORIZONS_S = (0.1, 0.25, 0.5, 1.0, 2.0)  # from a rate loop's response to a manoeuvre
@@ -111,7 +111,7 @@ def make_windows(
             a whole lead-in.
     """
     filled = fill_gaps(log)
-    step_s = float(np.median(usual_step(filled.log)))
+    step_s = median_step(filled.log)
     lead, ends = _lead_and_ends(filled.log)
     is_scored = scored_rows[filled.behind] & (filled.source_row >= 0)
     begins = filled.log.is_start()
@@ -165,7 +165,7 @@ def _windows_at(filled: Filled, starts: np.ndarray) -> Windows:
 
 def _lead_and_ends(log: FlightLog) -> tuple[int, np.ndarray]:
     """Return the number of rows of a lead-in, and those from its end to each horizon."""
-    step_s = float(np.median(usual_step(log)))
+    step_s = median_step(log)
     return round(SETTLING_S / step_s), np.round(np.array(HORIZONS_S) / step_s).astype(int)
 
 

@@ -13,7 +13,8 @@ from flytrack_env.state import Drone
 from flytrack_sysid.inference.record import Filled, Record, build_record, is_applied_certain
 from flytrack_sysid.inference.replay import Step, replay, start_replay
 from flytrack_sysid.inference.trace_cache import fast_jit
-from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.kinematics import since_first
+from flytrack_sysid.log import FlightLog, median_step
 from flytrack_sysid.log_voltage import with_voltage
 
 # For effects with memory, whose memory at the start of a segment is not known.
@@ -144,7 +145,7 @@ def predict(model: ModelParameters, filled: Filled) -> Prediction:
         before, after, force_b = jax.tree.map(np.asarray, steps)
     is_settled = np.all(is_applied_certain(record, np.asarray(model.tau, float)), axis=1)
     if any(effect_of(effect).memory for effect in model.effects):
-        time_in_segment = log.time - log.time[record.begins][np.cumsum(record.begins) - 1]
+        time_in_segment = since_first(log.time, record.begins)
         is_settled = is_settled & (time_in_segment >= SETTLING_S)
-    step_s = float(np.median(usual_step(log)))
+    step_s = median_step(log)
     return Prediction(model, filled, before, after, columns(force_b), record, step_s, is_settled)

@@ -569,7 +569,7 @@ def vector_of(model: ModelParameters) -> np.ndarray:
 
 def _longest(names: Sequence[str], chunks: Chunks) -> np.ndarray:
     """Return the longest delay (s) that each effect remembers; infinity for other parameters."""
-    step_s = float(np.median(chunks.record.step_s))
+    step_s = chunks.record.median_step_s
     fields = [name.partition(".") for name in names]
     steps = [
         BY_NAME[effect].max_steps.get(field, np.inf) if field else np.inf

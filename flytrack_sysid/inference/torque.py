@@ -14,7 +14,7 @@ from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_env.effects import takes_motors
 from flytrack_env.motors import NAMES
 from flytrack_sysid.inference.chunks import Chunks
-from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.log import FlightLog, median_step
 from flytrack_sysid.log_voltage import flown_voltages
 
 AXES = ("roll", "pitch")  # yaw is turned by little, and by rotors that spin up
@@ -57,7 +57,7 @@ class MotorRecord(NamedTuple):
     @classmethod
     def of_log(cls, log: FlightLog) -> "MotorRecord":
         """Return the record of a log, in one chunk."""
-        step_s = float(np.median(usual_step(log)))
+        step_s = median_step(log)
         voltage = float(np.mean(flown_voltages(log)))
         is_joined = ~log.is_start()[:, None]
         return cls(log["u"][:, None], log["w"][:, None], is_joined, step_s, voltage)
@@ -66,7 +66,7 @@ class MotorRecord(NamedTuple):
     def of_chunks(cls, chunks: Chunks) -> "MotorRecord":
         """Return the record of chunks."""
         record = chunks.record
-        step_s, voltage = float(np.median(record.step_s)), float(np.median(record.battery_v))
+        step_s, voltage = record.median_step_s, float(np.median(record.battery_v))
         rates_b = chunks.measured["w"]
         return cls(record.command, rates_b, chunks.is_joined, step_s, voltage)
 
