@@ -4,6 +4,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import nominal_parameters
@@ -93,6 +94,24 @@ def segments_of(log: FlightLog) -> list[slice]:
     """Return the rows of each segment of a log."""
     edges = [*np.flatnonzero(log.is_start()), len(log)]
     return [slice(start, end) for start, end in pairwise(edges)]
+
+
+def runs_of(is_in: np.ndarray, is_start: np.ndarray) -> list[tuple[int, int]]:
+    """Return start and end of each run of True, none across the start of a segment.
+
+    Args:
+        is_in: (num_rows,) bool.
+        is_start: rows at which a segment starts, (num_rows,) bool.
+    """
+    starts = np.flatnonzero(is_in & (~np.append(False, is_in[:-1]) | is_start))
+    ends = np.flatnonzero(is_in & ~np.append(is_in[1:] & ~is_start[1:], False)) + 1
+    return list(zip(starts.tolist(), ends.tolist(), strict=True))
+
+
+def low_pass(values: np.ndarray, step_s: float, lag_s: float) -> np.ndarray:
+    """Return values, (num_rows, ...), as a first-order lag follows them from 0."""
+    decay = np.exp(-step_s / lag_s) if lag_s else 0.0
+    return lfilter([1.0 - decay], [1.0, -decay], values, axis=0)
 
 
 def derivative(log: FlightLog, values: np.ndarray) -> np.ndarray:

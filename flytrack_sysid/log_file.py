@@ -25,6 +25,7 @@ from flytrack_env import motors
 from flytrack_env.files import open_file, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.npz_file import NpzError, load_npz, npz_of
+from flytrack_env.toml_file import TomlError, parse_toml, read_text
 from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_step
 from flytrack_sysid.log_table import Table, check_names, columns_of, log_of_table, stated_columns
 
@@ -84,6 +85,14 @@ def check_name(path: str | Path) -> None:
         raise LogError(
             f"{path}: found suffix {Path(path).suffix!r}, expected {' or '.join(SUFFIXES)}"
         )
+
+
+def load_toml(path: Path) -> dict[str, Any]:
+    """Return the content of a TOML file that describes logs; raises LogError."""
+    try:
+        return parse_toml(read_text(path))
+    except (OSError, UnicodeDecodeError, TomlError) as error:
+        raise LogError(f"{path}: not a readable TOML file: {error_text(error)}") from error
 
 
 def gaps_of(log: FlightLog) -> np.ndarray:

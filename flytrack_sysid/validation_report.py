@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from flytrack_env.files import write_atomically
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, page
+from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, page, write_report
 from flytrack_sysid.plots import draw_steps, draw_thrust, png_of
 from flytrack_sysid.prediction_errors import (
     NORMALISED_BY,
@@ -173,6 +172,4 @@ def write_validation(
         "validation.html": html_of(validation, model_name, log, pictures).encode(),
         **{f"{name}.png": png for name, png in pictures.items()},
     }
-    for name, content in files.items():
-        write_atomically(Path(out) / name, content)
-    return [Path(out) / name for name in files]
+    return write_report(out, files)

@@ -100,9 +100,7 @@ def compare_commands(log: FlightLog) -> Followed | None:
     by_lag = {lag_s: lagged(log, log["u"][:, :3], lag_s) for lag_s in LAGS_S}
     for lag_s, delay_s in product(LAGS_S, DELAYS_S):
         commands = windows.mean_of(log, read_at(log, by_lag[lag_s], -delay_s))
-        values = weight_of(WINDOWS_S[0]) * np.array(
-            [by_frame(rates[part], commands[part], RATE_FLOOR) for part in parts_of(count)]
-        )
+        values = [by_frame(rates[part], commands[part], RATE_FLOOR) for part in parts_of(count)]
         likelihoods = described(values, WINDOWS_S[0], rates, commands)
         found.append(Followed(likelihoods, float(delay_s), lag_s))
     # Each frame has the delay and the lag under which it fits best.
@@ -166,6 +164,11 @@ def responses(log: FlightLog) -> list[Response]:
     return [response_to(log, log["u"][:, axis], axis) for axis in range(3)]
 
 
+def share_left(correlation: float) -> float:
+    """Return the share of an axis's rates that commands leave; with a negative correlation all."""
+    return 1.0 - min(max(correlation, 0.0), MAX_CORRELATION) ** 2
+
+
 def mean_delay(log: FlightLog, found: list[Response], expected_s: np.ndarray) -> float:
     """Return by how much rates follow their commands later than expected, s; 0 if that is unclear.
 
@@ -183,8 +186,8 @@ def mean_delay(log: FlightLog, found: list[Response], expected_s: np.ndarray) ->
         later_s = one.delay_s + one.lag_s - float(expected_s[axis])
         as_expected = follow(log, log["u"][:, axis : axis + 1], one.delay_s - later_s, one.lag_s)
         correlation = correlations_of(rates[:, axis : axis + 1], windows.mean_of(log, as_expected))
-        unexplained = 1.0 - min(max(float(correlation[0, 0]), 0.0), MAX_CORRELATION) ** 2
-        least = 1.0 - min(one.correlation, MAX_CORRELATION) ** 2
+        unexplained = share_left(float(correlation[0, 0]))
+        least = share_left(one.correlation)
         nats += 0.5 * weight_of(WINDOWS_S[0]) * len(rates) * float(np.log(unexplained / least))
         delays_s.append(later_s)
         weights.append(1.0 / least)
@@ -240,7 +243,7 @@ def curve_changes(log: FlightLog, found: list[Response]) -> list[Change]:
         stick = log["u"][:, axis]
         if response.correlation < MIN_FOLLOWED or np.abs(stick).max() < MIN_STICK:
             continue
-        straight = 1.0 - min(response.correlation, MAX_CORRELATION) ** 2
+        straight = share_left(response.correlation)
         if straight < MIN_BENT * _unexplained_by_cubic(log, axis, stick, response):
             continue
         left = {name: _unexplained(log, axis, stick, response, name) for name in CURVES}
@@ -277,8 +280,7 @@ def _unexplained(
     def left(shape: np.ndarray) -> float:
         bent = CURVES[name](stick, *shape)[:, None]
         followed = windows.mean_of(log, follow(log, bent, response.delay_s, response.lag_s))
-        correlation = float(correlations_of(shown, followed)[0, 0])
-        return 1.0 - min(max(correlation, 0.0), MAX_CORRELATION) ** 2
+        return share_left(float(correlations_of(shown, followed)[0, 0]))
 
     def settings(start: tuple[float, float]) -> np.ndarray:
         return minimize(

@@ -8,7 +8,7 @@ negatively explains nothing.
 """
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -39,15 +39,11 @@ class Likelihoods(NamedTuple):
 
     Attributes:
         values: nats, (NUM_PARTS, ...); of which frames depends on the pair.
-        length_s: of each.
         correlations: of the three axes as they are logged.
-        sizes: root mean squares of both quantities' axes, (2, 3).
     """
 
     values: np.ndarray
-    length_s: float
     correlations: np.ndarray
-    sizes: np.ndarray
 
 
 def most_telling(found: list[Likelihoods]) -> Likelihoods | None:
@@ -125,20 +121,24 @@ def compare(
     for length_s, windows in useful_windows(log):
         shown = windows.rate_of(sums)
         measured = windows.mean_of(log, rates)
-        values = weight_of(length_s) * np.array(
-            [by_frame(shown[part], measured[part], floor) for part in parts_of(len(shown))]
-        )
+        values = [by_frame(shown[part], measured[part], floor) for part in parts_of(len(shown))]
         found.append(described(values, length_s, shown, measured))
     return most_telling(found)
 
 
 def described(
-    values: np.ndarray, length_s: float, shown: np.ndarray, measured: np.ndarray
+    by_part: Sequence[np.ndarray], length_s: float, shown: np.ndarray, measured: np.ndarray
 ) -> Likelihoods:
-    """Return likelihoods with what describes the two quantities, (num_windows, 3) each."""
-    correlations = np.diag(correlations_of(shown, measured))
-    sizes = np.sqrt(np.array([np.mean(shown**2, axis=0), np.mean(measured**2, axis=0)]))
-    return Likelihoods(values, length_s, correlations, sizes)
+    """Return likelihoods with the correlations of two quantities, (num_windows, 3) each.
+
+    Args:
+        by_part: nats of each part, as if all windows were independent.
+        length_s: of the windows.
+        shown: the first quantity.
+        measured: the second one.
+    """
+    values = weight_of(length_s) * np.array(by_part)
+    return Likelihoods(values, np.diag(correlations_of(shown, measured)))
 
 
 def compare_forces(
@@ -166,14 +166,10 @@ def compare_forces(
         changes = windows.rate_of(log["v"])
         means = windows.mean_of(log, products).reshape(-1, 3, 3, 3)
         turned = windows.mean_of(log, matrices.reshape(len(log), 9)).reshape(-1, 3, 3)
-        values = weight_of(length_s) * np.array(
-            [
-                _likelihoods_of_forces(
-                    changes[part], means[part], turned[part] if with_bias else None
-                )
-                for part in parts_of(len(changes))
-            ]
-        )
+        values = [
+            _likelihoods_of_forces(changes[part], means[part], turned[part] if with_bias else None)
+            for part in parts_of(len(changes))
+        ]
         forces = np.einsum("nijj->ni", means) - WEIGHT_W
         found.append(described(values, length_s, changes, forces))
     return most_telling(found)
@@ -236,9 +232,9 @@ def compare_thrust(log: FlightLog, attitude: Rotation) -> Likelihoods | None:
     for length_s, windows in useful_windows(log):
         changes = windows.rate_of(log["v"])
         axes = windows.mean_of(log, columns).reshape(-1, 3, 3)
-        values = weight_of(length_s) * np.array(
-            [_likelihoods_of_thrust(changes[part], axes[part]) for part in parts_of(len(changes))]
-        )
+        values = [
+            _likelihoods_of_thrust(changes[part], axes[part]) for part in parts_of(len(changes))
+        ]
         thrust = np.sum((changes + WEIGHT_W) * axes[:, :, 2], axis=1)
         forces = thrust[:, None] * axes[:, :, 2] - WEIGHT_W
         found.append(described(values, length_s, changes, forces))

@@ -103,19 +103,7 @@ def _pair(name: str, found: Likelihoods, is_allowed: np.ndarray, of_frames: np.n
     return Pair(name, verdict, correlations, unseen, evidence, margin)
 
 
-class Compared(NamedTuple):
-    """The pairs of a log.
-
-    Attributes:
-        pairs: that could be compared.
-        edges: the frames that they allow.
-    """
-
-    pairs: tuple[Pair, ...]
-    edges: Edges
-
-
-def compare_pairs(log: FlightLog) -> Compared:
+def compare_pairs(log: FlightLog) -> tuple[tuple[Pair, ...], Edges]:
     """Return the pairs of a log, and the frames that they allow."""
     rate_pair, rates = _compare_rates(log)
     force_pair, forces = _compare_forces(log, rates)
@@ -124,7 +112,7 @@ def compare_pairs(log: FlightLog) -> Compared:
     up_pair, force_up = _compare_up(log)
     every = (rate_pair, force_pair, position_pair, command_pair, up_pair)
     edges = Edges(rates, forces, positions, commands, force_up)
-    return Compared(tuple(pair for pair in every if pair is not None), edges)
+    return tuple(pair for pair in every if pair is not None), edges
 
 
 def _attitudes(log: FlightLog) -> list[Rotation]:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, ORANGE
 from flytrack_sysid.check.commands import compare_commands, follow, thinned
@@ -22,7 +21,7 @@ from flytrack_sysid.kinematics import (
     summed_turns,
 )
 from flytrack_sysid.log import FlightLog, time_in_line
-from flytrack_sysid.page import Bullets, Part, Picture, Section, Table, Verdict, page
+from flytrack_sysid.page import Bullets, Part, Picture, Section, Table, Verdict, page, write_report
 from flytrack_sysid.plots import png_of
 
 SHOWN_S = 20.0  # of flight in a picture: longer ones are black
@@ -173,6 +172,4 @@ def write_check(folder: str | Path, check: Check, log: FlightLog) -> list[Path]:
         "check.html": page(f"Check of {check.source}", sections, introduction).encode(),
         **pictures,
     }
-    for name, content in files.items():
-        write_atomically(Path(folder) / name, content)
-    return [Path(folder) / name for name in files]
+    return write_report(folder, files)

@@ -44,15 +44,14 @@ def _says(channel: str, kind: str, value: str | float | bool) -> str:
             "u_thrust": "upside down: more command is less thrust",
             "v_bat": "rises in flight, as no battery does: the charge used, or rows in reverse?",
         }[channel]
-    if kind == "axes":
-        names = BODY_NAMES if channel in BODY_CHANNELS else WORLD_NAMES
-        sticks = "roll, pitch, yaw are about" if channel == "u_rates" else "x, y, z hold"
+    if kind in ("axes", "body", "world"):
+        is_of_body = channel in BODY_CHANNELS if kind == "axes" else kind == "body"
+        names = BODY_NAMES if is_of_body else WORLD_NAMES
         known = f" ({names[str(value)]})" if str(value) in names else ""
-        return f"{sticks} {', '.join(str(value).split())}{known}"
-    if kind in ("body", "world"):
-        names = BODY_NAMES if kind == "body" else WORLD_NAMES
-        known = f" ({names[str(value)]})" if str(value) in names else ""
-        return f"the {kind}'s axes are {', '.join(str(value).split())}{known}"
+        what = f"the {kind}'s axes are"
+        if kind == "axes":
+            what = "roll, pitch, yaw are about" if channel == "u_rates" else "x, y, z hold"
+        return f"{what} {', '.join(str(value).split())}{known}"
     if kind == "scale":
         unit = unit_of(channel, float(value))
         return f"{float(value):.4g} times the true size" + (f": in {unit}" if unit else "")
@@ -74,9 +73,8 @@ def _says(channel: str, kind: str, value: str | float | bool) -> str:
 
 def list_explanations(explanations: Sequence[Sequence[Change]]) -> list[str]:
     """Return a line for each change, with the alternatives one after the other."""
-    lines = []
     common = [change for change in explanations[0] if all(change in one for one in explanations)]
-    lines += [f"  {describe(change)}" for change in common]
+    lines = [f"  {describe(change)}" for change in common]
     others = [[change for change in one if change not in common] for one in explanations]
     for number, alternative in enumerate(others[:MAX_SHOWN] if any(others) else []):
         text = "; ".join(map(describe, alternative)) or "nothing else"

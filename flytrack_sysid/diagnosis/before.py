@@ -7,7 +7,7 @@ and by a notable size. Uncertainty is estimated from the disagreement between se
 which includes the effect of the parts that the model lacks.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -19,6 +19,8 @@ from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.effects import BY_NAME, acts
 from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis.diagnose import (
+    Logs,
+    Report,
     Split,
     refined_within_range,
     split,
@@ -42,6 +44,7 @@ from flytrack_sysid.inference.score_test import (
     solve,
     threshold,
 )
+from flytrack_sysid.kinematics import low_pass
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_motion import check_same_origin
 
@@ -50,7 +53,6 @@ MAX_EFFECTS = 4  # that changed between two logs
 # constant of the low-pass; AFTERMATH_S is how long the rows after a jump do not count.
 JUMP, JUMP_S, AFTERMATH_S = 0.5, 0.05, 0.2
 WORSE = 1.5  # times what was left unexplained before: more than this is new
-Logs = FlightLog | Sequence[FlightLog]
 
 
 def _logs(logs: Logs) -> Sequence[FlightLog]:
@@ -136,7 +138,7 @@ def diagnose_change(
     before: Logs,
     model: ModelParameters | None = None,
     held_out: np.ndarray | None = None,
-    report: Callable[[int, int], None] = lambda done, stages: None,
+    report: Report = lambda done, stages: None,
     motion: Motion | None = None,
 ) -> Diagnosis:
     """Return the diagnosis of a log, in which causes are changes since an earlier log.
@@ -213,10 +215,8 @@ def calm(parts: Split) -> Split:
 def _calm(problem: Problem) -> Problem:
     record, counts = problem.chunks.record, problem.chunks.counts
     step_s = record.median_step_s
-    keep = np.exp(-step_s / JUMP_S)
     sticks = record.command[..., :3]
-    lagged = signal.lfilter([1.0 - keep], [1.0, -keep], sticks, axis=0)
-    is_jump = np.abs(sticks - lagged).sum(axis=-1) > JUMP
+    is_jump = np.abs(sticks - low_pass(sticks, step_s, JUMP_S)).sum(axis=-1) > JUMP
     rows = max(round(AFTERMATH_S / step_s), 1)
     follows = signal.lfilter(np.ones(rows), [1.0], is_jump.astype(float), axis=0) > 0.5
     quiet = counts & ~follows[..., None, None]

@@ -177,28 +177,34 @@ def _local(side: Side, quantity: str, shapes: Sequence[str], count: int) -> Iter
                 )
 
 
+def _powers(quantity: str, exponents: Iterable[float]) -> Iterator[tuple[str, tuple[Factor, ...]]]:
+    """Yield powers of a quantity, each with its frame."""
+    for exponent in exponents:
+        yield "body", (power(quantity, exponent),)
+
+
 def list_factors(side: Side) -> Iterator[tuple[str, tuple[Factor, ...]]]:
     """Yield the frames and factors that are tried."""
     airspeeds = ("airspeed_x", "airspeed_y", "airspeed_z", "edgewise", "airspeed")
     for quantity in airspeeds:
-        yield from (("body", (power(quantity, exponent),)) for exponent in (1.0, 2.0, 3.0))
+        yield from _powers(quantity, (1.0, 2.0, 3.0))
         yield from (
             ("body", (power("thrust", exponent), power(quantity))) for exponent in (0.5, 1.0)
         )
         yield "body", (power("thrust"), power(quantity, 2.0))
     for quantity in ("rate_x", "rate_y", "rate_z"):
-        yield from (("body", (power(quantity, exponent),)) for exponent in (1.0, 2.0))
+        yield from _powers(quantity, (1.0, 2.0))
         yield from (("body", (power(quantity), power(airspeed))) for airspeed in airspeeds[:3])
     yield "body", (power("rate_x"), power("rate_y"))
     yield "body", (power("rate_x"), power("rate_z"))
     yield "body", (power("rate_y"), power("rate_z"))
     for quantity in ("roll", "pitch", "yaw", "throttle"):
-        yield from (("body", (power(quantity, exponent),)) for exponent in (2.0, 3.0))
+        yield from _powers(quantity, (2.0, 3.0))
         yield from (("body", (factor,)) for factor in _local(side, quantity, ("bump", "step"), 5))
     # The voltage alone is not tried: within one flight it falls with the time.
     yield "body", (power("thrust"), power("voltage"))
     for quantity in ("tilt", "height"):
-        yield from (("body", (power(quantity, exponent),)) for exponent in (1.0, 2.0))
+        yield from _powers(quantity, (1.0, 2.0))
         yield from (("body", (factor,)) for factor in _local(side, quantity, ("bump",), 6))
         yield "body", (power("thrust"), power(quantity))
     span = float(np.ptp(side.spread("time")))

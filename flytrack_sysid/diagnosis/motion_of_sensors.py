@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import PAIRS, offset_between
 from flytrack_sysid.inference.score_test import solve
-from flytrack_sysid.kinematics import WEIGHT_W, attitude_of
+from flytrack_sysid.kinematics import WEIGHT_W, attitude_of, runs_of
 from flytrack_sysid.log import GAP_STEPS, FlightLog, median_step
 
 # The attitude that rotates the force of a step, as a share of the turn from the attitude before the
@@ -116,11 +116,10 @@ def _pieces(is_whole: np.ndarray, step_s: float) -> list[tuple[int, int]]:
         is_whole: the steps without a gap, (num_steps,) bool.
         step_s: the usual step.
     """
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_whole, [False]]).astype(int)))
     piece_steps, min_steps = round(PIECE_S / step_s), round(MIN_PIECE_S / step_s)
     cuts = (
         (start, min(start + piece_steps, last))
-        for first, last in edges.reshape(-1, 2)
+        for first, last in runs_of(is_whole, np.zeros_like(is_whole))
         for start in range(first, last, piece_steps)
     )
     return [(start, end) for start, end in cuts if end - start >= min_steps]

@@ -11,7 +11,7 @@ Times are those of one clock. A log whose time goes back is of several flights, 
 for changes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -343,6 +343,11 @@ def active_windows(selection: Selection) -> list[Window]:
     return windows_of(selection.state, selection.model)
 
 
+def rows_of(windows: Iterable[Window]) -> set[int]:
+    """Return the rows of the record at which windows begin or end within a log."""
+    return {row for one in windows for row in (one.start, one.end)} - {ALWAYS, NEVER}
+
+
 def ended(selection: Selection) -> list[str]:
     """Return the effects that end within the log."""
     return [window.effect for window in active_windows(selection) if window.end != NEVER]
@@ -358,10 +363,7 @@ def at_end(selection: Selection, model: FittedModel) -> FittedModel:
 
 def first_row_as_at_end(selection: Selection, test: Problem) -> int:
     """Return the row of the log after which the same effects act as at its end."""
-    rows = {row for window in active_windows(selection) for row in (window.start, window.end)} - {
-        ALWAYS,
-        NEVER,
-    }
+    rows = rows_of(active_windows(selection))
     return int(np.ceil(log_rows(selection.state.problem, test, [max(rows)])[0])) if rows else 0
 
 
@@ -445,11 +447,7 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     )
     state, model = with_refitted_noise(at_best_row(state, test, model, first.row), model)
     state, base, model = extended(state, state.fitted((), selection.base.vector), model)
-    new_rows, old_rows = (
-        {row for one in windows for row in (one.start, one.end)}
-        for windows in (windows_of(state, model), selection.state.problem.windows)
-    )
-    rows = new_rows - old_rows - {ALWAYS, NEVER}
+    rows = rows_of(windows_of(state, model)) - rows_of(selection.state.problem.windows)
     if rows:
         state = at_best_row(state, test, model, max(rows))
     tried = Selection(state, base, state.fitted(model.candidates, model.vector), {})

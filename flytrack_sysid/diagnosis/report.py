@@ -553,7 +553,6 @@ def write_diagnosis(folder: str | Path, diagnosis: Diagnosis, log: FlightLog) ->
         OSError: a file cannot be written.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     content = diagnosis.as_json()
     provenance = {
         "tool": f"flytrack_sysid.diagnose {__version__}",

@@ -17,7 +17,8 @@ from flytrack_env.dynamics import ModelParameters, advance, body_rates, observe_
 from flytrack_env.effects import MAX_DELAY_STEPS, ImuLatency, at_row, start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
-from flytrack_sysid.inference.one_step import SETTLING_S, in_float64
+from flytrack_sysid.inference.one_step import SETTLING_S
+from flytrack_sysid.inference.parameters import in_float64
 from flytrack_sysid.inference.record import Filled, Record, build_record, fill_gaps
 from flytrack_sysid.inference.replay import measured_drone, where_true
 from flytrack_sysid.inference.trace_cache import fast_jit
@@ -150,7 +151,7 @@ def _windows_at(filled: Filled, starts: np.ndarray) -> Windows:
     begins = np.flatnonzero(log.is_start())
     first = begins[np.searchsorted(begins, starts, side="right") - 1]
     index = np.clip(starts + np.arange(-lead, ends[-1] + 1)[:, None], first, len(log) - 1)
-    gyro_b = log["w"] if "w" in log else np.zeros((len(log), 3))
+    gyro_b = log.channels.get("w", np.zeros((len(log), 3)))
     return Windows(
         record=Record(*(leaf[index] for leaf in build_record(filled))),
         is_free=np.arange(len(index)) > lead,
