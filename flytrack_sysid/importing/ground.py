@@ -16,7 +16,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_sysid.kinematics import GRAVITY, attitude_of, derivative, since_first, summed_turns
+from flytrack_sysid.kinematics import (
+    GRAVITY,
+    attitude_of,
+    derivative,
+    runs_of,
+    since_first,
+    summed_turns,
+)
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.plausibility import MIN_ROWS, MIN_S
 
@@ -148,8 +155,8 @@ def _ground_rows(log: FlightLog, blocks: _Blocks, hover: float) -> np.ndarray:
     is_low = blocks.throttle < LOW * hover
     is_ground = np.zeros(len(is_low), bool)
     is_candidate = blocks.is_at_rest & (blocks.throttle < SPOOLING * hover)
-    for start, end in _runs(is_candidate, blocks.is_start):
-        low_runs = _runs(is_low[start:end], blocks.is_start[start:end])
+    for start, end in runs_of(is_candidate, blocks.is_start):
+        low_runs = runs_of(is_low[start:end], blocks.is_start[start:end])
         longest_low = max((stop - begin for begin, stop in low_runs), default=0)
         if longest_low * BLOCK_S >= MIN_REST_S and not _is_descent(log, blocks, is_low, start, end):
             is_ground[start:end] = True
@@ -166,14 +173,6 @@ def _ground_rows(log: FlightLog, blocks: _Blocks, hover: float) -> np.ndarray:
     never_moves = blocks.is_at_rest[~is_ground].all()
     is_too_short = flown_s < MIN_S or np.sum(~rows) < MIN_ROWS
     return np.ones(len(rows), bool) if never_moves or is_too_short else rows
-
-
-def _runs(is_in: np.ndarray, is_start: np.ndarray) -> list[tuple[int, int]]:
-    """Return start and end of each run of True, none across the start of a segment."""
-    before = np.append(False, is_in[:-1])
-    starts = np.flatnonzero(is_in & (~before | is_start))
-    after = np.append(is_in[1:] & ~is_start[1:], False)
-    return list(zip(starts, np.flatnonzero(is_in & ~after) + 1, strict=True))
 
 
 def _is_descent(log: FlightLog, blocks: _Blocks, is_low: np.ndarray, start: int, end: int) -> bool:

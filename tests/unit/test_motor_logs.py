@@ -61,7 +61,7 @@ def test_a_known_craft_has_a_frame_that_a_mapping_may_change(log, tmp_path):
 
 
 def test_stated_numbers_replace_those_of_a_known_craft_whatever_they_are(monkeypatch):
-    crafts = mapping._load(mapping.FRAMES)
+    crafts = mapping.load_toml(mapping.FRAMES)
     crafts["crazyflie_2"] |= {"propellers": "out", "rotor_momentum": 1e-6}
     monkeypatch.setattr(mapping, "_load", lambda path: crafts)
     known = Frame(craft="crazyflie_2").known()
