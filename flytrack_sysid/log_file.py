@@ -100,8 +100,9 @@ def gaps_of(log: FlightLog) -> np.ndarray:
 
     After these rows, the time step exceeds 1.5 times the median step of the segment.
     """
-    is_inside = log.segment[1:] == log.segment[:-1]
-    return np.flatnonzero(is_inside & (np.diff(log.time) > GAP_STEPS * usual_step(log)[:-1]))
+    return np.flatnonzero(
+        ~log.is_start()[1:] & (np.diff(log.time) > GAP_STEPS * usual_step(log)[:-1])
+    )
 
 
 def describe(log: FlightLog) -> str:

@@ -1,7 +1,7 @@
 """One self-contained HTML page of text, tables and pictures; nothing is loaded from elsewhere."""
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from string import Template
@@ -106,6 +106,22 @@ def page(title: str, sections: Sequence[Section], introduction: Sequence[Part] =
         body.append(f"<section>\n<h2>{escape(section.heading)}</h2>\n{parts}\n</section>")
     content = "\n".join(body)
     return _PAGE.substitute(title=escape(title), style=_STYLE, content=content)
+
+
+def text_table(
+    rows: Sequence[Sequence[str]], justify: Callable[[str, int], str] = str.ljust
+) -> list[str]:
+    """Return rows of cells as lines of text with aligned columns.
+
+    Args:
+        rows: of cells, the header first.
+        justify: pads the cells of all columns but the first.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join([first.ljust(widths[0]), *map(justify, others, widths[1:])]).rstrip()
+        for first, *others in rows
+    ]
 
 
 def write_report(folder: str | Path, files: Mapping[str, bytes]) -> list[Path]:

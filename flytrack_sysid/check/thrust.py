@@ -141,9 +141,9 @@ def motor_changes(log: FlightLog, motors: np.ndarray) -> list[tuple[Change, ...]
     if highest - best[0, 1, 2, 3] < MARGIN:
         return [()]
     alike = [order for order, value in best.items() if value > highest - MARGIN]
-    fewest = min(sum(k != motor for k, motor in enumerate(order)) for order in alike)
+    moved = [sum(k != motor for k, motor in enumerate(order)) for order in alike]
     return [
         (Change("motors", "order", " ".join(str(motor + 1) for motor in order)),)
-        for order in alike
-        if sum(k != motor for k, motor in enumerate(order)) == fewest
+        for order, count in zip(alike, moved, strict=True)
+        if count == min(moved)
     ]

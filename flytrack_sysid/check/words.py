@@ -11,6 +11,7 @@ from flytrack_sysid.check.pairs import CONTRADICTS, STILL, Pair
 from flytrack_sysid.check.result import Check
 from flytrack_sysid.check.scales import unit_of
 from flytrack_sysid.log import CHANNELS
+from flytrack_sysid.page import text_table
 
 MAX_SHOWN = 4  # alternatives
 # Frames that have names, of a body's and of a world's axes.
@@ -124,12 +125,7 @@ def verdict_of(check: Check) -> str:
 
 def text_of(check: Check) -> str:
     """Return a check as plain text: a table of the pairs, and what explains contradictions."""
-    rows = [list(HEADER), *map(row_of, check.pairs)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(HEADER))]
-    table = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
+    table = text_table([HEADER, *map(row_of, check.pairs)])
     lines = [f"{check.source}: {len(check.pairs)} pairs of channels", *table, verdict_of(check)]
     if any(check.explanations):
         lines += list_explanations(check.explanations)
@@ -145,6 +141,5 @@ def problems_of(check: Check) -> list[str]:
     )
     if not any(check.explanations):
         return [f"{pairs}: no change of conventions explains it"]
-    lines = [line.strip() for line in list_explanations(check.explanations)]
-    text = "; ".join(lines)
+    text = "; ".join(line.strip() for line in list_explanations(check.explanations))
     return [f"found channels that contradict each other; they agree if {text}"]

@@ -146,8 +146,11 @@ def find_changes(
     if not len(seconds[1]):
         return []
     best: dict[str, Hypothesis] = {}
-    others = candidates_for(linearization.problem)
-    others = [candidate for candidate in others if candidate.effect not in model.effects]
+    others = [
+        candidate
+        for candidate in candidates_for(linearization.problem)
+        if candidate.effect not in model.effects
+    ]
     for candidate in (*model.candidates, *others):
         if candidate.effect in lacking:
             continue
@@ -190,10 +193,9 @@ def _change_of(
     index = int(np.argmax(gains))
     inflation = _inflation(score, information, given, changing, weights[way][index])
     row = int(changes[index]) if way != "drift" else 0
-    names = [linearization.problem.names[linearization.indices[column]] for column in columns]
     growth = -steps[index] if way == "end" else steps[index]
     by_name = {
-        names[columns.index(column)]: float(step)
+        candidate.fields[columns.index(column)]: float(step)
         for column, step in zip(changing, growth, strict=True)
         if is_named
     }
@@ -454,7 +456,7 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     if misfit(tried, test) >= misfit(selection, test):
         return None  # before the effects are selected, which takes longest
     later = select(state, base, tried.model)
-    later = later._replace(state=windowed(later.state, windows_of(later.state, later.model)))
+    later = later._replace(state=windowed(later.state, active_windows(later)))
     misfit_changes = [
         misfit(later, problem) - misfit(selection, problem)
         for problem in (selection.state.problem, test)

@@ -465,8 +465,8 @@ def with_refined_values(
         prefix = f"{cause.effect}." if cause.effect in BY_NAME else ""
         determined = [prefix + name for name in cause.parameters if prefix + name in problem.names]
         fitted = [problem.names[index] for index in half if prefix]
-        fields = [*determined, *(field for field in fitted if field.startswith(prefix))]
-        fields = list(dict.fromkeys(fields))
+        of_cause = (field for field in fitted if field.startswith(prefix))
+        fields = list(dict.fromkeys([*determined, *of_cause]))
         values = dict(cause.parameters)
         for field in fields:
             index, name = problem.names.index(field), field.split(".")[-1]

@@ -264,10 +264,10 @@ def _channels(table: Table, headers: _Headers) -> dict[str, np.ndarray]:
         channels["f"] = table.matrix(ACCELEROMETER) * GRAVITY / g_unit
     if BATTERY in table.columns:
         channels["v_bat"] = table.matrix([BATTERY]) * UNITS["voltage"]["cV"]
-    vector = (
-        table.matrix(ATTITUDE) / UNIT_QUATERNION if table.columns.keys() >= set(ATTITUDE) else None
-    )
-    if vector is None or not np.any(vector):
+    if not table.columns.keys() >= set(ATTITUDE):
+        return channels
+    vector = table.matrix(ATTITUDE) / UNIT_QUATERNION
+    if not np.any(vector):
         return channels
     size = np.linalg.norm(vector, axis=1, keepdims=True)
     channels["q"] = np.column_stack(

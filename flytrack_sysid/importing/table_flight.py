@@ -45,12 +45,8 @@ def channels_in(
         if fitting:
             result.append((channel, fitting[0]))
         elif not (channel.is_optional and not any(map(any, counts))):
-            nearest_table = max(
-                range(len(counts)), key=lambda number: sum(map(bool, counts[number])), default=None
-            )
-            count = (
-                counts[nearest_table] if nearest_table is not None else [0] * len(channel.columns)
-            )
+            absent = [0] * len(channel.columns)
+            count = max(counts, key=lambda found: sum(map(bool, found)), default=absent)
             column, times = next(
                 (c, n) for c, n in zip(channel.columns, count, strict=True) if n != 1
             )

@@ -71,6 +71,11 @@ class Chunks(NamedTuple):
         return int(self.counts.any(axis=(2, 3)).sum())
 
 
+def of_row_before(values: np.ndarray) -> np.ndarray:
+    """Return the values, (rows, ...), of the row before each row; of the first, its own."""
+    return np.concatenate([values[:1], values[:-1]])
+
+
 def count_lead_in(rows: int) -> int:
     """Return the number of a chunk's rows that are its lead-in."""
     return rows * LEAD_IN_S // PIECES

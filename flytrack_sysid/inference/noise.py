@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.fusion import one_kernel
-from flytrack_sysid.inference.chunks import NUM_AXES, Chunks
+from flytrack_sysid.inference.chunks import NUM_AXES, Chunks, of_row_before
 from flytrack_sysid.inference.trace_cache import fast_jit
 
 # Variance of a level at its first row, over that of its noise: its first innovation is about 0.
@@ -321,8 +321,7 @@ class Whitener:
 
 def step_to(chunks: Chunks) -> np.ndarray:
     """Return the time since the row before (s), (rows, chunks)."""
-    step_s = chunks.record.step_s
-    return np.concatenate([step_s[:1], step_s[:-1]])
+    return of_row_before(chunks.record.step_s)
 
 
 def noise_of(log_noise: jax.Array | np.ndarray) -> Noise:
