@@ -100,8 +100,8 @@ def compare_commands(log: FlightLog) -> Followed | None:
     by_lag = {lag_s: lagged(log, log["u"][:, :3], lag_s) for lag_s in LAGS_S}
     for lag_s, delay_s in product(LAGS_S, DELAYS_S):
         commands = windows.mean_of(log, read_at(log, by_lag[lag_s], -delay_s))
-        values = [by_frame(rates[part], commands[part], RATE_FLOOR) for part in parts_of(count)]
-        likelihoods = described(values, WINDOWS_S[0], rates, commands)
+        by_part = [by_frame(rates[part], commands[part], RATE_FLOOR) for part in parts_of(count)]
+        likelihoods = described(by_part, WINDOWS_S[0], rates, commands)
         found.append(Followed(likelihoods, float(delay_s), lag_s))
     # Each frame has the delay and the lag under which it fits best.
     totals = np.array([one.likelihoods.values.sum(axis=0) for one in found])

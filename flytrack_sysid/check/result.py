@@ -251,8 +251,7 @@ def explain_frames(log: FlightLog) -> Framed:
     def explained(scaled: FlightLog) -> Framed:
         pairs, edges = compare_pairs(scaled)
         frames = explain(channels, edges)
-        scales = scale_changes(corrected(log, frames[0])) if frames else [()]
-        return pairs, frames, scales
+        return pairs, frames, scale_changes(corrected(log, frames[0])) if frames else [()]
 
     found = explained(log)
     whole = tuple(change for change in found[2][0] if "_" not in change.channel)
