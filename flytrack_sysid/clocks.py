@@ -18,11 +18,16 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
-from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_sysid.kinematics import GRAVITY, summed_turns
-from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
+from flytrack_sysid.kinematics import (
+    acceleration_of,
+    attitude_of,
+    jackknife_error,
+    segments_of,
+    summed_turns,
+)
+from flytrack_sysid.log import GAP_STEPS, FlightLog, median_step, usual_step
 from flytrack_sysid.resample import interpolate, interpolate_quaternions
 
 MAX_OFFSET_S = 0.25  # above, a logger is broken rather than late
@@ -102,20 +107,11 @@ class _Stretch(NamedTuple):
         return tuple(values - values.mean(axis=0) for values in (self.change, integral, slope))
 
 
-def _turns(log: FlightLog) -> np.ndarray:
-    return summed_turns(Rotation.from_quat(log["q"], scalar_first=True))
-
-
-def _acceleration(log: FlightLog) -> np.ndarray:
-    force_w = Rotation.from_quat(log["q"], scalar_first=True).apply(log["f"])
-    return force_w - np.array([0.0, 0.0, GRAVITY])
-
-
 # Channel, reference, required channels, and the integrated channel and its rate as functions of the
 # log. In this order each reference is corrected before it is used.
 PAIRS = (
-    ("q", "w", ("q", "w"), _turns, lambda log: log["w"]),
-    ("v", "f", ("v", "f", "q"), lambda log: log["v"], _acceleration),
+    ("q", "w", ("q", "w"), lambda log: summed_turns(attitude_of(log)), lambda log: log["w"]),
+    ("v", "f", ("v", "f", "q"), lambda log: log["v"], acceleration_of),
     ("p", "v", ("p", "v"), lambda log: log["p"], lambda log: log["v"]),
 )
 
@@ -230,9 +226,8 @@ def offset_between(
         reason = "the costs around it have no minimum: they do not show one motion clearly"
         return *unknown, f"offset unknown: {reason}"
     jackknife = (numerator.sum() - numerator) / (denominator.sum() - denominator)
-    count = len(jackknife)
-    sigma = float(np.sqrt((count - 1) / count * np.sum((jackknife - jackknife.mean()) ** 2)))
-    return offset, sigma * max(denominator.sum() / curvature, 1.0), correlation, ""
+    sigma = jackknife_error(jackknife) * max(denominator.sum() / curvature, 1.0)
+    return offset, sigma, correlation, ""
 
 
 def read_later(
@@ -245,11 +240,10 @@ def read_later(
         is_known: (num_rows,) bool.
     """
     channels_later, is_known = dict(log.channels), np.ones(len(log), bool)
-    bounds = np.append(np.flatnonzero(log.is_start()), len(log))
     for channel in channels:
         values, is_known_here = np.array(log[channel], float), np.zeros(len(log), bool)
         interpolate_channel = interpolate_quaternions if channel == "q" else interpolate
-        for rows in (slice(start, end) for start, end in pairwise(bounds)):
+        for rows in segments_of(log):
             times = log.time[rows]
             values[rows], is_known_here[rows] = interpolate_channel(
                 times, log[channel][rows], times + offset_s
@@ -271,7 +265,7 @@ def align_clocks(log: FlightLog, correct: bool = True) -> tuple[FlightLog, tuple
         if any(name not in log for name in required):
             continue
         offset, sigma, correlation, verdict = offset_between(aligned, sums(aligned), rates(aligned))
-        step = float(np.median(usual_step(aligned)))
+        step = median_step(aligned)
         if not verdict and (abs(offset) <= SIGNIFICANT * sigma or abs(offset) <= MIN_STEPS * step):
             verdict = "not significant, left"
         elif not verdict:
@@ -295,9 +289,7 @@ def on_one_clock(log: FlightLog) -> tuple[FlightLog, np.ndarray, list[str]]:
         notes: one on each corrected clock.
     """
     pose_s, notes, is_kept = 0.0, [], np.ones(len(log), bool)
-    slack_s = 0.5 * float(
-        np.median(usual_step(log))
-    )  # the force of a simulator may be that of half a step before
+    slack_s = 0.5 * median_step(log)  # the force of a simulator may be that of half a step before
     for channel, reference, required, sums, rates in PAIRS:
         if any(name not in log for name in required):
             continue
@@ -341,7 +333,7 @@ def with_causal_commands(
     turns = np.cumsum(log["w"] * usual_step(log)[:, None], axis=0)
     commanded = log["u"][:, :3] * np.deg2rad(np.asarray(model.max_rate))
     lag_s, sigma_s, _, reason = offset_between(log, turns, commanded)
-    step_s = float(np.median(usual_step(log)))
+    step_s = median_step(log)
     if reason or lag_s >= -(max(LATE_ERRORS * sigma_s, LATE_S) + step_s):
         return log, all_rows, []
     late_rows = round((float(np.mean(np.asarray(model.tau)[:2])) - lag_s) / step_s)

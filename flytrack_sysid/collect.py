@@ -20,8 +20,9 @@ from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.plants import Plant
 from flytrack_env.state import ACCELERATION, STATE_SIZE, pack, unpack, unpack_action
 from flytrack_sysid import excitation
-from flytrack_sysid.excitation import DT_S, MIDDLE_V, MIN_STEPS, VOLTAGES
+from flytrack_sysid.excitation import DT_S, MIN_STEPS, VOLTAGES
 from flytrack_sysid.log import FlightLog, log_of_states
+from flytrack_sysid.log_voltage import voltages_of
 from flytrack_sysid.script_file import Script, build_script, check_script
 from flytrack_sysid.sensors import LOST_ROWS, measure
 
@@ -104,7 +105,7 @@ def _fly_any(plant: Plant | StepFunction, report: Report) -> Fly:
     return _fly_plant(plant) if isinstance(plant, Plant) else _fly_function(plant, report)
 
 
-def find_hover(fly: Fly, middle_v: float = MIDDLE_V) -> float:
+def find_hover(fly: Fly, middle_v: float) -> float:
     """Return the thrust action at which a plant, level and at rest, holds its weight.
 
     Raises:
@@ -125,13 +126,8 @@ def find_hover(fly: Fly, middle_v: float = MIDDLE_V) -> float:
             f"{middle_v:g} V; expected it to sink and to climb"
         )
     first_climbing = int(np.argmax(climb > 0.0))
-    return float(
-        np.interp(
-            0.0,
-            climb[first_climbing - 1 : first_climbing + 1],
-            actions[first_climbing - 1 : first_climbing + 1],
-        )
-    )
+    around = slice(first_climbing - 1, first_climbing + 1)
+    return float(np.interp(0.0, climb[around], actions[around]))
 
 
 def collect(
@@ -167,7 +163,7 @@ def collect(
     rng = np.random.default_rng(seed)
     fly = _fly_any(plant, report)
     battery = plant.battery if isinstance(plant, Plant) else None
-    voltages = VOLTAGES if battery is None else (float(battery.empty_v), float(battery.full_v))
+    voltages = VOLTAGES if battery is None else voltages_of(battery)
     if script is None:
         hover = find_hover(_fly_any(plant, lambda done, total: None), 0.5 * sum(voltages))
         num_flights = round(minutes * 60.0 / SECONDS_PER_FLIGHT)

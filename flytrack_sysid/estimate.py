@@ -20,7 +20,7 @@ Centring removes the value at the start of a window, which is measured with nois
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -45,6 +45,7 @@ LAST_STEPS = (
     0,
     3,
 )  # full Gauss-Newton steps at the end of each round: only the last round has to be exact
+Report = Callable[[int, int], None]
 LAST_RISE = 1e-10  # relative rise of the cost in such a step that may be rounding
 
 
@@ -320,7 +321,7 @@ def estimate(
     scored_rows: np.ndarray,
     start: ModelParameters,
     free: tuple[str, ...],
-    report: Callable[[int, int], None] = lambda done, rounds: None,
+    report: Report = lambda done, rounds: None,
 ) -> Estimate:
     """Return the least squares estimate of a model's free parameters from the scored rows of a log.
 
@@ -331,7 +332,7 @@ def estimate(
         FitError: the search diverged, or no residual depends on a parameter.
     """
     with threadpool_limits(1, "blas"), jax.enable_x64(True):
-        model: Any = jax.tree.map(lambda leaf: np.asarray(leaf, float), start)
+        model = parameters.in_float64(start)
         noise = FIRST_NOISE
         for round_index, steps in enumerate(LAST_STEPS):
             problem = replace(Channels.of_log(log, scored_rows, model), noise=noise)

@@ -43,8 +43,8 @@ RESERVE_V = 0.1
 
 def is_inside(
     states: np.ndarray,
-    heights: tuple[float, float] = HEIGHTS,
-    voltages: tuple[float, float] = VOLTAGES,
+    heights: tuple[float, float],
+    voltages: tuple[float, float],
 ) -> np.ndarray:
     """Return where states are within the envelope; NaN is outside.
 
@@ -162,27 +162,25 @@ def _flight(
     if kind == "thrust":
         name = ("sine", "step", "doublet", "chirp")[number]
         command[:, 3] = np.append(wave(name, rng), switching(rng, 0.5, SLOW_STEPS)[SLOT_STEPS:])
-        return ScriptedFlight(
-            kind, start_state(rng, voltage, hover, rng.uniform(0.0, 20.0), 0.0), command
-        )
-    command[:, 2] = switching(rng)
-    if kind == "free":
+        tilts_deg, speed = (0.0, 20.0), 0.0
+    elif kind == "free":
+        command[:, 2] = switching(rng)
         amplitude = FREE_AMPLITUDES[number]
         command[:, :2] = amplitude * np.stack([switching(rng), switching(rng)], axis=1)
         command[:, 3] = switching(rng, smallest=0.0)
-        return ScriptedFlight(
-            kind, start_state(rng, voltage, hover, rng.uniform(20.0, 80.0), 0.0), command
-        )
-    time = np.arange(FLIGHT_STEPS) * DT_S
-    slow = [
-        np.sin(2 * np.pi * rng.uniform(0.5, 1.5) * time + rng.uniform(0, 2 * np.pi))
-        for _ in range(3)
-    ]
-    command[:, :2] = LEG_STICK * np.stack(slow[:2], axis=1)
-    command[:, 3] += LEG_SWING * slow[2]
-    return ScriptedFlight(
-        kind, start_state(rng, voltage, hover, rng.uniform(10.0, 50.0), LEG_SPEEDS[number]), command
-    )
+        tilts_deg, speed = (20.0, 80.0), 0.0
+    else:
+        command[:, 2] = switching(rng)
+        time = np.arange(FLIGHT_STEPS) * DT_S
+        slow = [
+            np.sin(2 * np.pi * rng.uniform(0.5, 1.5) * time + rng.uniform(0, 2 * np.pi))
+            for _ in range(3)
+        ]
+        command[:, :2] = LEG_STICK * np.stack(slow[:2], axis=1)
+        command[:, 3] += LEG_SWING * slow[2]
+        tilts_deg, speed = (10.0, 50.0), LEG_SPEEDS[number]
+    start = start_state(rng, voltage, hover, rng.uniform(*tilts_deg), speed)
+    return ScriptedFlight(kind, start, command)
 
 
 def _voltages(

@@ -1,6 +1,6 @@
 """Identify a model from a flight log: lags, thrust map, battery drain, and chosen effects."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from flytrack_env.dynamics import ModelParameters, collective_thrust, nominal_pa
 from flytrack_env.effects import BY_NAME, effect_of
 from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis.result import TWO_SIDED_95
-from flytrack_sysid.estimate import Estimate, FitError, estimate
+from flytrack_sysid.estimate import Estimate, FitError, Report, estimate
 from flytrack_sysid.inference.parameters import (
     DRAIN,
     TAU_RANGE,
@@ -25,7 +25,7 @@ from flytrack_sysid.inference.parameters import (
     names_of,
     neutral_value,
     range_of,
-    to_vector,
+    values_of,
     with_neutral_effects,
     with_values,
 )
@@ -37,6 +37,7 @@ from flytrack_sysid.log_voltage import (
     flown_voltages,
     is_within,
     voltage_notes,
+    voltages_of,
     with_voltage,
 )
 from flytrack_sysid.plausibility import check_plausible
@@ -178,10 +179,9 @@ def _free_names(
 
 
 def _intervals(result: Estimate) -> dict[str, Interval]:
-    values = dict(zip(names_of(result.model), to_vector(result.model), strict=True))
-    intervals = {}
+    values, intervals = values_of(result.model), {}
     for name, deviation in zip(result.free, np.sqrt(np.diag(result.covariance)), strict=True):
-        value, half = float(values[name]), float(TWO_SIDED_95 * deviation)
+        value, half = values[name], float(TWO_SIDED_95 * deviation)
         if name in TAUS:  # symmetric in the logarithm, so that no time is negative
             factor = np.exp(min(half / value, np.log(TAU_RANGE.high / TAU_RANGE.low)))
             intervals[name] = Interval(value, float(value / factor), float(value * factor))
@@ -200,7 +200,7 @@ def _map_uncertainty(result: Estimate, log: FlightLog) -> MapUncertainty | None:
         return None
     low, high = flown_voltages(log)
     if is_within((low, high), result.model.battery):
-        low, high = float(result.model.battery.empty_v), float(result.model.battery.full_v)
+        low, high = voltages_of(result.model.battery)
     action, battery_v = np.meshgrid(
         np.linspace(-1, 1, BOX_ACTIONS), np.linspace(low, high, BOX_VOLTAGES)
     )
@@ -294,7 +294,7 @@ def fit(
     fixed: Mapping[str, float] | None = None,
     effects: Iterable[str] = (),
     every: int = HELD_OUT_EVERY,
-    report: Callable[[int, int], None] = lambda done, rounds: None,
+    report: Report = lambda done, rounds: None,
     motion: Motion | None = None,
     accept: bool = False,
 ) -> Fit:
@@ -402,7 +402,7 @@ def _likely_cause(log: FlightLog, tau: str) -> str:
 
 def _check_result(result: Estimate, log: FlightLog, scored_rows: np.ndarray) -> None:
     """Raise FitError if the best model is not plausible for a drone."""
-    values = dict(zip(names_of(result.model), to_vector(result.model), strict=True))
+    values = values_of(result.model)
     for name in TAUS:
         if (
             name in result.free

@@ -1,5 +1,6 @@
 """The page of a fleet: Markdown, and a picture of all flights."""
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,6 @@ import matplotlib
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from flytrack_env.files import write_atomically
 from flytrack_env.messages import quote_name
 from flytrack_env.pictures.drawing import png_of
 from flytrack_sysid.fleet import (
@@ -21,6 +21,7 @@ from flytrack_sysid.fleet import (
     Flight,
     names_of,
 )
+from flytrack_sysid.page import write_report
 
 PAGE, PICTURE = "fleet.md", "fleet.png"
 COLOURS = {  # of the picture; causes have others
@@ -37,10 +38,9 @@ Results = dict[str, dict[str, Any]]
 
 def standing(diagnosed: Sequence[dict[str, Any]], changed: set[str]) -> list[str]:
     """Return causes that most flights of a craft name, but for those that changed."""
-    counts: dict[str, int] = {}
-    for result in diagnosed:
-        for cause in result["diagnosis"]["causes"]:
-            counts[cause["effect"]] = counts.get(cause["effect"], 0) + 1
+    counts = Counter(
+        cause["effect"] for result in diagnosed for cause in result["diagnosis"]["causes"]
+    )
     return [
         f"{effect} ({count} of {len(diagnosed)} flights)"
         for effect, count in sorted(counts.items())
@@ -168,7 +168,5 @@ def write_fleet(
     out: Path, flights: Sequence[Flight], results: Results, changes: Sequence[Change]
 ) -> list[Path]:
     """Write the page and its picture; return their paths."""
-    page, picture = out / PAGE, out / PICTURE
-    write_atomically(picture, png_of(draw_fleet(flights, results, changes)))
-    write_atomically(page, format_page(flights, results, changes).encode())
-    return [page, picture]
+    page = format_page(flights, results, changes).encode()
+    return write_report(out, {PAGE: page, PICTURE: png_of(draw_fleet(flights, results, changes))})

@@ -4,12 +4,14 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_sysid.log import FlightLog
 
 GRAVITY = float(nominal_parameters().g)  # m/s^2
+WEIGHT_W = np.array([0.0, 0.0, GRAVITY])  # specific force at rest, world frame
 WINDOWS_S = (0.1, 0.3, 1.0)  # long against the noise of a sample; short ones for fast manoeuvres
 
 
@@ -26,23 +28,22 @@ class Windows(NamedTuple):
     ends: np.ndarray
     durations: np.ndarray
 
-    def change_of(self, values: np.ndarray) -> np.ndarray:
-        """Return the change of values, (num_rows, ...), over each window."""
-        return values[self.ends] - values[self.starts]
+    def rate_of(self, values: np.ndarray) -> np.ndarray:
+        """Return the change of values, (num_rows, n), over each window, a second."""
+        return (values[self.ends] - values[self.starts]) / self.durations[:, None]
 
     def mean_of(self, log: FlightLog, values: np.ndarray) -> np.ndarray:
         """Return the mean of values, (num_rows, n), over each window; linear between rows."""
         steps = np.diff(log.time)[:, None] * 0.5 * (values[1:] + values[:-1])
         integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
-        return self.change_of(integral) / self.durations[:, None]
+        return self.rate_of(integral)
 
 
 def cut_windows(log: FlightLog, length_s: float) -> Windows:
     """Return the windows of a log, without those that a gap makes more than twice as long."""
     is_start = log.is_start()
     flight = np.cumsum(is_start) - 1
-    since_start = log.time - log.time[is_start][flight]
-    window = np.floor(since_start / length_s)
+    window = np.floor(since_first(log.time, is_start) / length_s)
     edges = np.flatnonzero(is_start | np.append(True, np.diff(window) > 0))
     starts, ends = edges[:-1], edges[1:]
     durations = log.time[ends] - log.time[starts]
@@ -50,6 +51,26 @@ def cut_windows(log: FlightLog, length_s: float) -> Windows:
     max_duration = 2.0 * max(length_s, np.median(steps)) if len(steps) else 0.0
     keep = (flight[starts] == flight[ends]) & (durations <= max_duration)
     return Windows(starts[keep], ends[keep], durations[keep])
+
+
+def since_first(values: np.ndarray, is_first: np.ndarray) -> np.ndarray:
+    """Return values, (num_rows, ...), less those of the last row before or at each that is first.
+
+    Args:
+        values: (num_rows, ...).
+        is_first: rows at which counting starts anew, the first row among them, (num_rows,) bool.
+    """
+    return values - values[is_first][np.cumsum(is_first) - 1]
+
+
+def attitude_of(log: FlightLog) -> Rotation:
+    """Return the attitude of a log's rows."""
+    return Rotation.from_quat(log["q"], scalar_first=True)
+
+
+def acceleration_of(log: FlightLog) -> np.ndarray:
+    """Return the acceleration by accelerometer and attitude, world frame, (num_rows, 3) m/s^2."""
+    return attitude_of(log).apply(log["f"]) - WEIGHT_W
 
 
 def summed_turns(attitude: Rotation) -> np.ndarray:
@@ -75,6 +96,33 @@ def segments_of(log: FlightLog) -> list[slice]:
     return [slice(start, end) for start, end in pairwise(edges)]
 
 
+def runs_of(is_in: np.ndarray, is_start: np.ndarray) -> list[tuple[int, int]]:
+    """Return start and end of each run of True, none across the start of a segment.
+
+    Args:
+        is_in: (num_rows,) bool.
+        is_start: rows at which a segment starts, (num_rows,) bool.
+    """
+    starts = np.flatnonzero(is_in & (~np.append(False, is_in[:-1]) | is_start))
+    ends = np.flatnonzero(is_in & ~np.append(is_in[1:] & ~is_start[1:], False)) + 1
+    return list(zip(starts.tolist(), ends.tolist(), strict=True))
+
+
+def low_pass(values: np.ndarray, step_s: float, lag_s: float) -> np.ndarray:
+    """Return values, (num_rows, ...), as a first-order lag follows them from 0."""
+    decay = np.exp(-step_s / lag_s) if lag_s else 0.0
+    return lfilter([1.0 - decay], [1.0, -decay], values, axis=0)
+
+
+def derivative(log: FlightLog, values: np.ndarray) -> np.ndarray:
+    """Return the derivative of values, (num_rows, n), by time; 0 in segments of one row."""
+    slopes = np.zeros_like(values)
+    for rows in segments_of(log):
+        if rows.stop - rows.start > 1:
+            slopes[rows] = np.gradient(values[rows], log.time[rows], axis=0)
+    return slopes
+
+
 def read_at(log: FlightLog, values: np.ndarray, later_s: float) -> np.ndarray:
     """Return values, (num_rows, n), read some seconds later within each segment; ends are held."""
     result = np.empty_like(values)
@@ -83,3 +131,9 @@ def read_at(log: FlightLog, values: np.ndarray, later_s: float) -> np.ndarray:
         for column in range(values.shape[1]):
             result[rows, column] = np.interp(time + later_s, time, values[rows, column])
     return result
+
+
+def jackknife_error(estimates: np.ndarray) -> float:
+    """Return the standard error of an estimate, by estimates without one block each."""
+    count = len(estimates)
+    return float(np.sqrt((count - 1) / count * np.sum((estimates - estimates.mean()) ** 2)))

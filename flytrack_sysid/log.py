@@ -159,6 +159,11 @@ def usual_step(log: FlightLog) -> np.ndarray:
     return np.repeat(medians, [len(segment_steps) + 1 for segment_steps in steps])
 
 
+def median_step(log: FlightLog) -> float:
+    """Return the usual time between rows of a log, s."""
+    return float(np.median(usual_step(log)))
+
+
 def time_in_line(log: FlightLog, between_s: np.ndarray | float = BETWEEN_S) -> np.ndarray:
     """Return the time of rows with segments one after the other, (num_rows,) s from 0.
 

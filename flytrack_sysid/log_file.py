@@ -25,6 +25,7 @@ from flytrack_env import motors
 from flytrack_env.files import open_file, write_atomically
 from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_env.npz_file import NpzError, load_npz, npz_of
+from flytrack_env.toml_file import TomlError, parse_toml, read_text
 from flytrack_sysid.log import CHANNELS, GAP_STEPS, FlightLog, LogError, usual_step
 from flytrack_sysid.log_table import Table, check_names, columns_of, log_of_table, stated_columns
 
@@ -86,13 +87,22 @@ def check_name(path: str | Path) -> None:
         )
 
 
+def load_toml(path: Path) -> dict[str, Any]:
+    """Return the content of a TOML file that describes logs; raises LogError."""
+    try:
+        return parse_toml(read_text(path))
+    except (OSError, UnicodeDecodeError, TomlError) as error:
+        raise LogError(f"{path}: not a readable TOML file: {error_text(error)}") from error
+
+
 def gaps_of(log: FlightLog) -> np.ndarray:
     """Return the rows after which samples are missing, (num_gaps,) int.
 
     After these rows, the time step exceeds 1.5 times the median step of the segment.
     """
-    is_inside = log.segment[1:] == log.segment[:-1]
-    return np.flatnonzero(is_inside & (np.diff(log.time) > GAP_STEPS * usual_step(log)[:-1]))
+    return np.flatnonzero(
+        ~log.is_start()[1:] & (np.diff(log.time) > GAP_STEPS * usual_step(log)[:-1])
+    )
 
 
 def describe(log: FlightLog) -> str:

@@ -19,13 +19,16 @@ LOWEST_PERCENTILE, HIGHEST_PERCENTILE = 0.5, 99.5
 DECIMALS = 3  # of a battery's voltages, V; sensors have two
 
 
+def voltages_of(battery: Battery) -> tuple[float, float]:
+    """Return the voltages of an empty and a full battery, V."""
+    return float(battery.empty_v), float(battery.full_v)
+
+
 def with_voltage(log: FlightLog, model: ModelParameters) -> FlightLog:
     """Return a log with a voltage; that of the model's battery if none is logged or stated."""
     if "v_bat" in log or log.stated_voltage_v is not None:
         return log
-    return replace(
-        log, stated_voltage_v=(float(model.battery.empty_v), float(model.battery.full_v))
-    )
+    return replace(log, stated_voltage_v=voltages_of(model.battery))
 
 
 def assumed_voltage(log: FlightLog) -> float:
@@ -87,7 +90,7 @@ def voltage_notes(log: FlightLog, battery: Battery) -> list[str]:
             if log.stated_voltage_v is None
             else "the voltages stated for the craft"
         )
-        low, high = log.stated_voltage_v or (float(battery.empty_v), float(battery.full_v))
+        low, high = log.stated_voltage_v or voltages_of(battery)
         notes.append(
             f"v_bat is absent: {log.source} is taken as flown at {0.5 * (low + high):.4g} V, the "
             f"middle of {lender} ({low:.4g} to {high:.4g} V)"

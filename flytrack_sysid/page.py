@@ -1,11 +1,13 @@
 """One self-contained HTML page of text, tables and pictures; nothing is loaded from elsewhere."""
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from string import Template
 from typing import NamedTuple
+
+from flytrack_env.files import write_atomically
 
 _STYLE = "\n" + Path(__file__).with_name("page.css").read_text(encoding="utf-8")
 _PAGE = Template(Path(__file__).with_suffix(".html").read_text(encoding="utf-8"))
@@ -104,3 +106,27 @@ def page(title: str, sections: Sequence[Section], introduction: Sequence[Part] =
         body.append(f"<section>\n<h2>{escape(section.heading)}</h2>\n{parts}\n</section>")
     content = "\n".join(body)
     return _PAGE.substitute(title=escape(title), style=_STYLE, content=content)
+
+
+def text_table(
+    rows: Sequence[Sequence[str]], justify: Callable[[str, int], str] = str.ljust
+) -> list[str]:
+    """Return rows of cells as lines of text with aligned columns.
+
+    Args:
+        rows: of cells, the header first.
+        justify: pads the cells of all columns but the first.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join([first.ljust(widths[0]), *map(justify, others, widths[1:])]).rstrip()
+        for first, *others in rows
+    ]
+
+
+def write_report(folder: str | Path, files: Mapping[str, bytes]) -> list[Path]:
+    """Write the files of a report into a folder; return their paths."""
+    paths = [Path(folder) / name for name in files]
+    for path, content in zip(paths, files.values(), strict=True):
+        write_atomically(path, content)
+    return paths

@@ -17,7 +17,7 @@ from flytrack_sysid.inference.free_flight import (
 from flytrack_sysid.inference.free_flight import UNITS as FLIGHT_UNITS
 from flytrack_sysid.inference.one_step import Prediction, columns, scored_steps
 from flytrack_sysid.log import CHANNELS, FlightLog
-from flytrack_sysid.log_voltage import with_voltage
+from flytrack_sysid.log_voltage import voltages_of, with_voltage
 from flytrack_sysid.sensors import specific_force_b
 
 UNITS = {"p": "m", "v": "m/s", "q": "1", "w": "rad/s", "a": "m/s^2", "f": "m/s^2"}
@@ -260,7 +260,7 @@ class ThrustError(NamedTuple):
 def _voltage_range(battery_v: np.ndarray, battery: Battery) -> tuple[float, float]:
     """Return the voltage range of the battery, or that of the log if it exceeds the battery's."""
     low, high = float(battery_v.min()), float(battery_v.max())
-    empty_v, full_v = float(battery.empty_v), float(battery.full_v)
+    empty_v, full_v = voltages_of(battery)
     if low >= empty_v and high <= full_v:
         return empty_v, full_v
     return low, max(high, low + MIN_VOLTAGE_RANGE)

@@ -12,7 +12,7 @@ from flytrack_env.effects.command_delay import dead_times
 from flytrack_env.motion import Motion
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import ACTION_SIZE, Action, Drone
-from flytrack_sysid.inference.parameters import from_vector, in_batches, to_vector
+from flytrack_sysid.inference.parameters import from_vector, in_batches, in_float64, to_vector
 from flytrack_sysid.inference.trace_cache import keep_trace
 
 SMALL_STEP, FULL_STEP = 1e-3, 1.0  # of a stick, from its centre; no limit acts on the small one
@@ -35,7 +35,7 @@ def half_response_s(model: ModelParameters, stick_step: float = SMALL_STEP) -> n
         stick_step: from the centre, which for thrust is half a stick.
     """
     with jax.enable_x64(True):
-        like = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
+        like = in_float64(model)
         return half_responses(to_vector(like)[None], like, stick_step)[0]
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flytrack_sysid.kinematics import attitude_of
 from flytrack_sysid.log import FlightLog
 
 # Standard deviations at level 1; gyro and accelerometer are those of a drone with running motors.
@@ -51,7 +52,7 @@ def measure(log: FlightLog, level: float, gravity: float, rng: np.random.Generat
     def noisy(values: np.ndarray, noise: float, step: float) -> np.ndarray:
         return step * np.round((values + level * noise * rng.standard_normal(values.shape)) / step)
 
-    attitude = Rotation.from_quat(log["q"], scalar_first=True)
+    attitude = attitude_of(log)
     turn = np.deg2rad(level * ATTITUDE_NOISE_DEG) * rng.standard_normal((len(log), 3))
     quat = (attitude * Rotation.from_rotvec(turn)).as_quat(scalar_first=True)
     quat = QUATERNION_STEP * np.round(quat / QUATERNION_STEP)

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_sysid.inference.free_flight import fly_freely
-from flytrack_sysid.inference.one_step import Prediction, find_runs
+from flytrack_sysid.inference.one_step import Prediction
+from flytrack_sysid.kinematics import runs_of
 
 AXES = ("roll", "pitch", "yaw")
 MIN_JUMP = 0.2
@@ -66,7 +67,7 @@ def _largest_steps(
     """Return the largest steps of an axis: first shown row, row of the step, end of shown rows."""
     largest, log = [], prediction.log
     command = log["u"][:, axis]
-    for start, end in find_runs(rows, prediction.record):
+    for start, end in runs_of(rows, prediction.record.begins):
         time = log.time[start:end]
         for step in _steps_in(time, command[start:end]).tolist():
             step_time = time[step]

@@ -232,18 +232,16 @@ def _cheapest_joint(
     return joint
 
 
-def put_on_one_line(
-    source: str, clocks: Mapping[str, Clock], base: str, slow: tuple[str, ...] = ("v_bat",)
-) -> dict[str, np.ndarray]:
+def put_on_one_line(source: str, clocks: Mapping[str, Clock], base: str) -> dict[str, np.ndarray]:
     """Put the streams of one log on one increasing time line.
 
-    Where the clock was set back, later times of all streams are moved behind the earlier ones.
+    Where the clock was set back, later times of all streams are moved behind the earlier ones. The
+    battery changes so slowly that it may end before the base begins.
 
     Args:
         source: the log, for messages.
         clocks: of the streams, by name; all count from the same moment.
         base: the stream whose rows become those of the log.
-        slow: streams that change so slowly that they may end before the base begins.
 
     Returns:
         The times of each stream's used rows, s.
@@ -261,7 +259,7 @@ def put_on_one_line(
             raise LogError(
                 f"{source}: clock of {name}: set back {counts}; which rows belong together?"
             )
-        distance_s = MAX_BATTERY_DISTANCE_S if name in slow else 0.0
+        distance_s = MAX_BATTERY_DISTANCE_S if name == "v_bat" else 0.0
         if np.isfinite(clock.max_gap_s):  # the last event holds until the next
             _check_common(source, name, clock, base, clocks[base], distance_s)
     shifts_s, end_s = np.zeros(num_epochs), -np.inf

@@ -7,7 +7,6 @@ second.
 
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +20,7 @@ from flytrack_sysid.inference.free_flight import CHANNEL_OF, HORIZONS_S, fly_fre
 from flytrack_sysid.inference.one_step import Prediction, inputs_that_lack, predict
 from flytrack_sysid.inference.parameters import with_neutral_effects
 from flytrack_sysid.inference.record import fill_gaps
+from flytrack_sysid.kinematics import segments_of, since_first
 from flytrack_sysid.log import IN_STATE, FlightLog, time_in_line
 
 WINDOW_S = 0.1  # of means: long enough to average out noise, short against a manoeuvre
@@ -100,8 +100,7 @@ def position_of(log: FlightLog) -> tuple[np.ndarray, str]:
         return np.zeros((len(log), 3)), " (no position)"
     step_s = np.where(log.is_start(), 0.0, np.diff(log.time, prepend=log.time[:1]))
     path = np.cumsum(0.5 * (log["v"] + np.roll(log["v"], 1, axis=0)) * step_s[:, None], axis=0)
-    starts = np.flatnonzero(log.is_start())
-    return path - path[starts][np.cumsum(log.is_start()) - 1], " (position integrated)"
+    return since_first(path, log.is_start()), " (position integrated)"
 
 
 def states_of(channels: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -146,8 +145,7 @@ def force_w(residuals: Traces, model: str, time_s: np.ndarray) -> np.ndarray:
 def _measured(timed: _Timed, name: str, residuals_w: Mapping[str, np.ndarray]) -> Trajectory:
     """Return the trajectory as it was measured."""
     log, starts = timed.log, timed.log.is_start()
-    segment_start = np.flatnonzero(starts)[np.cumsum(starts) - 1]
-    rows = np.flatnonzero((np.arange(len(log)) - segment_start) % timed.every == 0)
+    rows = np.flatnonzero(since_first(np.arange(len(log)), starts) % timed.every == 0)
     return Trajectory(
         name=name,
         states=states_of(log.channels)[rows],
@@ -163,15 +161,14 @@ def _starts_and_ends(prediction: Prediction) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows where free flights start, one a second, and where the next ones start."""
     log, can_start = prediction.log, prediction.is_settled & prediction.is_measured
     half_step = 0.5 * prediction.step_s
-    edges = np.append(np.flatnonzero(log.is_start()), len(log))
     starts, ends = [np.zeros(0, int)], [np.zeros(0, int)]
-    for first, end in pairwise(edges):
-        rows = first + np.flatnonzero(can_start[first:end])
+    for segment in segments_of(log):
+        rows = segment.start + np.flatnonzero(can_start[segment])
         if len(rows):
             wanted_s = np.arange(log.time[rows[0]], log.time[rows[-1]] + half_step, RESTART_S)
             segment_starts = rows[np.unique(np.searchsorted(log.time[rows], wanted_s - half_step))]
             starts.append(segment_starts)
-            ends.append(np.append(segment_starts[1:], end))
+            ends.append(np.append(segment_starts[1:], segment.stop))
     return np.concatenate(starts), np.concatenate(ends)
 
 

@@ -7,9 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from flytrack_env.files import write_atomically
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, page
+from flytrack_sysid.page import (
+    Bullets,
+    Picture,
+    Section,
+    Table,
+    Text,
+    page,
+    text_table,
+    write_report,
+)
 from flytrack_sysid.plots import draw_steps, draw_thrust, png_of
 from flytrack_sysid.prediction_errors import (
     NORMALISED_BY,
@@ -87,13 +95,7 @@ def _tables(validation: Validation) -> dict[str, Table]:
 
 
 def _text_of_table(table: Table) -> str:
-    columns = list(zip(table.header, *table.rows, strict=True))
-    widths = [max(map(len, column)) for column in columns]
-    lines = [
-        "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip()
-        for line in (table.header, *table.rows)
-    ]
-    return "\n".join([table.caption, *lines])
+    return "\n".join([table.caption, *text_table([table.header, *table.rows], str.rjust)])
 
 
 def _head(validation: Validation, model_name: str, log: FlightLog) -> str:
@@ -173,6 +175,4 @@ def write_validation(
         "validation.html": html_of(validation, model_name, log, pictures).encode(),
         **{f"{name}.png": png for name, png in pictures.items()},
     }
-    for name, content in files.items():
-        write_atomically(Path(out) / name, content)
-    return [Path(out) / name for name in files]
+    return write_report(out, files)

@@ -4,7 +4,7 @@ import numpy as np
 
 from flytrack_sysid.check.explain import Change
 from flytrack_sysid.check.pairs import AGREES, CONTRADICTS, STILL, Pair
-from flytrack_sysid.kinematics import segments_of
+from flytrack_sysid.kinematics import jackknife_error, segments_of
 from flytrack_sysid.log import FlightLog
 
 LIKELY_V, HIGHEST_V = (2.5, 70.0), 100.0
@@ -47,13 +47,11 @@ def compare_battery(log: FlightLog) -> tuple[Pair, ...]:
     )
     without = products.sum(axis=0) - products
     slope = _slope(products.sum(axis=0))
-    jackknife = np.array([_slope(one) for one in without])
-    count = len(jackknife)
-    sigma = np.sqrt((count - 1) / count * np.sum((jackknife - jackknife.mean()) ** 2))
+    sigma = jackknife_error(np.array([_slope(one) for one in without]))
     change = slope * elapsed_s[-1] / float(np.median(np.abs(log["v_bat"])) or 1.0)
     is_clear = abs(slope) > SLOPE_ERRORS * sigma and abs(change) > MIN_CHANGE
     verdict = STILL
-    if count >= MIN_BLOCKS and is_clear:
+    if len(without) >= MIN_BLOCKS and is_clear:
         verdict = AGREES if slope < 0.0 else CONTRADICTS
     return (Pair("v_bat and t", verdict, (), (), float("nan"), float("nan")),)
 

@@ -22,7 +22,7 @@ from flytrack_sysid.check.motion import (
     weight_of,
 )
 from flytrack_sysid.kinematics import WINDOWS_S, cut_windows, read_at, segments_of
-from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.log import FlightLog, median_step
 
 COARSE_STEP_S = 0.01  # between rows: a rate loop is slower
 GRID_S = 0.01
@@ -34,7 +34,7 @@ LAGS_S = (0.0, 0.02, 0.04, 0.06, 0.1)
 
 def thinned(log: FlightLog) -> FlightLog:
     """Return the commands and rates of a log, the means over some rows if it is fast."""
-    step_s = float(np.median(usual_step(log)))
+    step_s = median_step(log)
     every = max(1, int(COARSE_STEP_S / step_s))
     if every == 1:
         return log
@@ -60,7 +60,7 @@ def lagged(log: FlightLog, values: np.ndarray, lag_s: float) -> np.ndarray:
         values: (num_rows, n).
         lag_s: time constant.
     """
-    step_s = float(np.median(usual_step(log)))
+    step_s = median_step(log)
     decay = float(np.exp(-step_s / lag_s)) if lag_s > 0.0 else 0.0
     parts = [
         lfilter([0.0, 1.0 - decay], [1.0, -decay], values[rows], axis=0, zi=values[rows][:1])[0]
@@ -100,10 +100,8 @@ def compare_commands(log: FlightLog) -> Followed | None:
     by_lag = {lag_s: lagged(log, log["u"][:, :3], lag_s) for lag_s in LAGS_S}
     for lag_s, delay_s in product(LAGS_S, DELAYS_S):
         commands = windows.mean_of(log, read_at(log, by_lag[lag_s], -delay_s))
-        values = weight_of(WINDOWS_S[0]) * np.array(
-            [by_frame(rates[part], commands[part], RATE_FLOOR) for part in parts_of(count)]
-        )
-        likelihoods = described(values, WINDOWS_S[0], rates, commands)
+        by_part = [by_frame(rates[part], commands[part], RATE_FLOOR) for part in parts_of(count)]
+        likelihoods = described(by_part, WINDOWS_S[0], rates, commands)
         found.append(Followed(likelihoods, float(delay_s), lag_s))
     # Each frame has the delay and the lag under which it fits best.
     totals = np.array([one.likelihoods.values.sum(axis=0) for one in found])
@@ -166,6 +164,11 @@ def responses(log: FlightLog) -> list[Response]:
     return [response_to(log, log["u"][:, axis], axis) for axis in range(3)]
 
 
+def share_left(correlation: float) -> float:
+    """Return the share of an axis's rates that commands leave; with a negative correlation all."""
+    return 1.0 - min(max(correlation, 0.0), MAX_CORRELATION) ** 2
+
+
 def mean_delay(log: FlightLog, found: list[Response], expected_s: np.ndarray) -> float:
     """Return by how much rates follow their commands later than expected, s; 0 if that is unclear.
 
@@ -183,8 +186,8 @@ def mean_delay(log: FlightLog, found: list[Response], expected_s: np.ndarray) ->
         later_s = one.delay_s + one.lag_s - float(expected_s[axis])
         as_expected = follow(log, log["u"][:, axis : axis + 1], one.delay_s - later_s, one.lag_s)
         correlation = correlations_of(rates[:, axis : axis + 1], windows.mean_of(log, as_expected))
-        unexplained = 1.0 - min(max(float(correlation[0, 0]), 0.0), MAX_CORRELATION) ** 2
-        least = 1.0 - min(one.correlation, MAX_CORRELATION) ** 2
+        unexplained = share_left(float(correlation[0, 0]))
+        least = share_left(one.correlation)
         nats += 0.5 * weight_of(WINDOWS_S[0]) * len(rates) * float(np.log(unexplained / least))
         delays_s.append(later_s)
         weights.append(1.0 / least)
@@ -240,7 +243,7 @@ def curve_changes(log: FlightLog, found: list[Response]) -> list[Change]:
         stick = log["u"][:, axis]
         if response.correlation < MIN_FOLLOWED or np.abs(stick).max() < MIN_STICK:
             continue
-        straight = 1.0 - min(response.correlation, MAX_CORRELATION) ** 2
+        straight = share_left(response.correlation)
         if straight < MIN_BENT * _unexplained_by_cubic(log, axis, stick, response):
             continue
         left = {name: _unexplained(log, axis, stick, response, name) for name in CURVES}
@@ -277,8 +280,7 @@ def _unexplained(
     def left(shape: np.ndarray) -> float:
         bent = CURVES[name](stick, *shape)[:, None]
         followed = windows.mean_of(log, follow(log, bent, response.delay_s, response.lag_s))
-        correlation = float(correlations_of(shown, followed)[0, 0])
-        return 1.0 - min(max(correlation, 0.0), MAX_CORRELATION) ** 2
+        return share_left(float(correlations_of(shown, followed)[0, 0]))
 
     def settings(start: tuple[float, float]) -> np.ndarray:
         return minimize(

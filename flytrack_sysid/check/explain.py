@@ -111,7 +111,7 @@ def _costs(is_logged: bool, shared: int, numbers: np.ndarray | None = None) -> n
     """Return the cost of each frame of a channel, (48,), where the others have a shared one."""
     costs = np.full(NUM_FRAMES, np.inf)
     if not is_logged:
-        costs[:] = np.where(np.arange(NUM_FRAMES) == IDENTITY, 0.0, np.inf)
+        costs[IDENTITY] = 0.0
         return costs
     allowed = np.arange(NUM_FRAMES) if numbers is None else numbers
     is_mirrored = ~np.isin(allowed, ROTATIONS)

@@ -149,9 +149,14 @@ def _unit(fields: Fields, dimension: str, factor: float) -> Fields:
     return {"scale": float(f"{right:.6g}"), "unit": None}
 
 
+def _ends(fields: Fields) -> tuple[list[float], ...]:
+    """Return the values of a file that mean -1, and those that mean 1."""
+    return tuple(list(fields.get(name, [end] * 4)) for name, end in (("low", -1.0), ("high", 1.0)))
+
+
 def _sticks(fields: Fields, frame: np.ndarray) -> Fields:
     """Return corrected fields of the rate commands."""
-    low, high = (list(fields.get(name, [end] * 4)) for name, end in (("low", -1.0), ("high", 1.0)))
+    low, high = _ends(fields)
     order = [*np.argmax(np.abs(frame.T), axis=1), 3]
     signs = [*frame.T.sum(axis=1), 1.0]
     ends = [
@@ -167,7 +172,7 @@ def _sticks(fields: Fields, frame: np.ndarray) -> Fields:
 
 def _thrust(fields: Fields, kind: str, value: Any) -> Fields:
     """Return corrected fields of the thrust command."""
-    low, high = (list(fields.get(name, [end] * 4)) for name, end in (("low", -1.0), ("high", 1.0)))
+    low, high = _ends(fields)
 
     def as_logged(number: float) -> float:
         """Return the file's value that was read as a number."""

@@ -8,14 +8,14 @@ negatively explains nothing.
 """
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.check.frames import DIRECTIONS, FRAMES
-from flytrack_sysid.kinematics import WINDOWS_S, Windows, cut_windows
+from flytrack_sysid.kinematics import GRAVITY, WEIGHT_W, WINDOWS_S, Windows, cut_windows
 from flytrack_sysid.log import FlightLog
 
 MIN_WINDOWS = 10
@@ -39,17 +39,11 @@ class Likelihoods(NamedTuple):
 
     Attributes:
         values: nats, (NUM_PARTS, ...); of which frames depends on the pair.
-        num_windows: that were compared.
-        length_s: of each.
         correlations: of the three axes as they are logged.
-        sizes: root mean squares of both quantities' axes, (2, 3).
     """
 
     values: np.ndarray
-    num_windows: int
-    length_s: float
     correlations: np.ndarray
-    sizes: np.ndarray
 
 
 def most_telling(found: list[Likelihoods]) -> Likelihoods | None:
@@ -125,26 +119,30 @@ def compare(
     """
     found = []
     for length_s, windows in useful_windows(log):
-        shown = windows.change_of(sums) / windows.durations[:, None]
+        shown = windows.rate_of(sums)
         measured = windows.mean_of(log, rates)
-        values = weight_of(length_s) * np.array(
-            [by_frame(shown[part], measured[part], floor) for part in parts_of(len(shown))]
-        )
+        values = [by_frame(shown[part], measured[part], floor) for part in parts_of(len(shown))]
         found.append(described(values, length_s, shown, measured))
     return most_telling(found)
 
 
 def described(
-    values: np.ndarray, length_s: float, shown: np.ndarray, measured: np.ndarray
+    by_part: Sequence[np.ndarray], length_s: float, shown: np.ndarray, measured: np.ndarray
 ) -> Likelihoods:
-    """Return likelihoods with what describes the two quantities, (num_windows, 3) each."""
-    correlations = np.diag(correlations_of(shown, measured))
-    sizes = np.sqrt(np.array([np.mean(shown**2, axis=0), np.mean(measured**2, axis=0)]))
-    return Likelihoods(values, len(shown), length_s, correlations, sizes)
+    """Return likelihoods with the correlations of two quantities, (num_windows, 3) each.
+
+    Args:
+        by_part: nats of each part, as if all windows were independent.
+        length_s: of the windows.
+        shown: the first quantity.
+        measured: the second one.
+    """
+    values = weight_of(length_s) * np.array(by_part)
+    return Likelihoods(values, np.diag(correlations_of(shown, measured)))
 
 
 def compare_forces(
-    log: FlightLog, attitude: Rotation, gravity: float, with_bias: bool = False
+    log: FlightLog, attitude: Rotation, with_bias: bool = False
 ) -> Likelihoods | None:
     """Return likelihoods by which velocity, attitude and accelerometer agree, (6, 48, 48).
 
@@ -156,7 +154,6 @@ def compare_forces(
     Args:
         log: a flight.
         attitude: of its rows.
-        gravity: m/s^2.
         with_bias: whether what a bias of the accelerometer explains is no evidence.
 
     Returns:
@@ -166,38 +163,33 @@ def compare_forces(
     matrices = attitude.as_matrix()
     products = np.einsum("nij,nk->nijk", matrices, log["f"]).reshape(len(log), 27)
     for length_s, windows in useful_windows(log):
-        changes = windows.change_of(log["v"]) / windows.durations[:, None]
+        changes = windows.rate_of(log["v"])
         means = windows.mean_of(log, products).reshape(-1, 3, 3, 3)
         turned = windows.mean_of(log, matrices.reshape(len(log), 9)).reshape(-1, 3, 3)
-        values = weight_of(length_s) * np.array(
-            [
-                _likelihoods_of_forces(
-                    changes[part], means[part], gravity, turned[part] if with_bias else None
-                )
-                for part in parts_of(len(changes))
-            ]
-        )
-        forces = np.einsum("nijj->ni", means) - np.array([0.0, 0.0, gravity])
+        values = [
+            _likelihoods_of_forces(changes[part], means[part], turned[part] if with_bias else None)
+            for part in parts_of(len(changes))
+        ]
+        forces = np.einsum("nijj->ni", means) - WEIGHT_W
         found.append(described(values, length_s, changes, forces))
     return most_telling(found)
 
 
 def _likelihoods_of_forces(
-    changes: np.ndarray, means: np.ndarray, gravity: float, turned: np.ndarray | None
+    changes: np.ndarray, means: np.ndarray, turned: np.ndarray | None
 ) -> np.ndarray:
     """Return likelihoods as ``compare_forces`` does, from means over windows.
 
     Args:
         changes: of the velocity, over the duration, (num_windows, 3).
         means: of products of the attitude's matrix and the force, (num_windows, 3, 3, 3).
-        gravity: m/s^2.
         turned: means of the attitude's matrix, (num_windows, 3, 3), to leave out what a bias
             explains; None to keep it.
     """
     count = len(changes)
     force = np.einsum("nijk,fjk->fni", means, FRAMES)  # (48 of the body, num_windows, 3)
     moved = np.einsum("wij,nj->wni", FRAMES, changes)  # (48 of the world, num_windows, 3)
-    up = np.repeat(gravity * DIRECTIONS[:, None], count, axis=1)  # (6, num_windows, 3)
+    up = np.repeat(GRAVITY * DIRECTIONS[:, None], count, axis=1)  # (6, num_windows, 3)
     if turned is not None:
         force, moved, up = (_without_bias(one, turned) for one in (force, moved, up))
     # Moments by axis: (up, world, body, axis), or what of these they depend on.
@@ -230,36 +222,31 @@ def _without_bias(accelerations: np.ndarray, turned: np.ndarray) -> np.ndarray:
     return (flat - flat @ axes @ weights).reshape(accelerations.shape)
 
 
-def compare_thrust(log: FlightLog, attitude: Rotation, gravity: float) -> Likelihoods | None:
+def compare_thrust(log: FlightLog, attitude: Rotation) -> Likelihoods | None:
     """Return likelihoods as ``compare_forces`` does, of a thrust along the body's z axis.
 
     Of the force only the direction is known, and that it is not negative; drag is small beside it.
     """
     found = []
     columns = attitude.as_matrix().reshape(len(log), 9)
-    up = np.array([0.0, 0.0, gravity])
     for length_s, windows in useful_windows(log):
-        changes = windows.change_of(log["v"]) / windows.durations[:, None]
+        changes = windows.rate_of(log["v"])
         axes = windows.mean_of(log, columns).reshape(-1, 3, 3)
-        values = weight_of(length_s) * np.array(
-            [
-                _likelihoods_of_thrust(changes[part], axes[part], gravity)
-                for part in parts_of(len(changes))
-            ]
-        )
-        thrust = np.sum((changes + up) * axes[:, :, 2], axis=1)
-        forces = thrust[:, None] * axes[:, :, 2] - up
+        values = [
+            _likelihoods_of_thrust(changes[part], axes[part]) for part in parts_of(len(changes))
+        ]
+        thrust = np.sum((changes + WEIGHT_W) * axes[:, :, 2], axis=1)
+        forces = thrust[:, None] * axes[:, :, 2] - WEIGHT_W
         found.append(described(values, length_s, changes, forces))
     return most_telling(found)
 
 
-def _likelihoods_of_thrust(changes: np.ndarray, axes: np.ndarray, gravity: float) -> np.ndarray:
+def _likelihoods_of_thrust(changes: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """Return likelihoods as ``compare_thrust`` does, from means over windows.
 
     Args:
         changes: of the velocity, over the duration, (num_windows, 3).
         axes: attitude's matrices, (num_windows, 3, 3).
-        gravity: m/s^2.
     """
     count = len(changes)
     moved = np.einsum("wij,nj->wni", FRAMES, changes)
@@ -271,7 +258,7 @@ def _likelihoods_of_thrust(changes: np.ndarray, axes: np.ndarray, gravity: float
         thrust /= np.maximum(np.linalg.norm(thrust, axis=1, keepdims=True), STILL)
         along = np.einsum("wni,ni->wn", moved, thrust)
         across = moved - along[..., None] * thrust
-        for up_number, up in enumerate(gravity * DIRECTIONS):
+        for up_number, up in enumerate(GRAVITY * DIRECTIONS):
             up_across = up - (thrust @ up)[:, None] * thrust
             size = np.sum(up_across**2)
             scale = np.maximum(-np.einsum("wni,ni->w", across, up_across) / max(size, STILL), 0.0)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_sysid.check.commands import Followed, compare_commands
+from flytrack_sysid.check.commands import compare_commands
 from flytrack_sysid.check.explain import Edges
 from flytrack_sysid.check.frames import (
     DIRECTIONS,
@@ -23,7 +23,7 @@ from flytrack_sysid.check.motion import (
     compare_forces,
     compare_thrust,
 )
-from flytrack_sysid.kinematics import GRAVITY, summed_turns
+from flytrack_sysid.kinematics import summed_turns
 from flytrack_sysid.log import FlightLog
 
 AGAINST = 2.0  # nats by which a part of the log may be against the best frame
@@ -83,12 +83,19 @@ def allowed(values: np.ndarray) -> np.ndarray:
     return ~((total.max() - total > MARGIN) & np.all(ahead > -AGAINST, axis=0))
 
 
-def _pair(name: str, found: Likelihoods, is_allowed: np.ndarray, flips: list[bool]) -> Pair:
-    """Return a pair; ``is_allowed`` and the likelihoods begin with the frames of the log."""
+def _pair(name: str, found: Likelihoods, is_allowed: np.ndarray, of_frames: np.ndarray) -> Pair:
+    """Return a pair; ``is_allowed`` and the likelihoods begin with the frames of the log.
+
+    Args:
+        name: of the pair.
+        found: the likelihoods.
+        is_allowed: by ``allowed``.
+        of_frames: the same of one channel's frames, all else as in the log, (48,) bool.
+    """
     total = found.values.sum(axis=0)
     evidence = float(total.max() - total.flat[0])
     margin = float(total.max() - total[~is_allowed].max(initial=-np.inf))
-    unseen = tuple(axis for axis, is_seen in zip(AXES, flips, strict=True) if is_seen)
+    unseen = tuple(axis for axis, is_seen in zip(AXES, of_frames[MIRRORS], strict=True) if is_seen)
     verdict = AGREES if is_allowed.flat[0] else CONTRADICTS
     if verdict == AGREES and len(unseen) == len(AXES):
         verdict = STILL
@@ -96,30 +103,16 @@ def _pair(name: str, found: Likelihoods, is_allowed: np.ndarray, flips: list[boo
     return Pair(name, verdict, correlations, unseen, evidence, margin)
 
 
-class Compared(NamedTuple):
-    """The pairs of a log.
-
-    Attributes:
-        pairs: that could be compared.
-        edges: the frames that they allow.
-        followed: how rates follow commands; None where that is unknown.
-    """
-
-    pairs: tuple[Pair, ...]
-    edges: Edges
-    followed: Followed | None
-
-
-def compare_pairs(log: FlightLog) -> Compared:
+def compare_pairs(log: FlightLog) -> tuple[tuple[Pair, ...], Edges]:
     """Return the pairs of a log, and the frames that they allow."""
     rate_pair, rates = _compare_rates(log)
     force_pair, forces = _compare_forces(log, rates)
     position_pair, positions = _compare_positions(log)
-    command_pair, commands, followed = _compare_commands(log)
+    command_pair, commands = _compare_commands(log)
     up_pair, force_up = _compare_up(log)
     every = (rate_pair, force_pair, position_pair, command_pair, up_pair)
     edges = Edges(rates, forces, positions, commands, force_up)
-    return Compared(tuple(pair for pair in every if pair is not None), edges, followed)
+    return tuple(pair for pair in every if pair is not None), edges
 
 
 def _attitudes(log: FlightLog) -> list[Rotation]:
@@ -142,8 +135,7 @@ def _compare_rates(log: FlightLog) -> tuple[Pair | None, np.ndarray]:
         return None, rates
     values = np.stack([one.values for one in found], axis=1)
     rates = allowed(values)
-    flips = [bool(rates[0, flip]) for flip in MIRRORS]
-    return _pair("q and w", found[0]._replace(values=values), rates, flips), rates
+    return _pair("q and w", found[0]._replace(values=values), rates, rates[0]), rates
 
 
 def _compare_forces(log: FlightLog, rates: np.ndarray) -> tuple[Pair | None, np.ndarray]:
@@ -160,22 +152,22 @@ def _compare_forces(log: FlightLog, rates: np.ndarray) -> tuple[Pair | None, np.
     attitudes = _attitudes(log)
     # The reading of the log is compared too, to say that it contradicts.
     tried = [number for number in range(len(READINGS)) if number == 0 or rates[number].any()]
-    by_reading = {number: function(log, attitudes[number], GRAVITY) for number in tried}
+    by_reading = {number: function(log, attitudes[number]) for number in tried}
     known = {number: one for number, one in by_reading.items() if one is not None}
     if not known:
         return None, forces
     values = np.stack([one.values for one in known.values()], axis=1)
     is_allowed = allowed(values)
     if "f" in log and not is_allowed.flat[0]:  # nothing contradicts that a bias explains
-        found = [compare_forces(log, attitudes[number], GRAVITY, True) for number in known]
+        found = [compare_forces(log, attitudes[number], True) for number in known]
         is_allowed |= allowed(np.stack([one.values for one in found if one is not None], axis=1))
     evidence = values.sum(axis=0)
     if evidence.max() - evidence.flat[0] < FORCE_MARGIN:
         is_allowed.flat[0] = True
     forces[:] = False
     forces[list(known)] = is_allowed
-    flips = [bool(is_allowed[0, 0, flip, IDENTITY]) for flip in MIRRORS]
-    return _pair(name, known[0]._replace(values=values), is_allowed, flips), forces
+    of_velocity = is_allowed[0, 0, :, IDENTITY]
+    return _pair(name, known[0]._replace(values=values), is_allowed, of_velocity), forces
 
 
 def _compare_positions(log: FlightLog) -> tuple[Pair | None, np.ndarray]:
@@ -184,17 +176,16 @@ def _compare_positions(log: FlightLog) -> tuple[Pair | None, np.ndarray]:
     if found is None:
         return None, np.ones(NUM_FRAMES, bool)
     is_allowed = allowed(found.values)
-    return _pair("p and v", found, is_allowed, [is_allowed[flip] for flip in MIRRORS]), is_allowed
+    return _pair("p and v", found, is_allowed, is_allowed), is_allowed
 
 
-def _compare_commands(log: FlightLog) -> tuple[Pair | None, np.ndarray, Followed | None]:
+def _compare_commands(log: FlightLog) -> tuple[Pair | None, np.ndarray]:
     """Compare commands with the rates that follow them."""
     followed = compare_commands(log) if "w" in log else None
     if followed is None:
-        return None, np.ones(NUM_FRAMES, bool), None
+        return None, np.ones(NUM_FRAMES, bool)
     is_allowed = allowed(followed.likelihoods.values)
-    flips = [bool(is_allowed[flip]) for flip in MIRRORS]
-    return _pair("u and w", followed.likelihoods, is_allowed, flips), is_allowed, followed
+    return _pair("u and w", followed.likelihoods, is_allowed, is_allowed), is_allowed
 
 
 def _compare_up(log: FlightLog) -> tuple[Pair | None, np.ndarray]:

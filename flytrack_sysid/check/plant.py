@@ -14,13 +14,12 @@ from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import nominal_parameters
-from flytrack_env.messages import error_text
 from flytrack_env.state import BATTERY, POSITION, QUATERNION, RATES, STATE_SIZE, VELOCITY
-from flytrack_env.toml_file import TomlError, parse_toml, read_text
 from flytrack_env.validation import Fields, Finite, Positive, convert
 from flytrack_sysid.check.result import Check, check_log
 from flytrack_sysid.check.thrust import hover_command
 from flytrack_sysid.log import FlightLog, LogError
+from flytrack_sysid.log_file import load_toml
 
 Step = Callable[[np.ndarray, np.ndarray], np.ndarray | None]
 NUM_EPISODES, EPISODE_S = 60, 1.6
@@ -63,11 +62,7 @@ def handout_layout() -> Layout:
 
 def load_layout(path: str | Path) -> Layout:
     """Return the layout in a TOML file; raises LogError naming file and field."""
-    try:
-        content = parse_toml(read_text(Path(path)))
-    except (OSError, UnicodeDecodeError, TomlError) as error:
-        raise LogError(f"{path}: not a readable TOML file: {error_text(error)}") from error
-    return convert(str(path), content, Layout, LogError)
+    return convert(str(path), load_toml(Path(path)), Layout, LogError)
 
 
 def excitation(dt: float, rng: np.random.Generator) -> np.ndarray:

@@ -6,18 +6,22 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.spatial.transform import Rotation
 
-from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, ORANGE
 from flytrack_sysid.check.commands import compare_commands, follow, thinned
 from flytrack_sysid.check.pairs import CONTRADICTS, Pair
 from flytrack_sysid.check.result import Check
 from flytrack_sysid.check.words import HEADER, describe, row_of, text_of, verdict_of
-from flytrack_sysid.kinematics import GRAVITY, WINDOWS_S, cut_windows, summed_turns
+from flytrack_sysid.kinematics import (
+    WINDOWS_S,
+    acceleration_of,
+    attitude_of,
+    cut_windows,
+    summed_turns,
+)
 from flytrack_sysid.log import FlightLog, time_in_line
-from flytrack_sysid.page import Bullets, Part, Picture, Section, Table, Verdict, page
+from flytrack_sysid.page import Bullets, Part, Picture, Section, Table, Verdict, page, write_report
 from flytrack_sysid.plots import png_of
 
 SHOWN_S = 20.0  # of flight in a picture: longer ones are black
@@ -44,20 +48,15 @@ def signals_of(log: FlightLog, pair: str) -> Signals | None:
         )
         sums, rates = None, commands * sizes
     elif pair == "q and w":
-        sums, rates = summed_turns(Rotation.from_quat(log["q"], scalar_first=True)), log["w"]
+        sums, rates = summed_turns(attitude_of(log)), log["w"]
     elif pair == "v, f and q":
-        attitude = Rotation.from_quat(log["q"], scalar_first=True)
-        sums, rates = log["v"], attitude.apply(log["f"]) - np.array([0.0, 0.0, GRAVITY])
+        sums, rates = log["v"], acceleration_of(log)
     elif pair == "p and v":
         sums, rates = log["p"], log["v"]
     else:
         return None
     windows = cut_windows(log, WINDOWS_S[0])
-    shown = (
-        windows.mean_of(log, log["w"])
-        if sums is None
-        else windows.change_of(sums) / windows.durations[:, None]
-    )
+    shown = windows.mean_of(log, log["w"]) if sums is None else windows.rate_of(sums)
     return time_in_line(log)[windows.starts], shown, windows.mean_of(log, rates)
 
 
@@ -173,6 +172,4 @@ def write_check(folder: str | Path, check: Check, log: FlightLog) -> list[Path]:
         "check.html": page(f"Check of {check.source}", sections, introduction).encode(),
         **pictures,
     }
-    for name, content in files.items():
-        write_atomically(Path(folder) / name, content)
-    return [Path(folder) / name for name in files]
+    return write_report(folder, files)

@@ -13,7 +13,7 @@ from flytrack_sysid.check.commands import curve_changes, mean_delay, responses, 
 from flytrack_sysid.check.explain import Change, Explanation, explain
 from flytrack_sysid.check.frames import FRAMES, IDENTITY, READINGS
 from flytrack_sysid.check.motion import MARGIN, RATE_FLOOR, compare
-from flytrack_sysid.check.pairs import CONTRADICTS, STILL, Compared, Pair, compare_pairs
+from flytrack_sysid.check.pairs import CONTRADICTS, STILL, Pair, compare_pairs
 from flytrack_sysid.check.samples import describe_stuck, sample_changes
 from flytrack_sysid.check.scales import scale_changes
 from flytrack_sysid.check.thrust import hover_command, motor_changes, thrust_changes
@@ -22,7 +22,8 @@ from flytrack_sysid.kinematics import GRAVITY, continuous, read_at, summed_turns
 from flytrack_sysid.log import FlightLog
 
 MAX_ALTERNATIVES = 8
-NO_SCALES: list[tuple[Change, ...]] = [()]
+# The pairs of a log, the frames that explain them, and the scales with these frames.
+Framed = tuple[tuple[Pair, ...], list[Explanation], list[tuple[Change, ...]]]
 ALIKE = 0.8  # of the log-likelihood of another reading
 # Rates that come before their command by more than this were not caused by it: it was logged late.
 LATE_S = 0.018  # beyond a model's lag; the lag of a craft is known to some 15 ms
@@ -152,7 +153,7 @@ def check_log(
     framed = [(turned, one, *explain_frames(one)) for turned, one in readings]
     explained = [one for one in framed if one[3]]
     battery = compare_battery(log)
-    pairs = (*framed[0][2].pairs, *battery)
+    pairs = (*framed[0][2], *battery)
     if not explained:
         return Check(log.source, pairs, ((),), log)
     turned, right, compared, frames, scales = min(
@@ -174,13 +175,13 @@ def check_log(
         (*(change for part in one for change in part), *others)
         for one in islice(parts, MAX_ALTERNATIVES)
     ]
-    contradicted = any(pair.verdict == CONTRADICTS for pair in (*compared.pairs, *battery))
+    contradicted = any(pair.verdict == CONTRADICTS for pair in (*compared, *battery))
     remarks = describe_stuck(log)
     remarks += () if model is None else constants_that_differ(right, model)
     if not any(explanations) and not contradicted:
-        return Check(log.source, (*compared.pairs, *battery), (), right, (), remarks)
+        return Check(log.source, (*compared, *battery), (), right, (), remarks)
     pairs = with_wrong_sizes(pairs, explanations[0])
-    after = compare_pairs(right).pairs
+    after, _ = compare_pairs(right)
     return Check(log.source, pairs, tuple(dict.fromkeys(explanations)), right, after, remarks)
 
 
@@ -239,24 +240,22 @@ def constants_that_differ(log: FlightLog, model: ModelParameters) -> tuple[str, 
     return tuple(sentences)
 
 
-def explain_frames(
-    log: FlightLog,
-) -> tuple[Compared, list[Explanation], list[tuple[Change, ...]]]:
+def explain_frames(log: FlightLog) -> Framed:
     """Return the pairs of a log, the frames that explain them, and the scales with these frames.
 
     Motion that is slower than a sensor's errors shows nothing. This depends on the scales, so pairs
     are compared again where scales are wrong.
     """
     channels = frozenset(log.channels) | {"u_rates"}
-    compared = compare_pairs(log)
-    frames = explain(channels, compared.edges)
-    scales = scale_changes(corrected(log, frames[0])) if frames else NO_SCALES
-    whole = tuple(change for change in scales[0] if "_" not in change.channel)
-    if whole:
-        compared = compare_pairs(rescaled(log, whole))
-        frames = explain(channels, compared.edges)
-        scales = scale_changes(corrected(log, frames[0])) if frames else NO_SCALES
-    return compared, frames, scales
+
+    def explained(scaled: FlightLog) -> Framed:
+        pairs, edges = compare_pairs(scaled)
+        frames = explain(channels, edges)
+        return pairs, frames, scale_changes(corrected(log, frames[0])) if frames else [()]
+
+    found = explained(log)
+    whole = tuple(change for change in found[2][0] if "_" not in change.channel)
+    return explained(rescaled(log, whole)) if whole else found
 
 
 def with_body_rates(log: FlightLog) -> list[tuple[tuple[Change, ...], FlightLog]]:

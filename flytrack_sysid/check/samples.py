@@ -1,10 +1,9 @@
 """Samples that are no measurements: held, repeated, or interpolated where that is wrong."""
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.check.explain import Change
-from flytrack_sysid.kinematics import summed_turns
+from flytrack_sysid.kinematics import attitude_of, summed_turns
 from flytrack_sysid.log import CHANNELS, FlightLog, usual_step
 
 SENSORS = ("w", "f", "q", "v", "p")
@@ -78,7 +77,7 @@ def is_wrapped(log: FlightLog) -> bool:
     """
     if "q" not in log or "w" not in log:
         return False
-    turns = np.diff(summed_turns(Rotation.from_quat(log["q"], scalar_first=True)), axis=0)
+    turns = np.diff(summed_turns(attitude_of(log)), axis=0)
     measured = log["w"][1:] * usual_step(log)[1:, None]
     excess = np.linalg.norm(turns, axis=1) - np.linalg.norm(measured, axis=1)
     is_jump = (excess > MIN_JUMP) & ~log.is_start()[1:]

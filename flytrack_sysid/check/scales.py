@@ -3,11 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.check.explain import Change
 from flytrack_sysid.check.motion import correlations_of, useful_windows
-from flytrack_sysid.kinematics import GRAVITY, summed_turns
+from flytrack_sysid.kinematics import GRAVITY, WEIGHT_W, attitude_of, summed_turns
 from flytrack_sysid.log import FlightLog
 
 MIN_CORRELATION = 0.9  # below, the slope may be that of noise
@@ -60,7 +59,7 @@ def slope_between(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> Slope:
     """
     best, slope = 0.0, UNKNOWN
     for _, windows in useful_windows(log):
-        shown = windows.change_of(sums) / windows.durations[:, None]
+        shown = windows.rate_of(sums)
         measured = windows.mean_of(log, rates)
         sizes = np.linalg.norm(shown, axis=0), np.linalg.norm(measured, axis=0)
         total = np.linalg.norm(sizes[0]), np.linalg.norm(sizes[1])
@@ -78,15 +77,13 @@ def scales_of_forces(log: FlightLog) -> tuple[float, float]:
     The change of the velocity is regressed on the rotated force and on gravity: with scales s_v and
     s_f it is (s_v / s_f) R f - s_v g.
     """
-    attitude = Rotation.from_quat(log["q"], scalar_first=True)
-    force_w = attitude.apply(log["f"])
-    up = np.array([0.0, 0.0, GRAVITY])
+    force_w = attitude_of(log).apply(log["f"])
     found = np.nan, np.nan
     best = MIN_CORRELATION**2
     for _, windows in useful_windows(log):
-        changes = windows.change_of(log["v"]) / windows.durations[:, None]
+        changes = windows.rate_of(log["v"])
         means = windows.mean_of(log, force_w)
-        design = np.stack([means.ravel(), np.tile(-up, len(means))], axis=1)
+        design = np.stack([means.ravel(), np.tile(-WEIGHT_W, len(means))], axis=1)
         (a, b), *_ = np.linalg.lstsq(design, changes.ravel(), rcond=None)
         residual = np.sum((changes.ravel() - design @ [a, b]) ** 2)
         explained = 1.0 - residual / max(np.sum(changes**2), 1e-12)
@@ -132,7 +129,7 @@ def scale_changes(log: FlightLog) -> list[tuple[Change, ...]]:
     found: list[Change] = []
     speed, force = np.nan, np.nan
     if "q" in log and "w" in log:
-        turns = summed_turns(Rotation.from_quat(log["q"], scalar_first=True))
+        turns = summed_turns(attitude_of(log))
         found += _by_axis("w", slope_between(log, turns, log["w"]))
     elif "w" in log:
         fast = float(np.percentile(np.linalg.norm(log["w"], axis=1), FAST_PERCENTILE))

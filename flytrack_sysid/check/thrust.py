@@ -4,13 +4,12 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from flytrack_env.motors import SIGNS
 from flytrack_sysid.check.commands import GRID_S, follow
 from flytrack_sysid.check.explain import Change
 from flytrack_sysid.check.motion import MARGIN, MAX_CORRELATION, useful_windows, weight_of
-from flytrack_sysid.kinematics import GRAVITY, WINDOWS_S, Windows, cut_windows
+from flytrack_sysid.kinematics import GRAVITY, WINDOWS_S, Windows, attitude_of, cut_windows
 from flytrack_sysid.log import FlightLog
 
 DELAYS_S = np.arange(0.0, 0.15, GRID_S)  # of the force behind the command
@@ -36,8 +35,8 @@ def force_along_z(log: FlightLog, windows: Windows) -> np.ndarray | None:
         return windows.mean_of(log, log["f"][:, 2:])[:, 0]
     if "q" not in log or "v" not in log:
         return None
-    up_w = Rotation.from_quat(log["q"], scalar_first=True).apply(UP)
-    changes = windows.change_of(log["v"]) / windows.durations[:, None]
+    up_w = attitude_of(log).apply(UP)
+    changes = windows.rate_of(log["v"])
     return np.sum((changes + UP * GRAVITY) * windows.mean_of(log, up_w), axis=1)
 
 
@@ -121,7 +120,7 @@ def motor_changes(log: FlightLog, motors: np.ndarray) -> list[tuple[Change, ...]
         return [()]
     found = []
     for length_s, windows in useful_windows(log):
-        turned = windows.change_of(log["w"]) / windows.durations[:, None]
+        turned = windows.rate_of(log["w"])
         pushed = windows.mean_of(log, follow(log, motors, 0.0, MOTOR_LAG_S))
         pushed = pushed - pushed.mean(axis=0)
         nats = {}
@@ -142,9 +141,9 @@ def motor_changes(log: FlightLog, motors: np.ndarray) -> list[tuple[Change, ...]
     if highest - best[0, 1, 2, 3] < MARGIN:
         return [()]
     alike = [order for order, value in best.items() if value > highest - MARGIN]
-    fewest = min(sum(k != motor for k, motor in enumerate(order)) for order in alike)
+    moved = [sum(k != motor for k, motor in enumerate(order)) for order in alike]
     return [
         (Change("motors", "order", " ".join(str(motor + 1) for motor in order)),)
-        for order in alike
-        if sum(k != motor for k, motor in enumerate(order)) == fewest
+        for order, count in zip(alike, moved, strict=True)
+        if count == min(moved)
     ]

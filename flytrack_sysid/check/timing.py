@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from flytrack_sysid.check.explain import Change
 from flytrack_sysid.check.motion import MARGIN, useful_windows, weight_of
 from flytrack_sysid.clocks import offset_between
-from flytrack_sysid.kinematics import GRAVITY, read_at, summed_turns
-from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.kinematics import WEIGHT_W, attitude_of, jackknife_error, read_at, summed_turns
+from flytrack_sysid.log import FlightLog, median_step
 
 LATE_S = 0.006  # smaller offsets are those of filters and of the log's step
 MAX_LATE_S, GRID_S = 0.1, 0.005
@@ -66,7 +66,7 @@ def best_shift(
     """
     best = NOTHING
     # A simulator's rates may be those of half a step before.
-    half_step_s = 0.5 * float(np.median(usual_step(log))) if log.origin == "simulated" else 0.0
+    half_step_s = 0.5 * median_step(log) if log.origin == "simulated" else 0.0
     least_s = LATE_S + half_step_s
     grid = np.arange(-MAX_LATE_S, MAX_LATE_S + GRID_S / 2, GRID_S)
     features = [rates(seconds).reshape(len(log), -1) for seconds in grid]
@@ -74,7 +74,7 @@ def best_shift(
         elapsed_s = np.cumsum(windows.durations)
         if elapsed_s[-1] < MIN_S:
             continue
-        shown = windows.change_of(sums) / windows.durations[:, None]
+        shown = windows.rate_of(sums)
         block = (elapsed_s / BLOCK_S).astype(int)
         residuals = np.array(
             [
@@ -87,9 +87,7 @@ def best_shift(
         if totals.sum(axis=1).min() > (1.0 - MIN_EXPLAINED) * np.sum(shown**2):
             continue
         without = np.log(totals[:, None] - residuals + TINY).sum(axis=2)  # one block
-        jackknife = np.array([_lowest(grid, costs)[0] for costs in without.T])
-        count = len(jackknife)
-        sigma_s = np.sqrt((count - 1) / count * np.sum((jackknife - jackknife.mean()) ** 2))
+        sigma_s = jackknife_error(np.array([_lowest(grid, costs)[0] for costs in without.T]))
         at_zero = float(np.log(totals[len(grid) // 2] + TINY).sum())
         nats = 0.5 * weight_of(length_s) * len(shown) * (at_zero - least)
         if nats > best.nats and abs(seconds) > max(least_s, LATE_ERRORS * sigma_s):
@@ -134,7 +132,7 @@ def _lowest(grid: np.ndarray, costs: np.ndarray) -> tuple[float, float]:
 def late_sensors(log: FlightLog) -> list[Change]:
     """Return the sensors that are late; the log has right axes and scales."""
     late: dict[str, float] = {}
-    attitude = Rotation.from_quat(log["q"], scalar_first=True) if "q" in log else None
+    attitude = attitude_of(log) if "q" in log else None
     if attitude is not None and "w" in log:
         turns = summed_turns(attitude)
         # A late attitude agrees with rates that are read earlier.
@@ -180,5 +178,5 @@ def accelerations(force: np.ndarray, matrices: np.ndarray) -> np.ndarray:
         matrices: of the attitude, (num_rows, 3, 3).
     """
     turned = np.cross(np.eye(3)[None], force[:, None]).transpose(0, 2, 1)
-    world = matrices @ force[..., None] - np.array([0.0, 0.0, GRAVITY])[:, None]
+    world = matrices @ force[..., None] - WEIGHT_W[:, None]
     return np.concatenate([world, matrices, matrices @ turned], axis=2)

@@ -11,6 +11,7 @@ from flytrack_sysid.check.pairs import CONTRADICTS, STILL, Pair
 from flytrack_sysid.check.result import Check
 from flytrack_sysid.check.scales import unit_of
 from flytrack_sysid.log import CHANNELS
+from flytrack_sysid.page import text_table
 
 MAX_SHOWN = 4  # alternatives
 # Frames that have names, of a body's and of a world's axes.
@@ -44,15 +45,14 @@ def _says(channel: str, kind: str, value: str | float | bool) -> str:
             "u_thrust": "upside down: more command is less thrust",
             "v_bat": "rises in flight, as no battery does: the charge used, or rows in reverse?",
         }[channel]
-    if kind == "axes":
-        names = BODY_NAMES if channel in BODY_CHANNELS else WORLD_NAMES
-        sticks = "roll, pitch, yaw are about" if channel == "u_rates" else "x, y, z hold"
+    if kind in ("axes", "body", "world"):
+        is_of_body = channel in BODY_CHANNELS if kind == "axes" else kind == "body"
+        names = BODY_NAMES if is_of_body else WORLD_NAMES
         known = f" ({names[str(value)]})" if str(value) in names else ""
-        return f"{sticks} {', '.join(str(value).split())}{known}"
-    if kind in ("body", "world"):
-        names = BODY_NAMES if kind == "body" else WORLD_NAMES
-        known = f" ({names[str(value)]})" if str(value) in names else ""
-        return f"the {kind}'s axes are {', '.join(str(value).split())}{known}"
+        what = f"the {kind}'s axes are"
+        if kind == "axes":
+            what = "roll, pitch, yaw are about" if channel == "u_rates" else "x, y, z hold"
+        return f"{what} {', '.join(str(value).split())}{known}"
     if kind == "scale":
         unit = unit_of(channel, float(value))
         return f"{float(value):.4g} times the true size" + (f": in {unit}" if unit else "")
@@ -74,9 +74,8 @@ def _says(channel: str, kind: str, value: str | float | bool) -> str:
 
 def list_explanations(explanations: Sequence[Sequence[Change]]) -> list[str]:
     """Return a line for each change, with the alternatives one after the other."""
-    lines = []
     common = [change for change in explanations[0] if all(change in one for one in explanations)]
-    lines += [f"  {describe(change)}" for change in common]
+    lines = [f"  {describe(change)}" for change in common]
     others = [[change for change in one if change not in common] for one in explanations]
     for number, alternative in enumerate(others[:MAX_SHOWN] if any(others) else []):
         text = "; ".join(map(describe, alternative)) or "nothing else"
@@ -126,12 +125,7 @@ def verdict_of(check: Check) -> str:
 
 def text_of(check: Check) -> str:
     """Return a check as plain text: a table of the pairs, and what explains contradictions."""
-    rows = [list(HEADER), *map(row_of, check.pairs)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(HEADER))]
-    table = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
+    table = text_table([HEADER, *map(row_of, check.pairs)])
     lines = [f"{check.source}: {len(check.pairs)} pairs of channels", *table, verdict_of(check)]
     if any(check.explanations):
         lines += list_explanations(check.explanations)
@@ -147,6 +141,5 @@ def problems_of(check: Check) -> list[str]:
     )
     if not any(check.explanations):
         return [f"{pairs}: no change of conventions explains it"]
-    lines = [line.strip() for line in list_explanations(check.explanations)]
-    text = "; ".join(lines)
+    text = "; ".join(line.strip() for line in list_explanations(check.explanations))
     return [f"found channels that contradict each other; they agree if {text}"]

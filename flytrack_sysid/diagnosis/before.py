@@ -7,7 +7,7 @@ and by a notable size. Uncertainty is estimated from the disagreement between se
 which includes the effect of the parts that the model lacks.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -19,6 +19,8 @@ from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.effects import BY_NAME, acts
 from flytrack_env.motion import Motion
 from flytrack_sysid.diagnosis.diagnose import (
+    Logs,
+    Report,
     Split,
     refined_within_range,
     split,
@@ -47,6 +49,7 @@ from flytrack_sysid.inference.score_test import (
     solve,
     threshold,
 )
+from flytrack_sysid.kinematics import low_pass
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.log_motion import check_same_origin
 
@@ -63,7 +66,6 @@ NOT_SHARED = (
     "the logs were flown at other thrusts: each was compared with the model at its own, so that "
     "a change of the thrust may be an error of the model's curve"
 )
-Logs = FlightLog | Sequence[FlightLog]
 
 
 def _logs(logs: Logs) -> Sequence[FlightLog]:
@@ -149,7 +151,7 @@ def diagnose_change(
     before: Logs,
     model: ModelParameters | None = None,
     held_out: np.ndarray | None = None,
-    report: Callable[[int, int], None] = lambda done, stages: None,
+    report: Report = lambda done, stages: None,
     motion: Motion | None = None,
 ) -> Diagnosis:
     """Return the diagnosis of a log, in which causes are changes since an earlier log.
@@ -226,11 +228,9 @@ def calm(parts: Split) -> Split:
 
 def _calm(problem: Problem) -> Problem:
     record, counts = problem.chunks.record, problem.chunks.counts
-    step_s = float(np.median(record.step_s))
-    keep = np.exp(-step_s / JUMP_S)
+    step_s = record.median_step_s
     sticks = record.command[..., :3]
-    lagged = signal.lfilter([1.0 - keep], [1.0, -keep], sticks, axis=0)
-    is_jump = np.abs(sticks - lagged).sum(axis=-1) > JUMP
+    is_jump = np.abs(sticks - low_pass(sticks, step_s, JUMP_S)).sum(axis=-1) > JUMP
     rows = max(round(AFTERMATH_S / step_s), 1)
     follows = signal.lfilter(np.ones(rows), [1.0], is_jump.astype(float), axis=0) > 0.5
     quiet = counts & ~follows[..., None, None]

@@ -63,7 +63,7 @@ def summarize_half_responses(
     does ended at the top of its range: the log then shows at most that the response is not faster.
     """
     problem, indices = refined.problem, free_indices(model, refined)
-    least_lag_s = LAG_STEP * float(np.median(problem.chunks.record.step_s))
+    least_lag_s = LAG_STEP * problem.chunks.record.median_step_s
     nudged, step = problem.nudged(vectors["extended"], indices, SLOPE_STEP, least_lag_s)
     small = half_responses(np.stack([*vectors.values(), *nudged]), problem.like, SMALL_STEP)
     full = half_responses(np.stack(list(vectors.values())), problem.like, FULL_STEP)

@@ -1,6 +1,6 @@
 """Diagnose a model from a log: causes, their certainty, and what correcting them gains."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -75,6 +75,7 @@ from flytrack_sysid.split import HELD_OUT_EVERY, held_out_rows
 
 STAGES = ("first look", "search", "vetoes", "refinement", "summary")
 Report = Callable[[int, int], None]
+Logs = FlightLog | Sequence[FlightLog]
 
 
 class DiagnosisError(ValueError):
@@ -106,7 +107,7 @@ class Split(NamedTuple):
 
 
 def diagnose(
-    log: FlightLog | Sequence[FlightLog],
+    log: Logs,
     model: ModelParameters | None = None,
     held_out: np.ndarray | None = None,
     report: Report = lambda done, stages: None,
@@ -166,7 +167,7 @@ def diagnose(
 
 
 def first_look(
-    log: FlightLog | Sequence[FlightLog],
+    log: Logs,
     model: ModelParameters | None = None,
     held_out: np.ndarray | None = None,
     motion: Motion | None = None,
@@ -183,7 +184,7 @@ def begun(parts: Split) -> tuple[SearchState, FittedModel]:
 
 
 def split(
-    log: FlightLog | Sequence[FlightLog],
+    log: Logs,
     model: ModelParameters | None,
     held_out: np.ndarray | None,
     motion: Motion | None,
@@ -223,7 +224,7 @@ def split(
     corrected, is_known = read_poses(log, motion_estimate.late_s)
     corrected, mask = corrected.select(is_known), mask[is_known]
     train_chunks, test_chunks = (cut_chunks(corrected, rows, model) for rows in (~mask, mask))
-    warnings += thinning_warning(train_chunks, thinned(train_chunks))
+    warnings += thinning_warning(train_chunks)
     same_rows = log.select(is_known)
     as_logged = tuple(
         thinned(cut_chunks(same_rows, rows, model))
@@ -512,25 +513,26 @@ def joined(logs: Sequence[FlightLog]) -> FlightLog:
     if len(logs) == 1:
         return logs[0]
     check_same_origin(*logs)
-    if len({one.has_motors for one in logs}) > 1:
-        shown = ", ".join(
-            f"{Path(one.source).name}: {'motors' if one.has_motors else 'sticks'}" for one in logs
-        )
-        raise LogError(f"u: found commands of {shown}; expected one kind in one command")
-    voltages = [flight_log.stated_voltage_v for flight_log in logs]
+
+    def listed(values: Iterable[object]) -> str:
+        pairs = zip(logs, values, strict=True)
+        return ", ".join(f"{Path(log.source).name}: {value}" for log, value in pairs)
+
+    kinds = ["motors" if log.has_motors else "sticks" for log in logs]
+    if len(set(kinds)) > 1:
+        raise LogError(f"u: found commands of {listed(kinds)}; expected one kind in one command")
+    voltages = [log.stated_voltage_v for log in logs]
     if len(set(voltages)) > 1:
-        shown = ", ".join(
-            f"{Path(flight_log.source).name}: {flight_log.stated_voltage_v}" for flight_log in logs
-        )
         raise LogError(
-            f"{', '.join(STATED_VOLTAGES)}: found {shown}; expected logs of one pack in one command"
+            f"{', '.join(STATED_VOLTAGES)}: found {listed(voltages)}; expected logs of one pack in "
+            "one command"
         )
-    masses = {log.stated_mass_kg for log in logs} - {None}
+    stated_kg = [log.stated_mass_kg for log in logs]
+    masses = set(stated_kg) - {None}
     if len(masses) > 1:
-        shown = ", ".join(
-            f"{Path(flight_log.source).name}: {flight_log.stated_mass_kg}" for flight_log in logs
+        raise LogError(
+            f"{STATED_MASS}: found {listed(stated_kg)}; expected logs of one craft in one command"
         )
-        raise LogError(f"{STATED_MASS}: found {shown}; expected logs of one craft in one command")
     names = set.intersection(*(set(log.channels) for log in logs))
     first = np.cumsum([0, *(len(np.unique(log.segment)) for log in logs)])
     segments = [
@@ -563,8 +565,9 @@ def unused_channels(logs: Sequence[FlightLog]) -> list[str]:
     ]
 
 
-def thinning_warning(chunks: Chunks, kept: Chunks) -> list[str]:
+def thinning_warning(chunks: Chunks) -> list[str]:
     """Return a warning if a log is so long that only some of its chunks are learnt from."""
+    kept = thinned(chunks)
     if kept.num_judged == chunks.num_judged:
         return []
     return [

@@ -45,6 +45,11 @@ class Fit(NamedTuple):
     columns: np.ndarray
 
     @property
+    def half_width_of(self) -> dict[int, float]:
+        """``half_widths`` by index."""
+        return dict(zip(self.indices, self.half_widths.tolist(), strict=True))
+
+    @property
     def quantile(self) -> float:
         """Standard deviations in half of a 95 % interval, Student's t for the number of blocks."""
         return float(stats.t.ppf(0.975, max(len(self.losses), 2) - 1))
@@ -163,7 +168,7 @@ class Target(NamedTuple):
     @property
     def step_s(self) -> float:
         """Usual time between rows, s."""
-        return float(np.median(self.windows.record.step_s))
+        return self.windows.record.median_step_s
 
     def linearized(
         self,

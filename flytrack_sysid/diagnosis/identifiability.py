@@ -33,6 +33,7 @@ from flytrack_sysid.inference.score_test import (
 from flytrack_sysid.inference.search import FittedModel, SearchState
 from flytrack_sysid.inference.trace_cache import fast_jit
 from flytrack_sysid.log import FlightLog, log_of_states
+from flytrack_sysid.log_voltage import voltages_of
 from flytrack_sysid.manoeuvres import (
     FLIGHTS_PER_MANOEUVRE,
     MANOEUVRES,
@@ -217,7 +218,7 @@ def _seen_flights(problem: Problem, vector: np.ndarray) -> tuple[FlightLog, np.n
     The log has the channels of the problem's log.
     """
     model = problem.like._replace(thrust_coeffs=vector[problem.parameter_indices(THRUST_COEFFS)])
-    voltages = measured_voltage_range(problem.chunks) or _battery_range(problem.like)
+    voltages = measured_voltage_range(problem.chunks) or voltages_of(problem.like.battery)
     flights = flights_of(MANOEUVRES, hover_action(model, voltages), voltages=voltages)
     starts = np.stack([flight.start for flight in flights])
     commands = np.stack([flight.command for flight in flights])
@@ -376,16 +377,12 @@ def _reasons(path: Path, content: Any) -> dict[str, tuple[str, ...]]:
     return {name: tuple(effects) for name, effects in wanted.items() if effects}
 
 
-def _battery_range(model: ModelParameters) -> tuple[float, float]:
-    return float(model.battery.empty_v), float(model.battery.full_v)
-
-
 def _voltages(path: Path, content: dict[str, Any], model: ModelParameters) -> tuple[float, float]:
     """Return the range of voltages in a diagnosis, else that of the model's battery."""
     data = content.get("data")
     found = data.get("voltages") if isinstance(data, dict) else None
     if found is None:
-        return _battery_range(model)
+        return voltages_of(model.battery)
     numbers = (
         found
         if isinstance(found, list) and all(isinstance(number, int | float) for number in found)

@@ -10,6 +10,7 @@ terms. A term has to gain on held-out rows, too.
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -32,7 +33,7 @@ from flytrack_sysid.diagnosis.unexplained import (
     linearized_residuals,
     whitened,
 )
-from flytrack_sysid.inference.chunks import CHUNK_S
+from flytrack_sysid.inference.chunks import CHUNK_S, of_row_before
 from flytrack_sysid.inference.parameters import MAX_RATES, from_vector
 from flytrack_sysid.inference.problem import Problem, robust_square, split_blocks
 from flytrack_sysid.inference.search import FittedModel
@@ -65,13 +66,12 @@ def moment_of_flight(problem: Problem, vector: np.ndarray, flight: FlightVariabl
     wind_w = np.array([float(wind.v_x), float(wind.v_y), float(wind.v_z)])
     rotation = flight.body_to_world
     airspeed_b = np.einsum("rlji,rlj->rli", rotation, flight.vel_w - wind_w)
-    volts = np.concatenate([record.battery_v[:1], record.battery_v[:-1]])
+    volts = of_row_before(record.battery_v)
     thrust = collective_thrust(flight.applied[..., 3], volts, model.thrust_coeffs)
     max_rates = np.radians(vector[problem.parameter_indices(MAX_RATES)])
     rates_b = flight.applied[..., :XYZ] * max_rates
     if "w" in problem.chunks.measured:
-        gyro = problem.chunks.measured["w"]
-        rates_b = np.concatenate([gyro[:1], gyro[:-1]])
+        rates_b = of_row_before(problem.chunks.measured["w"])
 
     def vec(values: np.ndarray) -> Vec3:
         return Vec3(*np.moveaxis(values, -1, 0))
@@ -84,7 +84,7 @@ def moment_of_flight(problem: Problem, vector: np.ndarray, flight: FlightVariabl
         applied=Action(*np.moveaxis(flight.applied, -1, 0)),
         thrust_acc=np.asarray(thrust) / float(model.m),
         battery_v=volts,
-        time_s=np.concatenate([record.time_s[:1], record.time_s[:-1]]),
+        time_s=of_row_before(record.time_s),
     )
 
 
@@ -177,28 +177,33 @@ def _local(side: Side, quantity: str, shapes: Sequence[str], count: int) -> Iter
                 )
 
 
+def _powers(quantity: str, exponents: Iterable[float]) -> Iterator[tuple[str, tuple[Factor, ...]]]:
+    """Yield powers of a quantity, each with its frame."""
+    for exponent in exponents:
+        yield "body", (power(quantity, exponent),)
+
+
 def list_factors(side: Side) -> Iterator[tuple[str, tuple[Factor, ...]]]:
     """Yield the frames and factors that are tried."""
     airspeeds = ("airspeed_x", "airspeed_y", "airspeed_z", "edgewise", "airspeed")
     for quantity in airspeeds:
-        yield from (("body", (power(quantity, exponent),)) for exponent in (1.0, 2.0, 3.0))
+        yield from _powers(quantity, (1.0, 2.0, 3.0))
         yield from (
             ("body", (power("thrust", exponent), power(quantity))) for exponent in (0.5, 1.0)
         )
         yield "body", (power("thrust"), power(quantity, 2.0))
-    for quantity in ("rate_x", "rate_y", "rate_z"):
-        yield from (("body", (power(quantity, exponent),)) for exponent in (1.0, 2.0))
+    rates = ("rate_x", "rate_y", "rate_z")
+    for quantity in rates:
+        yield from _powers(quantity, (1.0, 2.0))
         yield from (("body", (power(quantity), power(airspeed))) for airspeed in airspeeds[:3])
-    yield "body", (power("rate_x"), power("rate_y"))
-    yield "body", (power("rate_x"), power("rate_z"))
-    yield "body", (power("rate_y"), power("rate_z"))
+    yield from (("body", tuple(map(power, pair))) for pair in combinations(rates, 2))
     for quantity in ("roll", "pitch", "yaw", "throttle"):
-        yield from (("body", (power(quantity, exponent),)) for exponent in (2.0, 3.0))
+        yield from _powers(quantity, (2.0, 3.0))
         yield from (("body", (factor,)) for factor in _local(side, quantity, ("bump", "step"), 5))
     # The voltage alone is not tried: within one flight it falls with the time.
     yield "body", (power("thrust"), power("voltage"))
     for quantity in ("tilt", "height"):
-        yield from (("body", (power(quantity, exponent),)) for exponent in (1.0, 2.0))
+        yield from _powers(quantity, (1.0, 2.0))
         yield from (("body", (factor,)) for factor in _local(side, quantity, ("bump",), 6))
         yield "body", (power("thrust"), power(quantity))
     span = float(np.ptp(side.spread("time")))

@@ -140,10 +140,9 @@ def with_rivals(
         linearization: of the model, along everything.
         ablations: without rivals, in the order of the model's effects.
     """
-    effects = (ablation.effect for ablation in model.candidates)
     return {
-        effect: _with_rivals(state, model, linearization, effect, ablation)
-        for effect, ablation in zip(effects, ablations, strict=True)
+        one.effect: _with_rivals(state, model, linearization, one.effect, ablation)
+        for one, ablation in zip(model.candidates, ablations, strict=True)
     }
 
 

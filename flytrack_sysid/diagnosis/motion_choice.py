@@ -40,7 +40,7 @@ from flytrack_sysid.inference.problem import (
 )
 from flytrack_sysid.inference.score_test import Linearization, solve
 from flytrack_sysid.inference.search import refine
-from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.log import FlightLog, median_step
 from flytrack_sysid.log_motion import required_motion
 
 CLEAR = 10.0  # of minus twice the log likelihood: a simulator's step has to be better by this
@@ -264,7 +264,7 @@ def estimate_motion(
     estimates = [MotionEstimate(candidate) for candidate in motions]
     if apparent is not None:
         # Rates of a simulator's step are those in its middle.
-        half_s = 0.5 * float(np.median(usual_step(log)))
+        half_s = 0.5 * median_step(log)
         estimates = _apparent_estimates(motions, *apparent, half_s)
     if motion is not None and estimates[0].late_s <= 0.0:
         return MotionEstimate(motion, is_sure=True)

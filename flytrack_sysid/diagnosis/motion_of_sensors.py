@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import PAIRS, offset_between
 from flytrack_sysid.inference.score_test import solve
-from flytrack_sysid.kinematics import GRAVITY
-from flytrack_sysid.log import GAP_STEPS, FlightLog, usual_step
+from flytrack_sysid.kinematics import WEIGHT_W, attitude_of, runs_of
+from flytrack_sysid.log import GAP_STEPS, FlightLog, median_step
 
 # The attitude that rotates the force of a step, as a share of the turn from the attitude before the
 # step to that after it. The sensors identify a motion if their share is more than SURE_ERRORS
@@ -50,7 +50,7 @@ def attitude_share(log: FlightLog, late_s: float) -> tuple[float, float] | None:
     """
     if not all(name in log for name in ("q", "v", "f", "w")):
         return None
-    steps = max(late_s, 0.0) / float(np.median(usual_step(log)))
+    steps = max(late_s, 0.0) / median_step(log)
     fits = [_share_of(log, late) for late in {int(np.floor(steps)), int(np.ceil(steps))}]
     return min((fit for fit in fits if fit is not None), default=(0.0, None))[1]
 
@@ -64,7 +64,7 @@ def _share_of(log: FlightLog, late_rows: int) -> tuple[float, tuple[float, float
     across the lift, where a drone feels less than the sensor's noise, offset, tilt and drag; and a
     steady force.
     """
-    step_s, usual_s = np.diff(log.time)[:, None], float(np.median(usual_step(log)))
+    step_s, usual_s = np.diff(log.time)[:, None], median_step(log)
     row = np.maximum(np.arange(1, len(log)) - late_rows, 0)
     lift, rates_b = log["f"][row, 2:], log["w"][row]
     slope, turning_b = (np.gradient(log[name], axis=0)[row] / usual_s for name in "fw")
@@ -72,7 +72,7 @@ def _share_of(log: FlightLog, late_rows: int) -> tuple[float, tuple[float, float
         (np.cross(turning_b, arm) + np.cross(rates_b, np.cross(rates_b, arm)))[:, 2:]
         for arm in np.eye(3)
     ]
-    quat = Rotation.from_quat(log["q"], scalar_first=True)
+    quat = attitude_of(log)
     before, after = quat[:-1], quat[1:]
     middle = before * Rotation.from_rotvec(0.5 * (before.inv() * after).as_rotvec())
     x, y, z = np.moveaxis(middle.as_matrix(), 2, 0)  # of the body, in the world
@@ -88,7 +88,7 @@ def _share_of(log: FlightLog, late_rows: int) -> tuple[float, tuple[float, float
         ],
         axis=-1,
     )
-    force_w = z * lift - np.array([0.0, 0.0, GRAVITY])
+    force_w = z * lift - WEIGHT_W
     residuals = np.diff(log["v"], axis=0) - force_w * step_s
     is_whole = (step_s[:, 0] < GAP_STEPS * usual_s) & ~log.is_start()[1:]
     is_whole[:late_rows] = False
@@ -116,11 +116,10 @@ def _pieces(is_whole: np.ndarray, step_s: float) -> list[tuple[int, int]]:
         is_whole: the steps without a gap, (num_steps,) bool.
         step_s: the usual step.
     """
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_whole, [False]]).astype(int)))
     piece_steps, min_steps = round(PIECE_S / step_s), round(MIN_PIECE_S / step_s)
     cuts = (
         (start, min(start + piece_steps, last))
-        for first, last in edges.reshape(-1, 2)
+        for first, last in runs_of(is_whole, np.zeros_like(is_whole))
         for start in range(first, last, piece_steps)
     )
     return [(start, end) for start, end in cuts if end - start >= min_steps]

@@ -11,7 +11,7 @@ Times are those of one clock. A log whose time goes back is of several flights, 
 for changes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -146,8 +146,11 @@ def find_changes(
     if not len(seconds[1]):
         return []
     best: dict[str, Hypothesis] = {}
-    others = candidates_for(linearization.problem)
-    others = [candidate for candidate in others if candidate.effect not in model.effects]
+    others = [
+        candidate
+        for candidate in candidates_for(linearization.problem)
+        if candidate.effect not in model.effects
+    ]
     for candidate in (*model.candidates, *others):
         if candidate.effect in lacking:
             continue
@@ -190,10 +193,9 @@ def _change_of(
     index = int(np.argmax(gains))
     inflation = _inflation(score, information, given, changing, weights[way][index])
     row = int(changes[index]) if way != "drift" else 0
-    names = [linearization.problem.names[linearization.indices[column]] for column in columns]
     growth = -steps[index] if way == "end" else steps[index]
     by_name = {
-        names[columns.index(column)]: float(step)
+        candidate.fields[columns.index(column)]: float(step)
         for column, step in zip(changing, growth, strict=True)
         if is_named
     }
@@ -270,7 +272,7 @@ def profile_change(problem: Problem, test: Problem, vector: np.ndarray, row: int
         vector: the model.
         row: at which the change is in ``problem``.
     """
-    step_s = float(np.median(problem.chunks.record.step_s))
+    step_s = problem.chunks.record.median_step_s
     problems = problem, replace(test, windows=problem.windows).with_noise(problem.noise)
     # Residuals with the change after the log, and before it.
     sides = [
@@ -343,6 +345,11 @@ def active_windows(selection: Selection) -> list[Window]:
     return windows_of(selection.state, selection.model)
 
 
+def rows_of(windows: Iterable[Window]) -> set[int]:
+    """Return the rows of the record at which windows begin or end within a log."""
+    return {row for one in windows for row in (one.start, one.end)} - {ALWAYS, NEVER}
+
+
 def ended(selection: Selection) -> list[str]:
     """Return the effects that end within the log."""
     return [window.effect for window in active_windows(selection) if window.end != NEVER]
@@ -358,10 +365,7 @@ def at_end(selection: Selection, model: FittedModel) -> FittedModel:
 
 def first_row_as_at_end(selection: Selection, test: Problem) -> int:
     """Return the row of the log after which the same effects act as at its end."""
-    rows = {row for window in active_windows(selection) for row in (window.start, window.end)} - {
-        ALWAYS,
-        NEVER,
-    }
+    rows = rows_of(active_windows(selection))
     return int(np.ceil(log_rows(selection.state.problem, test, [max(rows)])[0])) if rows else 0
 
 
@@ -445,18 +449,14 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     )
     state, model = with_refitted_noise(at_best_row(state, test, model, first.row), model)
     state, base, model = extended(state, state.fitted((), selection.base.vector), model)
-    new_rows, old_rows = (
-        {row for one in windows for row in (one.start, one.end)}
-        for windows in (windows_of(state, model), selection.state.problem.windows)
-    )
-    rows = new_rows - old_rows - {ALWAYS, NEVER}
+    rows = rows_of(windows_of(state, model)) - rows_of(selection.state.problem.windows)
     if rows:
         state = at_best_row(state, test, model, max(rows))
     tried = Selection(state, base, state.fitted(model.candidates, model.vector), {})
     if misfit(tried, test) >= misfit(selection, test):
         return None  # before the effects are selected, which takes longest
     later = select(state, base, tried.model)
-    later = later._replace(state=windowed(later.state, windows_of(later.state, later.model)))
+    later = later._replace(state=windowed(later.state, active_windows(later)))
     misfit_changes = [
         misfit(later, problem) - misfit(selection, problem)
         for problem in (selection.state.problem, test)

@@ -25,6 +25,7 @@ from flytrack_sysid.inference.parameters import (
     range_of,
     to_vector,
 )
+from flytrack_sysid.log_voltage import voltages_of
 
 # Standard deviation of a thrust curve's shape, in shares of full thrust. Voltage lost under load,
 # up to 0.95 V in 34 of 60 plants of benchmarks.loop (seed 2026), bends it by 2 % at most.
@@ -113,10 +114,9 @@ def _thrust_shapes(nominal: ModelParameters) -> np.ndarray:
 
     Multiples of the nominal curve are not bent.
     """
-    battery = nominal.battery
     sticks, volts = np.meshgrid(
         np.linspace(-1.0, 1.0, NUM_STICKS),
-        np.linspace(float(battery.empty_v), float(battery.full_v), NUM_VOLTAGES),
+        np.linspace(*voltages_of(nominal.battery), NUM_VOLTAGES),
     )
     by_coefficient = np.stack(
         [collective_thrust(sticks.ravel(), volts.ravel(), one) for one in np.eye(6)], axis=1

@@ -33,7 +33,17 @@ from flytrack_sysid.diagnosis.result import (
 )
 from flytrack_sysid.diagnosis.traces import Traces, traces
 from flytrack_sysid.log import FlightLog
-from flytrack_sysid.page import Bullets, Part, Picture, Section, Table, Text, Verdict, page
+from flytrack_sysid.page import (
+    Bullets,
+    Part,
+    Picture,
+    Section,
+    Table,
+    Text,
+    Verdict,
+    page,
+    text_table,
+)
 from flytrack_sysid.plots import WIDTH_IN, png_of
 
 JSON_NAME, MODEL_NAME, REPORT_NAME = "diagnosis.json", "extended_model.json", "report.html"
@@ -553,7 +563,6 @@ def write_diagnosis(folder: str | Path, diagnosis: Diagnosis, log: FlightLog) ->
         OSError: a file cannot be written.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     content = diagnosis.as_json()
     provenance = {
         "tool": f"flytrack_sysid.diagnose {__version__}",
@@ -614,11 +623,7 @@ def _limits_text(diagnosis: Diagnosis) -> list[str]:
     for limit in limits[:MAX_LIMITS]:
         size = f"{limit.smallest:.3g} {limit.unit}" if np.isfinite(limit.smallest) else "-"
         rows.append((limit.effect, size, ", ".join(limit.confused_with[:MAX_LISTED]) or "noise"))
-    widths = [max(len(row[column]) for row in rows) for column in range(2)]
-    lines = [
-        f"{name:<{widths[0]}}  {size:<{widths[1]}}  {confused}".rstrip()
-        for name, size, confused in rows
-    ]
+    lines = text_table(rows)
     if len(limits) > MAX_LIMITS:
         lines.append(f"and {len(limits) - MAX_LIMITS} more, in {REPORT_NAME}")
     flights = Counter(limit.fly for limit in limits if limit.fly)

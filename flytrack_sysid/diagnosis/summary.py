@@ -460,14 +460,14 @@ def with_refined_values(
     nominal values are omitted: single steps show them, and flights do not.
     """
     problem, fit = refined.problem, refined.fit
-    half = {} if fit is None else dict(zip(fit.indices, fit.half_widths, strict=True))
+    half = {} if fit is None else fit.half_width_of
     result = []
     for cause in causes:
         prefix = f"{cause.effect}." if cause.effect in BY_NAME else ""
         determined = [prefix + name for name in cause.parameters if prefix + name in problem.names]
         fitted = [problem.names[index] for index in half if prefix]
-        fields = [*determined, *(field for field in fitted if field.startswith(prefix))]
-        fields = list(dict.fromkeys(fields))
+        of_cause = (field for field in fitted if field.startswith(prefix))
+        fields = list(dict.fromkeys([*determined, *of_cause]))
         values = dict(cause.parameters)
         for field in fields:
             index, name = problem.names.index(field), field.split(".")[-1]
@@ -532,7 +532,7 @@ def changed_parameters(
     indices = [
         index for index in extended.indices if abs(vector[index] - problem.start[index]) > 0.0
     ]
-    widths = {} if fit is None else dict(zip(fit.indices, fit.half_widths, strict=True))
+    widths = {} if fit is None else fit.half_width_of
     acting = [
         index
         for index in indices
@@ -562,7 +562,7 @@ def estimate_joint(linearization: Linearization, extended: FittedModel, refined:
     parts of the log disagree, which few parts show in few directions only: so both are summed.
     """
     problem, fit = refined.problem, refined.fit
-    columns = [linearization.indices.index(index) for index in extended.indices]
+    columns = linearization.columns_at(extended.indices)
     acting = [linearization.indices[column] for column in linearization.acting(columns)]
     if not acting:
         return Joint()
@@ -703,10 +703,10 @@ def _at_bound(cause: Cause) -> str:
     why = "its law may stand in for something else"
     if cause.effect in BY_NAME:
         why += ", and is not in the extended model"
-    if cause.effect in BY_NAME and any(
-        name in cause.beyond for name in BY_NAME[cause.effect].max_steps
-    ):
-        why = "only so many rows of the log are remembered; import it with fewer rows per second"
+        if any(name in cause.beyond for name in BY_NAME[cause.effect].max_steps):
+            why = (
+                "only so many rows of the log are remembered; import it with fewer rows per second"
+            )
     return f"{cause.effect} is beyond the list: {cause.beyond}, the end of what is searched; {why}"
 
 

@@ -30,6 +30,7 @@ from flytrack_sysid.inference.parameters import STICKS
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.record import Record
 from flytrack_sysid.inference.trace_cache import fast_jit
+from flytrack_sysid.kinematics import since_first
 from flytrack_sysid.log import FlightLog
 
 UNITS = {"rates": "rad/s", "attitude": "rad/s", "force": "m/s²", "velocity": "m/s²", "battery": "V"}
@@ -180,10 +181,7 @@ def _residuals(residuals: np.ndarray, rows: _Rows) -> dict[str, np.ndarray]:
     for name, (axes, level) in PLACES.items():
         values = by_row[:, axes, level]
         if name == "battery":
-            summed = np.cumsum(values, axis=0)
-            is_first = np.flatnonzero(record.begins)
-            started = is_first[np.cumsum(record.begins) - 1]
-            values = summed - summed[started]
+            values = since_first(np.cumsum(values, axis=0), record.begins)
         elif name in _PER_STEP:
             values = values / step_s
         result[name] = (
@@ -299,10 +297,9 @@ def traces(log: FlightLog, models: Mapping[str, ModelParameters], like: str) -> 
         for name, model_residuals in zip(models, chunk_residuals, strict=True)
     }
     in_record_order = _regressors(base, rows.record, rows.along(applied))
-    time_in_flight = log.time - log.time[log.is_start()][np.cumsum(log.is_start()) - 1]
-    step_s = float(np.median(rows.record.step_s))
+    step_s = rows.record.median_step_s
     regressors = {
-        "time": time_in_flight,
+        "time": since_first(log.time, log.is_start()),
         **{name: values[rows.kept] for name, values in in_record_order.items()},
     }
     regressors |= _predicted(residuals[like], chunks, rows, float(base.g))

@@ -274,7 +274,7 @@ def rests(record: Record) -> np.ndarray:
         record: in chunks.
     """
     sticks = record.command[..., :3]
-    rows = max(round(REST_S / float(np.median(record.step_s))), 1)
+    rows = max(round(REST_S / record.median_step_s), 1)
     padded = np.pad(sticks, ((rows, 0), (0, 0), (0, 0)), mode="edge")
     moved = np.ptp(np.lib.stride_tricks.sliding_window_view(padded, rows + 1, axis=0), axis=-1)
     return np.asarray(moved.max(axis=-1) <= REST_SHARE * np.abs(sticks).max(axis=-1))

@@ -9,14 +9,9 @@ from pathlib import Path
 from flytrack_env.messages import quote_name
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.file_kinds import UNKNOWN, ZSTD, check_kind
-from flytrack_sysid.importing.flight import ImportedFlight
+from flytrack_sysid.importing.flight import ImportedFlight, list_names
 from flytrack_sysid.importing.mapping import Mapping
-from flytrack_sysid.importing.table_flight import (
-    MAX_LIST_LENGTH,
-    RECORDED,
-    TIMESTAMP,
-    build_flight,
-)
+from flytrack_sysid.importing.table_flight import RECORDED, TIMESTAMP, build_flight
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import Table
 
@@ -53,14 +48,14 @@ def read_bag(path: Path, mapping: Mapping) -> ImportedFlight:
         check_kind(
             path, "bag", "an MCAP file, a ROS 1 bag or the folder of a ROS 2 bag", (UNKNOWN, ZSTD)
         )
-    notes, arrays = decode(str(path), "bag", path, wanted)
+    notes, arrays = decode(path, "bag", wanted)
     for topic, field, kind in notes["missing"]:
         where = f"{path}: topic {quote_name(topic)}: field {quote_name(field)}"
         raise LogError(f"{where}: not a number in messages of type {quote_name(kind)}")
     names = [topic["topic"] for topic in notes["found"]]
     for topic in wanted:
         if topic not in names:
-            listed = ", ".join(map(quote_name, notes["topics"]))[:MAX_LIST_LENGTH] or "no topics"
+            listed = list_names(notes["topics"]) or "no topics"
             raise LogError(f"{path}: topic {quote_name(topic)}: no messages; found {listed}")
     topics, remarks = [], []
     for entry, rows in zip(notes["found"], arrays, strict=True):

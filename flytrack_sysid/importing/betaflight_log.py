@@ -6,7 +6,6 @@ Logs have the attitude since Betaflight 2025.12, and no velocity.
 """
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,8 @@ from flytrack_sysid.importing.commands import commands_of_motors
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import (
     ImportedFlight,
+    list_names,
+    log_of_channels,
     not_a_quadcopter,
     read_log_file,
     saturation,
@@ -28,7 +29,7 @@ from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS
 from flytrack_sysid.kinematics import GRAVITY
 from flytrack_sysid.log import LogError
-from flytrack_sysid.log_table import Table, columns_of, log_of_table
+from flytrack_sysid.log_table import Table
 from flytrack_sysid.timestamps import number_segments, put_on_one_line, read_clock
 
 FIRMWARE = "Betaflight"
@@ -46,7 +47,6 @@ FULL_THROTTLE = 1000.0  # setpoint[3] at full throttle; 0 at none
 FINE = 10.0  # units in one deg/s where blackbox_high_resolution is set
 MICROSECOND = UNITS["time"]["us"]
 MAX_SETTING = 1e9
-MAX_LIST_LENGTH = 1000  # characters of a list of field names in a message
 PERCENT = 100.0
 # Past full stick: smoothing by a Butterworth filter overshoots a step by 4.3 %.
 MAX_OVERSHOOT = 0.05
@@ -73,7 +73,7 @@ def read_betaflight(path: Path, mapping: Mapping) -> list[ImportedFlight]:
     is_cut_off = [END_OF_LOG not in log for log in content.split(FIRST_BYTES)[1:]]
     numbers = _chosen_logs(path, len(is_cut_off), mapping)
     cut_off = [number for number in numbers if is_cut_off[number - 1]]
-    decoded, frames = decode(str(path), "betaflight", path, numbers, cut_off)
+    decoded, frames = decode(path, "betaflight", numbers, cut_off)
     flights, left_out = [], list[LogError]()
     for number, log_notes, rows in zip(numbers, decoded, frames, strict=True):
         source = str(path) if len(is_cut_off) == 1 else f"{path}, log {number}"
@@ -110,8 +110,7 @@ def _read_log(
         )
     for name in ("time", *STICKS, *GYRO):
         if name not in names:
-            listed = ", ".join(map(quote_name, names))[:MAX_LIST_LENGTH]
-            raise LogError(f"{source}: field {name}: missing; found {listed}")
+            raise LogError(f"{source}: field {name}: missing; found {list_names(names)}")
     remarks = [f"{quote_name(revision)}, {len(frames)} frames"]
     if notes["num_bytes_left"]:
         remainder = f"the last {notes['num_bytes_left']} bytes"
@@ -136,13 +135,12 @@ def _read_log(
     if mapping.rules.motors_as_thrust:
         channels["u"][:, 3] = _thrust_of_motors(table, headers)
         clipped.append("thrust command: the mean of the motors")
-    columns = columns_of(times - times[0], channels)
-    columns["segment"] = number_segments(times, clock.max_gap_s)
     remarks += [*clipped, *_motors(table, headers)]
     if "f" not in channels:
         remarks.append("no accelerometer in the log: nothing is asked of the specific force")
     remarks += [*([] if of_motors else headers.stick_curve()), *headers.thrust_settings()]
-    log = replace(log_of_table(table._replace(columns=columns)), has_motors=of_motors)
+    segment = number_segments(times, clock.max_gap_s)
+    log = log_of_channels(table, times - times[0], segment, channels, of_motors)
     return ImportedFlight(log, craft, tuple(f"{source}: {text}" for text in remarks))
 
 
@@ -266,10 +264,10 @@ def _channels(table: Table, headers: _Headers) -> dict[str, np.ndarray]:
         channels["f"] = table.matrix(ACCELEROMETER) * GRAVITY / g_unit
     if BATTERY in table.columns:
         channels["v_bat"] = table.matrix([BATTERY]) * UNITS["voltage"]["cV"]
-    vector = (
-        table.matrix(ATTITUDE) / UNIT_QUATERNION if table.columns.keys() >= set(ATTITUDE) else None
-    )
-    if vector is None or not np.any(vector):
+    if not table.columns.keys() >= set(ATTITUDE):
+        return channels
+    vector = table.matrix(ATTITUDE) / UNIT_QUATERNION
+    if not np.any(vector):
         return channels
     size = np.linalg.norm(vector, axis=1, keepdims=True)
     channels["q"] = np.column_stack(
@@ -278,9 +276,13 @@ def _channels(table: Table, headers: _Headers) -> dict[str, np.ndarray]:
     return channels
 
 
+def _motor_names(table: Table) -> list[str]:
+    return [name for name in table.columns if name.startswith("motor[")]
+
+
 def _motors(table: Table, headers: _Headers) -> list[str]:
     """Return notes on the number of motors, and on how often one is at its upper end."""
-    names = [name for name in table.columns if name.startswith("motor[")]
+    names = _motor_names(table)
     if not names:
         return []
     notes = [not_a_quadcopter(f"{len(names)} motors")] if len(names) != len(NAMES) else []
@@ -298,7 +300,7 @@ def _motors_as_commands(source: str, table: Table, headers: _Headers) -> np.ndar
             "found motors in 3D mode, which turn both ways, expected motors of one direction with "
             "motors.as_command",
         )
-    names = [name for name in table.columns if name.startswith("motor[")]
+    names = _motor_names(table)
     # The low end tells protocols apart: motor_output_limit lowers the upper one.
     lowest, _ = headers.numbers("motorOutput", 2)
     low, high = DSHOT if lowest < PWM[0] else PWM
@@ -309,7 +311,7 @@ def _motors_as_commands(source: str, table: Table, headers: _Headers) -> np.ndar
 def _thrust_of_motors(table: Table, headers: _Headers) -> np.ndarray:
     """Return thrust commands, (num_rows,): -1 and 1 are the ends of the motors' mean output."""
     low, high = headers.numbers("motorOutput", 2)
-    names = [name for name in table.columns if name.startswith("motor[")]
+    names = _motor_names(table)
     if not names or high <= low:
         raise headers.error(
             "motorOutput", f"found {low:g}, {high:g} and {len(names)} motors: no outputs to use"

@@ -10,13 +10,13 @@ from collections.abc import Mapping as Channels
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.effects import Motors
 from flytrack_env.motors import NAMES
 from flytrack_sysid.importing.flight import saturation
 from flytrack_sysid.importing.units import PER_DEGREE
+from flytrack_sysid.kinematics import low_pass
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_table import COMMAND_MARGIN
 from flytrack_sysid.plausibility import MIN_ROWS
@@ -123,19 +123,20 @@ def commands_of_motors(source: str, motors: np.ndarray | None) -> np.ndarray:
 
 
 def check_motors_of_autopilot(
-    source: str, step_s: float, motors: Motors | None, turns_out: bool
+    source: str, steps_s: np.ndarray, motors: Motors | None, turns_out: bool
 ) -> None:
     """Check an autopilot's own log of motors against what a model of motors needs.
 
     Args:
         source: log and message, for the error.
-        step_s: between its samples.
+        steps_s: between its samples.
         motors: the frame that the mapping states; None if it does not.
         turns_out: whether the autopilot's propellers turn the other way than Betaflight's default.
 
     Raises:
         LogError: outputs are too slow, or the mapping's propellers turn the other way.
     """
+    step_s = float(np.median(steps_s)) if len(steps_s) else np.inf
     if step_s > SLOW_STEP_S:
         raise LogError(
             f"{source}: found motors at {1.0 / step_s:.3g} Hz, expected {1.0 / SLOW_STEP_S:.0f} Hz "
@@ -257,8 +258,7 @@ def _identified_attitude_gain(
             delay = round(delay_s / step_s)
             delayed = np.pad(errors[:, axis], (delay, 0))[: len(errors)]
             for lag_s in LAGS_S:
-                decay = np.exp(-step_s / lag_s) if lag_s else 0.0
-                response = lfilter([1.0 - decay], [1.0, -decay], delayed)[is_flying]
+                response = low_pass(delayed, step_s, lag_s)[is_flying]
                 response = response - response.mean()
                 size = np.linalg.norm(response) * np.linalg.norm(rates)
                 correlation = float(response @ rates / size) if size else 0.0

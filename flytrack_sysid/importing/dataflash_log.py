@@ -5,7 +5,7 @@ several sensors are numbered by an instance.
 """
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,7 +14,12 @@ from flytrack_env.effects import Motors
 from flytrack_env.messages import quote_name
 from flytrack_sysid.importing.commands import check_motors_of_autopilot
 from flytrack_sysid.importing.decoding import decode
-from flytrack_sysid.importing.flight import ImportedFlight, not_a_quadcopter, read_log_file
+from flytrack_sysid.importing.flight import (
+    ImportedFlight,
+    list_names,
+    not_a_quadcopter,
+    read_log_file,
+)
 from flytrack_sysid.importing.mapping import Channel, Mapping
 from flytrack_sysid.importing.table_flight import TIMESTAMP, build_flight
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, vector_from
@@ -83,13 +88,6 @@ TURN_OUT, DEFAULT_FRAME_TYPE = (3, 18), 1
 MIN_HEALTHY_FRACTION = 0.5  # of an instance's rows: the sensor is healthy for most of the flight
 
 
-class _Message(NamedTuple):
-    """The rows of one instance of a message: its fields by name, (num_rows,) each."""
-
-    instance: int
-    fields: dict[str, np.ndarray]
-
-
 def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
     """Return the flight in a DataFlash log: commands, rates, attitude, and its other channels.
 
@@ -98,22 +96,22 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
     Raises:
         LogError: the file is no such log, is not of a copter, or lacks rates and their setpoints.
     """
-    read_log_file(path, MAX_BYTES, FIRST_BYTES, "an ArduPilot log (DataFlash)", len(FIRST_BYTES))
+    read_log_file(path, MAX_BYTES, FIRST_BYTES, "an ArduPilot log (DataFlash)", is_whole=False)
     notes, arrays = decode(
-        str(path), "dataflash", path, {name: [TIME, *names] for name, names in FIELDS.items()}
+        path, "dataflash", {name: [TIME, *names] for name, names in FIELDS.items()}
     )
     _check_vehicle(path, notes["texts"], notes["parameters"])
-    messages: dict[str, list[_Message]] = {}
-    for instance, rows in zip(notes["found"], arrays, strict=True):
-        message = _Message(instance["instance"], dict(zip(instance["fields"], rows.T, strict=True)))
-        messages.setdefault(instance["name"], []).append(message)
+    messages: dict[str, dict[int, dict[str, np.ndarray]]] = {}  # fields by name and instance
+    for found, rows in zip(notes["found"], arrays, strict=True):
+        fields = dict(zip(found["fields"], rows.T, strict=True))
+        messages.setdefault(found["name"], {})[found["instance"]] = fields
     parameters: dict[str, float] = notes["parameters"]
     remarks = _airframe(parameters)
     if notes["is_cut_off"]:
         remarks.append("cut off: used up to the last whole message")
     chosen = {name: _choose(name, instances, remarks) for name, instances in messages.items()}
     if any(field not in chosen.get("RATE", ()) for field in (TIME, *FIELDS["RATE"])):
-        listed = ", ".join(map(quote_name, sorted(chosen))) or "none of the messages that are read"
+        listed = list_names(sorted(chosen)) or "none of the messages that are read"
         raise LogError(
             f"{path}: message RATE: missing or without {', '.join(FIELDS['RATE'])}; found {listed}"
         )
@@ -127,7 +125,13 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
         channels = [channel for channel in channels if channel.name not in ("u", "motors")]
         channels.append(_motors_as_commands(path, chosen, parameters, craft.motors))
     topics = [
-        Table(str(path), {TIMESTAMP: fields[TIME] * UNITS["time"]["us"], **_named(name, fields)})
+        Table(
+            str(path),
+            {
+                TIMESTAMP: fields[TIME] * UNITS["time"]["us"],
+                **{f"{name}.{field}": values for field, values in fields.items()},
+            },
+        )
         for name, fields in chosen.items()
         if TIME in fields
     ]
@@ -135,10 +139,6 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
         str(path), topics, mapping._replace(channels=tuple(channels), craft=craft)
     )
     return flight._replace(notes=(*(f"{path}: {text}" for text in remarks), *flight.notes))
-
-
-def _named(message: str, fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    return {f"{message}.{field}": values for field, values in fields.items()}
 
 
 def _check_vehicle(path: Path, texts: list[str], parameters: dict[str, float]) -> None:
@@ -169,33 +169,39 @@ def _function(parameters: dict[str, float], output: int) -> int:
     return int(parameters.get(f"SERVO{output}_FUNCTION", 0))
 
 
-def _choose(name: str, instances: list[_Message], remarks: list[str]) -> dict[str, np.ndarray]:
+def _choose(
+    name: str, instances: dict[int, dict[str, np.ndarray]], remarks: list[str]
+) -> dict[str, np.ndarray]:
     """Return the fields of the first healthy instance of a message; append remarks on others."""
-    instances = sorted(instances, key=lambda message: message.instance)
+    numbers = sorted(instances)
     if name == "BAT":
-        instances = [_without_zeros(message, remarks) for message in instances]
-    is_healthy = [_is_healthy(name, message.fields) for message in instances]
-    best = instances[is_healthy.index(True) if any(is_healthy) else 0]
-    if len(instances) > 1:
+        instances = {
+            number: _without_zeros(number, instances[number], remarks) for number in numbers
+        }
+    healthy = [number for number in numbers if _is_healthy(name, instances[number])]
+    best = (healthy or numbers)[0]
+    if len(numbers) > 1:
         others = [
-            f"{message.instance}{'' if healthy else ' (not healthy)'}"
-            for message, healthy in zip(instances, is_healthy, strict=True)
-            if message is not best
+            f"{number}{'' if number in healthy else ' (not healthy)'}"
+            for number in numbers
+            if number != best
         ]
-        remarks.append(f"instance {best.instance} of {name} is used, not {', '.join(others)}")
-    if not any(is_healthy):
+        remarks.append(f"instance {best} of {name} is used, not {', '.join(others)}")
+    if not healthy:
         remarks.append(f"no instance of {name} says that it is healthy")
-    return best.fields
+    return instances[best]
 
 
-def _without_zeros(message: _Message, remarks: list[str]) -> _Message:
+def _without_zeros(
+    number: int, fields: dict[str, np.ndarray], remarks: list[str]
+) -> dict[str, np.ndarray]:
     """Return a battery's rows with NaN for voltages of 0 or less, which are not measured."""
-    volts = message.fields.get("Volt", np.zeros(0))
+    volts = fields.get("Volt", np.zeros(0))
     is_measured = volts > 0.0
     if not is_measured.all():
-        count = f"{np.sum(~is_measured)} of {len(volts)} voltages of battery {message.instance}"
+        count = f"{np.sum(~is_measured)} of {len(volts)} voltages of battery {number}"
         remarks.append(f"{count} are not above 0: not measured")
-    return message._replace(fields={**message.fields, "Volt": np.where(is_measured, volts, np.nan)})
+    return {**fields, "Volt": np.where(is_measured, volts, np.nan)}
 
 
 def _is_healthy(name: str, fields: dict[str, np.ndarray]) -> bool:
@@ -329,8 +335,7 @@ def _motors_as_commands(
     if any(name not in rows for name in (TIME, *columns)):
         raise LogError(f"{source}: missing or without {', '.join(columns)}; expected the outputs")
     steps_s = np.diff(rows[TIME]) * UNITS["time"]["us"]
-    step_s = float(np.median(steps_s)) if len(steps_s) else np.inf
-    check_motors_of_autopilot(source, step_s, motors, frame_type in TURN_OUT)
+    check_motors_of_autopilot(source, steps_s, motors, frame_type in TURN_OUT)
     low, high = (
         parameters.get(name) or MOTOR_DEFAULTS[name] for name in ("MOT_PWM_MIN", "MOT_PWM_MAX")
     )

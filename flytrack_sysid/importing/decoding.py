@@ -39,15 +39,12 @@ def limits_of(num_bytes: int) -> sandbox.ResourceLimits:
     )
 
 
-def decode(
-    source: str, format_name: str, path: Path, *arguments: Any
-) -> tuple[Any, list[np.ndarray]]:
+def decode(path: Path, format_name: str, *arguments: Any) -> tuple[Any, list[np.ndarray]]:
     """Return the notes and arrays that a format's decoder (``decoders.py``) reads from a file.
 
     Args:
-        source: the file, for messages.
-        format_name: key of ``PACKAGES``.
         path: of the file or folder.
+        format_name: key of ``PACKAGES``.
         arguments: arguments of the decoder after the path.
 
     Raises:
@@ -56,7 +53,7 @@ def decode(
     try:
         check_installed(*PACKAGES[format_name])
     except ImportError as error:
-        raise LogError(f"{source}: {error}") from error
+        raise LogError(f"{path}: {error}") from error
     try:
         files = [path, *path.glob("*")] if path.is_dir() else [path]
         limits = limits_of(sum(file.stat().st_size for file in files))
@@ -70,4 +67,4 @@ def decode(
         damaged = "damaged, " if kind and kind not in NO_DAMAGE else ""
         error_kind = f"{kind}: " if kind and kind != NO_DAMAGE[0] else ""
         text = "" if kind == NO_DAMAGE[0] else f"{damaged}cannot be decoded: {error_kind}"
-        raise LogError(f"{source}: {text}{error_text(error)}") from error
+        raise LogError(f"{path}: {text}{error_text(error)}") from error

@@ -78,9 +78,7 @@ def identify(content: bytes) -> FileKind:
     return UNKNOWN
 
 
-def check_kind(
-    path: Path, format: str, expected: str, allowed: tuple[FileKind, ...] = (UNKNOWN,)
-) -> None:
+def check_kind(path: Path, format: str, expected: str, allowed: tuple[FileKind, ...]) -> None:
     """Raise LogError for a file of another kind than a format reads.
 
     Args:

@@ -1,5 +1,7 @@
 """One imported flight, and its craft."""
 
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,11 +11,13 @@ from flytrack_env.battery import Battery
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.effects import Motors
 from flytrack_env.files import open_file
-from flytrack_env.messages import error_text
+from flytrack_env.messages import error_text, quote_name
 from flytrack_env.motion import Motion
 from flytrack_sysid.importing.file_kinds import NUM_BYTES, identify
 from flytrack_sysid.log import FlightLog, LogError
+from flytrack_sysid.log_table import Table, columns_of, log_of_table
 
+MAX_LIST_LENGTH = 1000  # characters of a list of names in a message
 VOLTAGE_TERMS = 4  # of the thrust map: from this coefficient on they multiply the voltage
 
 
@@ -100,13 +104,38 @@ class ImportedFlight(NamedTuple):
     """
 
     log: FlightLog
-    craft: Craft = Craft()
-    notes: tuple[str, ...] = ()
+    craft: Craft
+    notes: tuple[str, ...]
     is_landed: np.ndarray | None = None
 
 
+def log_of_channels(
+    table: Table,
+    time: np.ndarray,
+    segment: np.ndarray,
+    channels: Mapping[str, np.ndarray],
+    has_motors: bool,
+) -> FlightLog:
+    """Return the log of channels of ``CHANNELS``, (num_rows, n) each, which is checked.
+
+    Args:
+        table: the source and its lines, for messages.
+        time: (num_rows,) s.
+        segment: of each row, (num_rows,).
+        channels: by name.
+        has_motors: whether the commands are those of motors.
+    """
+    columns = {**columns_of(time, channels), "segment": segment}
+    return replace(log_of_table(table._replace(columns=columns)), has_motors=has_motors)
+
+
+def list_names(names: Iterable[str]) -> str:
+    """Return names of a file for a message, as many as fit."""
+    return ", ".join(map(quote_name, names))[:MAX_LIST_LENGTH]
+
+
 def read_log_file(
-    path: Path, max_bytes: int, first: bytes, expected: str, num_bytes: int | None = None
+    path: Path, max_bytes: int, first: bytes, expected: str, is_whole: bool = True
 ) -> bytes:
     """Return the content of a log file.
 
@@ -115,14 +144,14 @@ def read_log_file(
         max_bytes: maximum size of the file.
         first: the bytes with which it begins.
         expected: the kind of file in words.
-        num_bytes: number of bytes that are needed; all if None.
+        is_whole: whether all bytes are needed, not only those that show the kind.
 
     Raises:
         LogError: the file cannot be read, or is of another kind, which the message names.
     """
     try:
         with open_file(path, max_bytes) as file:
-            content = file.read(max(num_bytes, NUM_BYTES) if num_bytes else max_bytes)
+            content = file.read(max_bytes if is_whole else NUM_BYTES)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error_text(error)}") from error
     if not content.startswith(first):

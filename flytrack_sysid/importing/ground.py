@@ -11,13 +11,19 @@ found.
 """
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flytrack_sysid.kinematics import GRAVITY, summed_turns
+from flytrack_sysid.kinematics import (
+    GRAVITY,
+    attitude_of,
+    derivative,
+    runs_of,
+    since_first,
+    summed_turns,
+)
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.plausibility import MIN_ROWS, MIN_S
 
@@ -89,8 +95,7 @@ def _blocks_of(log: FlightLog) -> _Blocks | None:
     if not ("w" in log or "q" in log) or not any(name in log for name in "fvp") or len(log) < 2:
         return None
     is_start = log.is_start()
-    segment_number = np.cumsum(is_start) - 1
-    block_in_segment = np.floor((log.time - log.time[is_start][segment_number]) / BLOCK_S)
+    block_in_segment = np.floor(since_first(log.time, is_start) / BLOCK_S)
     is_edge = is_start | np.append(True, np.diff(block_in_segment) > 0)
     of_row = np.cumsum(is_edge) - 1
     counts = np.bincount(of_row)
@@ -102,7 +107,7 @@ def _blocks_of(log: FlightLog) -> _Blocks | None:
         return np.sqrt(mean((values - mean(values)[of_row]) ** 2)).max(axis=1)
 
     starts = np.flatnonzero(is_edge)
-    rates = log["w"] if "w" in log else _rates_of_attitude(log)
+    rates = log["w"] if "w" in log else derivative(log, summed_turns(attitude_of(log)))
     is_motionless = (np.linalg.norm(mean(rates), axis=1) <= MAX_RATE) & (
         deviation(rates) <= MAX_RATE
     )
@@ -126,23 +131,10 @@ def _blocks_of(log: FlightLog) -> _Blocks | None:
     return _Blocks(of_row, throttle, is_at_rest, is_level, is_start[starts])
 
 
-def _rates_of_attitude(log: FlightLog) -> np.ndarray:
-    return _derivative(log, summed_turns(Rotation.from_quat(log["q"], scalar_first=True)))
-
-
 def _velocity(log: FlightLog) -> np.ndarray | None:
     if "v" in log:
         return log["v"]
-    return _derivative(log, log["p"]) if "p" in log else None
-
-
-def _derivative(log: FlightLog, values: np.ndarray) -> np.ndarray:
-    """Return the derivative of values (num_rows, n) by time, within segments."""
-    slopes = np.zeros_like(values)
-    for start, end in pairwise(np.append(np.flatnonzero(log.is_start()), len(log))):
-        if end - start > 1:
-            slopes[start:end] = np.gradient(values[start:end], log.time[start:end], axis=0)
-    return slopes
+    return derivative(log, log["p"]) if "p" in log else None
 
 
 def _hover_throttle(blocks: Sequence[_Blocks]) -> float:
@@ -163,8 +155,8 @@ def _ground_rows(log: FlightLog, blocks: _Blocks, hover: float) -> np.ndarray:
     is_low = blocks.throttle < LOW * hover
     is_ground = np.zeros(len(is_low), bool)
     is_candidate = blocks.is_at_rest & (blocks.throttle < SPOOLING * hover)
-    for start, end in _runs(is_candidate, blocks.is_start):
-        low_runs = _runs(is_low[start:end], blocks.is_start[start:end])
+    for start, end in runs_of(is_candidate, blocks.is_start):
+        low_runs = runs_of(is_low[start:end], blocks.is_start[start:end])
         longest_low = max((stop - begin for begin, stop in low_runs), default=0)
         if longest_low * BLOCK_S >= MIN_REST_S and not _is_descent(log, blocks, is_low, start, end):
             is_ground[start:end] = True
@@ -181,14 +173,6 @@ def _ground_rows(log: FlightLog, blocks: _Blocks, hover: float) -> np.ndarray:
     never_moves = blocks.is_at_rest[~is_ground].all()
     is_too_short = flown_s < MIN_S or np.sum(~rows) < MIN_ROWS
     return np.ones(len(rows), bool) if never_moves or is_too_short else rows
-
-
-def _runs(is_in: np.ndarray, is_start: np.ndarray) -> list[tuple[int, int]]:
-    """Return start and end of each run of True, none across the start of a segment."""
-    before = np.append(False, is_in[:-1])
-    starts = np.flatnonzero(is_in & (~before | is_start))
-    after = np.append(is_in[1:] & ~is_start[1:], False)
-    return list(zip(starts, np.flatnonzero(is_in & ~after) + 1, strict=True))
 
 
 def _is_descent(log: FlightLog, blocks: _Blocks, is_low: np.ndarray, start: int, end: int) -> bool:

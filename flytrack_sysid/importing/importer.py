@@ -2,10 +2,11 @@
 
 import csv
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,18 +23,18 @@ from flytrack_sysid.importing.mapping import Manifest, Mapping, load_mapping
 from flytrack_sysid.importing.table_flight import read_csv
 from flytrack_sysid.importing.ulog_log import read_ulog
 from flytrack_sysid.importing.usd_log import read_usd
-from flytrack_sysid.log import FlightLog, LogError, usual_step
+from flytrack_sysid.log import FlightLog, LogError, median_step
 from flytrack_sysid.log_file import describe
 from flytrack_sysid.plausibility import find_problems
 from flytrack_sysid.resample import SLOW_STEP_S
 
-READERS = {
-    "csv": lambda path, mapping: [read_csv(path, mapping)],
-    "ulog": lambda path, mapping: [read_ulog(path, mapping)],
+READERS: dict[str, Callable[[Path, Mapping], Any]] = {  # flights of a file, or its only one
+    "csv": read_csv,
+    "ulog": read_ulog,
     "betaflight": read_betaflight,
-    "dataflash": lambda path, mapping: [read_dataflash(path, mapping)],
-    "usd": lambda path, mapping: [read_usd(path, mapping)],
-    "bag": lambda path, mapping: [read_bag(path, mapping)],
+    "dataflash": read_dataflash,
+    "usd": read_usd,
+    "bag": read_bag,
 }
 FORMATS = tuple(READERS)
 FORMATS_OF_SEVERAL_LOGS = ("betaflight",)
@@ -139,7 +140,11 @@ def import_log(
     loaded = Mapping() if mapping is None else load_mapping(mapping)
     if loaded.rows.logs and format not in FORMATS_OF_SEVERAL_LOGS:
         raise LogError(f"{loaded.source}: rows.logs: a file of format {format} holds one log")
-    flights_read = [(path, flight) for path in files for flight in READERS[format](path, loaded)]
+    flights_read: list[tuple[Path, ImportedFlight]] = []
+    for path in files:
+        read = READERS[format](path, loaded)
+        several = read if format in FORMATS_OF_SEVERAL_LOGS else [read]
+        flights_read += [(path, flight) for flight in several]
     notes = (*loaded.notes, *(note for _, flight in flights_read for note in flight.notes))
     flights, ground_notes = _flights_in_the_air(flights_read, loaded, format in DENSE_FORMATS)
     notes += ground_notes
@@ -155,7 +160,7 @@ def import_log(
     )
     if craft.voltage_v is None and "v_bat" in log and log["v_bat"].min() > 0.0:
         craft = craft._replace(voltage_v=(float(log["v_bat"].min()), float(log["v_bat"].max())))
-    step_s = float(np.median(usual_step(log)))
+    step_s = median_step(log)
     if "w" in log and step_s > SLOW_STEP_S:
         remark = f"body rates at {1.0 / step_s:.3g} Hz: too slow for a rate loop's lag or delay"
         notes += (f"{log.source}: {remark}",)
@@ -241,7 +246,7 @@ def _with_measured_voltage(log: FlightLog) -> tuple[FlightLog, list[str]]:
 
 def _usual_every(log: FlightLog) -> int:
     """Return which share of a log's rows leaves about 500 Hz: one of so many."""
-    return max(1, round(DENSE_STEP_S / float(np.median(usual_step(log)))))
+    return max(1, round(DENSE_STEP_S / median_step(log)))
 
 
 def _is_selected(path: Path, log: FlightLog, mapping: Mapping, every: int) -> np.ndarray:

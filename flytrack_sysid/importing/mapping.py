@@ -15,9 +15,8 @@ from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.effects import BY_NAME, Motors
-from flytrack_env.messages import error_text, quote_name, quote_value
+from flytrack_env.messages import quote_name, quote_value
 from flytrack_env.motors import NAMES
-from flytrack_env.toml_file import TomlError, parse_toml, read_text
 from flytrack_env.validation import (
     Fields,
     Finite,
@@ -32,6 +31,7 @@ from flytrack_sysid.importing.commands import CommandRules
 from flytrack_sysid.importing.flight import Craft
 from flytrack_sysid.importing.units import TURNED, UNITS, quaternion_from, vector_from
 from flytrack_sysid.log import LogError
+from flytrack_sysid.log_file import load_toml
 from flytrack_sysid.log_table import MAX_NORM_ERROR, Table
 
 SHIPPED = Path(__file__).parent.parent / "mappings"
@@ -479,7 +479,7 @@ class Frame(Fields):
         """Return the frame with the numbers of its known craft; raises ValueError."""
         if self.craft is None:
             return self
-        crafts = _load(FRAMES)
+        crafts = load_toml(FRAMES)
         values = crafts[choose("craft", self.craft, crafts)]
         return msgspec.convert({**values, **self._stated()}, Frame)
 
@@ -615,11 +615,13 @@ def load_mapping(where: str | Path) -> Mapping:
             names = ", ".join(shipped)
             raise LogError(f"{path}: found no such mapping file; shipped ones are {names}")
         path = SHIPPED / f"{where}.toml"
-    content, source = _load(path), str(path)
+    content, source = load_toml(path), str(path)
     base = content.pop("extends", None)
     if base is not None:
         try:
-            content = _merged(_load(SHIPPED / f"{choose('extends', base, shipped)}.toml"), content)
+            content = _merged(
+                load_toml(SHIPPED / f"{choose('extends', base, shipped)}.toml"), content
+            )
         except ValueError as error:
             raise LogError(f"{source}: {error}") from error
     file = convert(source, content, MappingFile, LogError)
@@ -668,14 +670,6 @@ def _craft(source: str, file: MappingFile) -> Craft:
         return craft._replace(mass_kg=mass_kg, motors=frame.motors(mass_kg))
     except ValueError as error:
         raise LogError(f"{source}: {join_text('frame', str(error))}") from error
-
-
-def _load(path: Path) -> dict[str, Any]:
-    """Return the content of a mapping file."""
-    try:
-        return parse_toml(read_text(path))
-    except (OSError, UnicodeDecodeError, TomlError) as error:
-        raise LogError(f"{path}: not a readable TOML file: {error_text(error)}") from error
 
 
 def _merged(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:

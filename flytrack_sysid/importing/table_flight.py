@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +9,14 @@ import numpy as np
 from flytrack_env.messages import quote_name
 from flytrack_sysid.importing.commands import read_commands
 from flytrack_sysid.importing.file_kinds import EMPTY, GZIP, UNKNOWN, check_kind
-from flytrack_sysid.importing.flight import ImportedFlight
+from flytrack_sysid.importing.flight import ImportedFlight, list_names, log_of_channels
 from flytrack_sysid.importing.mapping import Channel, CsvFile, Mapping
 from flytrack_sysid.log import LogError
 from flytrack_sysid.log_file import open_csv, read_columns
-from flytrack_sysid.log_table import Table, columns_of, log_of_table
+from flytrack_sysid.log_table import Table
 from flytrack_sysid.resample import Samples, on_one_base, slow_channels
 from flytrack_sysid.timestamps import MAX_LATENCY_S, number_segments, put_on_one_line, read_clock
 
-MAX_LIST_LENGTH = 1000  # characters of a list of columns in a message
 TIMESTAMP = "timestamp"  # column of a table's own times, s
 RECORDED = "recorded"  # column of the times of recording, s, by one clock for all tables
 BASES = ("w", "q", "p")  # the rows are those of the first one that a log has
@@ -47,18 +45,12 @@ def channels_in(
         if fitting:
             result.append((channel, fitting[0]))
         elif not (channel.is_optional and not any(map(any, counts))):
-            nearest_table = max(
-                range(len(counts)), key=lambda number: sum(map(bool, counts[number])), default=None
-            )
-            count = (
-                counts[nearest_table] if nearest_table is not None else [0] * len(channel.columns)
-            )
+            absent = [0] * len(channel.columns)
+            count = max(counts, key=lambda found: sum(map(bool, found)), default=absent)
             column, times = next(
                 (c, n) for c, n in zip(channel.columns, count, strict=True) if n != 1
             )
-            listed = ", ".join(map(quote_name, dict.fromkeys(itertools.chain(*column_names))))[
-                :MAX_LIST_LENGTH
-            ]
+            listed = list_names(dict.fromkeys(itertools.chain(*column_names)))
             where = f"{source}: column {quote_name(column)}: found {times} times among {listed}"
             raise LogError(f"{where}; expected once by {mapping.source}: {channel.table}")
     return result
@@ -120,9 +112,7 @@ def _read_files(folder: Path, mapping: Mapping) -> ImportedFlight:
         file = mapping.files[name]
         paths = sorted(folder.glob(file.file))
         if len(paths) != 1:
-            listed = ", ".join(quote_name(path.name) for path in sorted(folder.iterdir()))[
-                :MAX_LIST_LENGTH
-            ]
+            listed = list_names(path.name for path in sorted(folder.iterdir()))
             problem = f"found {len(paths)} files of the name {quote_name(file.file)} among {listed}"
             raise LogError(f"{folder}: {problem}; expected one by {mapping.source}: files.{name}")
         tables.append(_read_file(paths[0], name, file, list(fields), mapping))
@@ -135,7 +125,7 @@ def _read_file(path: Path, name: str, file: CsvFile, fields: list[str], mapping:
         header = [column.strip() for column in next(rows, [])]
         for column in (file.time, *fields):
             if header.count(column) != 1:
-                listed = ", ".join(map(quote_name, header))[:MAX_LIST_LENGTH]
+                listed = list_names(header)
                 problem = (
                     f"{path}: column {quote_name(column)}: found {header.count(column)} times "
                     f"among {listed}"
@@ -218,8 +208,6 @@ def _flight(
     commands, notes = read_commands(
         table.source, time, values, mapping.rules, mapping.craft.max_rate_deg_s
     )
-    columns = columns_of(time, {**values, "u": commands})
-    columns["segment"] = number_segments(time, max_gap_s)
-    log = log_of_table(table._replace(columns=columns))
-    log = replace(log, has_motors=mapping.rules.motors_as_command)
+    segment, of_motors = number_segments(time, max_gap_s), mapping.rules.motors_as_command
+    log = log_of_channels(table, time, segment, {**values, "u": commands}, of_motors)
     return ImportedFlight(log, mapping.craft, notes)

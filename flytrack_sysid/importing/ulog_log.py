@@ -6,7 +6,6 @@ The rows are those of the body rates. Other sensors are interpolated between the
 setpoints are held. There are no rows where a topic has a gap of more than three of its usual steps.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from flytrack_sysid.importing.commands import check_motors_of_autopilot, command
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import (
     ImportedFlight,
+    log_of_channels,
     not_a_quadcopter,
     read_log_file,
     saturation,
@@ -25,13 +25,7 @@ from flytrack_sysid.importing.flight import (
 from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS, quaternion_from, vector_from
 from flytrack_sysid.log import LogError
-from flytrack_sysid.log_table import (
-    COMMAND_MARGIN,
-    MAX_NORM_ERROR,
-    Table,
-    columns_of,
-    log_of_table,
-)
+from flytrack_sysid.log_table import COMMAND_MARGIN, MAX_NORM_ERROR, Table
 from flytrack_sysid.resample import Samples, on_one_base, slow_channels
 from flytrack_sysid.timestamps import (
     MAX_LATENCY_S,
@@ -150,15 +144,16 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
         last_event = np.maximum(np.searchsorted(times, base[is_known], side="right") - 1, 0)
         is_landed = landed[last_event, 0] != 0.0
     used_channels = {name: values[is_known] for name, values in channels.items()}
-    columns = columns_of(base[is_known] - base[is_known][0], used_channels)
-    columns["segment"] = number_segments(base[is_known], clocks["w"].max_gap_s)
+    times = base[is_known]
+    segment = number_segments(times, clocks["w"].max_gap_s)
+    table = Table(str(path), {})
+    log = log_of_channels(table, times - times[0], segment, used_channels, of_motors)
     num_rows = len(clocks["w"].is_used)
     usage = f"{is_known.sum()} of {num_rows} samples of the rates have all other topics around them"
     notes = tuple(
         f"{path}: {text}"
         for text in [usage, *remarks, *_airframe(parameters), *slow_channels(converted)]
     )
-    log = replace(log_of_table(Table(str(path), columns)), has_motors=of_motors)
     return ImportedFlight(log, craft, notes, is_landed)
 
 
@@ -197,8 +192,7 @@ def _motors_as_commands(
         )
     order = [places.index(quadrant) for quadrant in QUADRANTS] if is_placed else [*ROTORS_OF_X]
     turns_out = parameters.get(f"CA_ROTOR{order[1]}_KM", 0.0) < 0.0  # clockwise at the front right
-    step_s = float(np.median(np.diff(outputs.times))) if len(outputs.times) > 1 else np.inf
-    check_motors_of_autopilot(topic, step_s, motors, turns_out)
+    check_motors_of_autopilot(topic, np.diff(outputs.times), motors, turns_out)
     controls = np.clip(outputs.values[:, order], 0.0, 1.0)
     return outputs._replace(values=commands_of_motors(str(path), controls))
 
@@ -218,13 +212,13 @@ def _decode(
         parameters: of the log.
         remarks: what is wrong with the log.
     """
-    read_log_file(path, MAX_BYTES, FIRST_BYTES, "a PX4 log (ULog)", len(FIRST_BYTES))
+    read_log_file(path, MAX_BYTES, FIRST_BYTES, "a PX4 log (ULog)", is_whole=False)
     unused = "u" if of_motors else "motors"
     used = {channel: sources for channel, sources in SOURCES.items() if channel != unused}
     fields: dict[str, list[str]] = {}
     for topic, names in (source for sources in used.values() for source in sources):
         fields[topic] = [*fields.get(topic, TIMES), *names]
-    notes, arrays = decode(str(path), "ulog", path, fields)
+    notes, arrays = decode(path, "ulog", fields)
     vehicle = OTHER_VEHICLES.get(int(notes["parameters"].get("MAV_TYPE", 0)))
     if vehicle:
         raise LogError(

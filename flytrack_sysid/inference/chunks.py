@@ -19,7 +19,8 @@ from flytrack_sysid.inference.record import (
     make_record,
     measured_channels,
 )
-from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.kinematics import since_first
+from flytrack_sysid.log import FlightLog, median_step
 from flytrack_sysid.log_voltage import with_voltage
 
 LEAD_IN_S, CHUNK_S = 1, 5  # lags forget within the lead-in; noise is fitted to chunks
@@ -68,6 +69,11 @@ class Chunks(NamedTuple):
     def num_judged(self) -> int:
         """The number of rows with scored residuals."""
         return int(self.counts.any(axis=(2, 3)).sum())
+
+
+def of_row_before(values: np.ndarray) -> np.ndarray:
+    """Return the values, (rows, ...), of the row before each row; of the first, its own."""
+    return np.concatenate([values[:1], values[:-1]])
 
 
 def count_lead_in(rows: int) -> int:
@@ -176,13 +182,11 @@ def at_usual_rate(log: FlightLog) -> tuple[FlightLog, np.ndarray, list[str]]:
 
     Rows between the kept ones are left out. A command is the mean until the next kept row.
     """
-    rate_hz = 1.0 / float(np.median(usual_step(log)))
+    rate_hz = 1.0 / median_step(log)
     ratio = max(round(rate_hz / MAX_RATE_HZ), 1)
     if ratio == 1:
         return log, np.ones(len(log), bool), []
-    begins = np.flatnonzero(log.is_start())
-    since_start = np.arange(len(log)) - begins[np.cumsum(log.is_start()) - 1]
-    is_kept = since_start % ratio == 0
+    is_kept = since_first(np.arange(len(log)), log.is_start()) % ratio == 0
     starts = np.flatnonzero(is_kept)
     counts = np.diff(np.append(starts, len(log)))[:, None]
     kept = log.select(is_kept)

@@ -17,11 +17,12 @@ from flytrack_env.dynamics import ModelParameters, advance, body_rates, observe_
 from flytrack_env.effects import MAX_DELAY_STEPS, ImuLatency, at_row, start_memories
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
-from flytrack_sysid.inference.one_step import SETTLING_S, in_float64
+from flytrack_sysid.inference.one_step import SETTLING_S
+from flytrack_sysid.inference.parameters import in_float64
 from flytrack_sysid.inference.record import Filled, Record, build_record, fill_gaps
 from flytrack_sysid.inference.replay import measured_drone, where_true
 from flytrack_sysid.inference.trace_cache import fast_jit
-from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.log import FlightLog, median_step
 from flytrack_sysid.log_voltage import with_voltage
 
 HORIZONS_S = (0.1, 0.25, 0.5, 1.0, 2.0)  # from a rate loop's response to a manoeuvre
@@ -111,7 +112,7 @@ def make_windows(
             a whole lead-in.
     """
     filled = fill_gaps(log)
-    step_s = float(np.median(usual_step(filled.log)))
+    step_s = median_step(filled.log)
     lead, ends = _lead_and_ends(filled.log)
     is_scored = scored_rows[filled.behind] & (filled.source_row >= 0)
     begins = filled.log.is_start()
@@ -150,7 +151,7 @@ def _windows_at(filled: Filled, starts: np.ndarray) -> Windows:
     begins = np.flatnonzero(log.is_start())
     first = begins[np.searchsorted(begins, starts, side="right") - 1]
     index = np.clip(starts + np.arange(-lead, ends[-1] + 1)[:, None], first, len(log) - 1)
-    gyro_b = log["w"] if "w" in log else np.zeros((len(log), 3))
+    gyro_b = log.channels.get("w", np.zeros((len(log), 3)))
     return Windows(
         record=Record(*(leaf[index] for leaf in build_record(filled))),
         is_free=np.arange(len(index)) > lead,
@@ -165,7 +166,7 @@ def _windows_at(filled: Filled, starts: np.ndarray) -> Windows:
 
 def _lead_and_ends(log: FlightLog) -> tuple[int, np.ndarray]:
     """Return the number of rows of a lead-in, and those from its end to each horizon."""
-    step_s = float(np.median(usual_step(log)))
+    step_s = median_step(log)
     return round(SETTLING_S / step_s), np.round(np.array(HORIZONS_S) / step_s).astype(int)
 
 

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.fusion import one_kernel
-from flytrack_sysid.inference.chunks import NUM_AXES, Chunks
+from flytrack_sysid.inference.chunks import NUM_AXES, Chunks, of_row_before
 from flytrack_sysid.inference.trace_cache import fast_jit
 
 # Variance of a level at its first row, over that of its noise: its first innovation is about 0.
@@ -231,68 +231,54 @@ def _whiten_rows(state: Filtered, gains: Gains, residuals: jax.Array) -> tuple[F
     )
 
 
-class Filter(NamedTuple):
-    """The filters of chunks, each of a noise: linear maps for residuals and their slopes.
+def build_gains(conditions: Conditions, log_noise: np.ndarray) -> Gains:
+    """Return the filters of chunks, each of a noise; rows and chunks are padded to whole parts.
 
-    Attributes:
-        gains: of some axes; rows and chunks are padded to whole parts.
+    Args:
+        conditions: of the rows of chunks.
+        log_noise: the noise of each chunk, (6, NUM_AXES, chunks).
     """
-
-    gains: Gains
-
-    @classmethod
-    def of(cls, conditions: Conditions, log_noise: np.ndarray) -> "Filter":
-        """Return the filter of all axes.
-
-        Args:
-            conditions: of the rows of chunks.
-            log_noise: the noise of each chunk, (6, NUM_AXES, chunks).
-        """
-        num_rows, _, num_chunks, _ = conditions.step_s.shape
-        size = num_rows + -num_rows % NUM_ROWS, NUM_AXES, num_chunks + -num_chunks % NUM_CHUNKS, 1
-        gains = Gains(*(np.empty(size) for _ in Gains._fields))
-        for chunk in range(0, num_chunks, NUM_CHUNKS):
-            noise = _cut(log_noise[..., None], (6, NUM_AXES, NUM_CHUNKS, 1), chunk=chunk)
-            state = Covariance(*[np.zeros((NUM_AXES, NUM_CHUNKS, 1))] * 3)
-            for row in range(0, num_rows, NUM_ROWS):
-                rows = Conditions(
-                    *(
-                        _cut(leaf, (NUM_ROWS, *leaf.shape[1:-2], NUM_CHUNKS, 1), row, chunk)
-                        for leaf in conditions
-                    )
+    num_rows, _, num_chunks, _ = conditions.step_s.shape
+    size = num_rows + -num_rows % NUM_ROWS, NUM_AXES, num_chunks + -num_chunks % NUM_CHUNKS, 1
+    gains = Gains(*(np.empty(size) for _ in Gains._fields))
+    for chunk in range(0, num_chunks, NUM_CHUNKS):
+        noise = _cut(log_noise[..., None], (6, NUM_AXES, NUM_CHUNKS, 1), chunk=chunk)
+        state = Covariance(*[np.zeros((NUM_AXES, NUM_CHUNKS, 1))] * 3)
+        for row in range(0, num_rows, NUM_ROWS):
+            rows = Conditions(
+                *(
+                    _cut(leaf, (NUM_ROWS, *leaf.shape[1:-2], NUM_CHUNKS, 1), row, chunk)
+                    for leaf in conditions
                 )
-                state, of_rows = _gains_of_rows(noise, state, rows)
-                for gain, part in zip(gains, of_rows, strict=True):
-                    gain[row : row + NUM_ROWS, :, chunk : chunk + NUM_CHUNKS] = part
-        return cls(gains)
+            )
+            state, of_rows = _gains_of_rows(noise, state, rows)
+            for gain, part in zip(gains, of_rows, strict=True):
+                gain[row : row + NUM_ROWS, :, chunk : chunk + NUM_CHUNKS] = part
+    return gains
 
-    def select_axes(self, axes: slice) -> "Filter":
-        """Return the filter of some axes, of ``NUM_AXES``."""
-        return Filter(Gains(*(gain[:, axes] for gain in self.gains)))
 
-    def whiten(self, residuals: np.ndarray, white: np.ndarray) -> None:
-        """Fill an array with the innovations of residuals, of variance 1; 0 where nothing counts.
+def whiten(gains: Gains, residuals: np.ndarray, white: np.ndarray) -> None:
+    """Fill an array with the innovations of residuals, of variance 1; 0 where nothing counts.
 
-        Args:
-            residuals: (rows, axes, 2, chunks, models).
-            white: of the same shape.
-        """
-        num_rows, num_axes, _, num_chunks, num_models = residuals.shape
-        chunks_at_once, models_at_once = min(
-            BATCHES, key=lambda size: -(-num_chunks // size[0]) * -(-num_models // size[1])
-        )
-        shape = NUM_ROWS, num_axes, 2, chunks_at_once, models_at_once
-        starts = range(0, num_chunks, chunks_at_once), range(0, num_models, models_at_once)
-        for chunk, model in product(*starts):
-            state = Filtered(*[np.zeros((num_axes, *shape[3:]))] * 3)
-            for row in range(0, num_rows, NUM_ROWS):
-                part = slice(row, row + NUM_ROWS), slice(None), slice(chunk, chunk + shape[3])
-                gains = Gains(*(gain[part] for gain in self.gains))
-                state, result = _whiten_rows(
-                    state, gains, _cut(residuals, shape, row, chunk, model)
-                )
-                target = white[row:, :, :, chunk:, model:][tuple(map(slice, shape))]
-                target[...] = np.asarray(result)[tuple(map(slice, target.shape))]
+    Args:
+        gains: of the axes of the residuals.
+        residuals: (rows, axes, 2, chunks, models).
+        white: of the same shape.
+    """
+    num_rows, num_axes, _, num_chunks, num_models = residuals.shape
+    chunks_at_once, models_at_once = min(
+        BATCHES, key=lambda size: -(-num_chunks // size[0]) * -(-num_models // size[1])
+    )
+    shape = NUM_ROWS, num_axes, 2, chunks_at_once, models_at_once
+    starts = range(0, num_chunks, chunks_at_once), range(0, num_models, models_at_once)
+    for chunk, model in product(*starts):
+        state = Filtered(*[np.zeros((num_axes, *shape[3:]))] * 3)
+        for row in range(0, num_rows, NUM_ROWS):
+            part = slice(row, row + NUM_ROWS), slice(None), slice(chunk, chunk + shape[3])
+            of_rows = Gains(*(gain[part] for gain in gains))
+            state, result = _whiten_rows(state, of_rows, _cut(residuals, shape, row, chunk, model))
+            target = white[row:, :, :, chunk:, model:][tuple(map(slice, shape))]
+            target[...] = np.asarray(result)[tuple(map(slice, target.shape))]
 
 
 def _cut(
@@ -312,10 +298,10 @@ class Whitener:
         self._chunks, self._log_noise = chunks, log_noise
 
     @cached_property
-    def _filter(self) -> Filter:
+    def _gains(self) -> Gains:
         num_chunks = self._chunks.row.shape[1]
         by_chunk = np.repeat(self._log_noise[..., None], num_chunks, axis=2)
-        return Filter.of(build_conditions(self._chunks), by_chunk)
+        return build_gains(build_conditions(self._chunks), by_chunk)
 
     def __call__(self, residuals: np.ndarray, axes: slice = slice(None)) -> np.ndarray:
         """Return residuals as innovations of variance 1; they are 0 where nothing counts.
@@ -328,16 +314,14 @@ class Whitener:
         """
         num_models, num_rows, num_chunks = residuals.shape[:3]
         white = np.empty((num_chunks, num_rows, *residuals.shape[3:], num_models))
-        self._filter.select_axes(axes).whiten(
-            residuals.transpose(1, 3, 4, 2, 0), white.transpose(1, 2, 3, 0, 4)
-        )
+        gains = Gains(*(gain[:, axes] for gain in self._gains))
+        whiten(gains, residuals.transpose(1, 3, 4, 2, 0), white.transpose(1, 2, 3, 0, 4))
         return white.transpose(4, 1, 0, 2, 3)
 
 
 def step_to(chunks: Chunks) -> np.ndarray:
     """Return the time since the row before (s), (rows, chunks)."""
-    step_s = chunks.record.step_s
-    return np.concatenate([step_s[:1], step_s[:-1]])
+    return of_row_before(chunks.record.step_s)
 
 
 def noise_of(log_noise: jax.Array | np.ndarray) -> Noise:
@@ -371,9 +355,9 @@ class Likelihood:
         shifts = DIFFERENCE * np.concatenate([np.zeros((1, 6)), np.eye(6)]).T
         num_chunks = self._residuals.shape[3] // NUM_COMPARED
         by_chunk = np.repeat(log_noise[:, :, None] + shifts[:, None], num_chunks, axis=2)
-        filters, white = Filter.of(self._conditions, by_chunk), np.empty_like(self._residuals)
-        filters.whiten(self._residuals, white)
-        scale = np.stack([filters.gains.direct_scale, filters.gains.level_scale], axis=2)
+        gains, white = build_gains(self._conditions, by_chunk), np.empty_like(self._residuals)
+        whiten(gains, self._residuals, white)
+        scale = np.stack([gains.direct_scale, gains.level_scale], axis=2)
         scale = scale[: len(white), ..., : white.shape[3], 0]
         white, scale = (
             np.moveaxis(values.reshape(*values.shape[:3], NUM_COMPARED, num_chunks), 3, 0)
@@ -396,11 +380,6 @@ class Likelihood:
 def noise_floors(chunks: Chunks) -> np.ndarray:
     """Return the least noise of each channel, (2, NUM_AXES): of its last digit or of float32."""
     return np.maximum(FLOORS, chunks.quanta * UNIFORM)
-
-
-def least_noise(chunks: Chunks) -> np.ndarray:
-    """Return the logarithms of the least noise, (6, NUM_AXES), with which a problem begins."""
-    return _bounds(chunks)[0]
 
 
 def first_guess(chunks: Chunks, residuals: np.ndarray) -> np.ndarray:
@@ -437,7 +416,7 @@ def fit_noise(chunks: Chunks, residuals: np.ndarray, start: np.ndarray | None = 
     A fit may end where the shortest disturbance passes for the sensor's noise, which is then next
     to nothing. Such an axis is fitted from the first guess, too.
     """
-    likelihood, bounds = Likelihood(chunks, residuals), _bounds(chunks)
+    likelihood, bounds = Likelihood(chunks, residuals), noise_bounds(chunks)
     guess = first_guess(chunks, residuals)
     best, misfit = _descended(likelihood, bounds, guess if start is None else start)
     is_shortest = best[4] <= np.log(TAU_RANGE_S[0])
@@ -483,8 +462,11 @@ def _descended(
     return best, misfit
 
 
-def _bounds(chunks: Chunks) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bounds of the search, (6, NUM_AXES) and (6, 1), as logarithms and a logit."""
+def noise_bounds(chunks: Chunks) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bounds of the search, (6, NUM_AXES) and (6, 1), as logarithms and a logit.
+
+    A problem begins with the lower ones.
+    """
     low = [
         np.log(MIN_DISTURBANCE_RATIO),
         np.log(MIN_DISTURBANCE_RATIO),

@@ -1,6 +1,7 @@
 """A model's step from every row of a log, in float64."""
 
 import operator
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -8,12 +9,15 @@ import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import acts, effect_of
+from flytrack_env.fusion import one_kernel
 from flytrack_env.quaternion import Vec3
 from flytrack_env.state import Drone
+from flytrack_sysid.inference.parameters import in_float64
 from flytrack_sysid.inference.record import Filled, Record, build_record, is_applied_certain
-from flytrack_sysid.inference.replay import Step, replay, start_replay
+from flytrack_sysid.inference.replay import ReplayState, replay_row, start_replay
 from flytrack_sysid.inference.trace_cache import fast_jit
-from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.kinematics import since_first
+from flytrack_sysid.log import FlightLog, median_step
 from flytrack_sysid.log_voltage import with_voltage
 
 # For effects with memory, whose memory at the start of a segment is not known.
@@ -61,19 +65,6 @@ class Prediction(NamedTuple):
         return inputs_that_lack(self.model, self.log)
 
 
-def find_runs(rows: np.ndarray, record: Record) -> list[tuple[int, int]]:
-    """Return the runs of scored rows within a flight, as first row and end.
-
-    Args:
-        rows: rows that are scored, (num_rows,) bool.
-        record: the record of the rows.
-    """
-    follows = np.append(False, rows[1:] & rows[:-1] & ~record.begins[1:])[: len(rows)]
-    starts = np.flatnonzero(rows & ~follows)
-    ends = np.flatnonzero(rows & ~np.append(follows[1:], False)[: len(rows)]) + 1
-    return list(zip(starts.tolist(), ends.tolist(), strict=True))
-
-
 def scored_steps(rows: np.ndarray, prediction: Prediction) -> np.ndarray:
     """Return the rows whose step to the next row is scored, ascending.
 
@@ -111,22 +102,18 @@ def columns(vector: Any) -> np.ndarray:
     return np.stack([np.asarray(leaf) for leaf in vector], axis=-1)
 
 
-def in_float64(model: ModelParameters) -> ModelParameters:
-    """Return the same model with leaves of float64."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
-
-
 @fast_jit
 def _step_from_every_row(
     record: Record, gyro_b: np.ndarray, model: ModelParameters
 ) -> tuple[Drone, Drone, Vec3]:
     """Return the steps of all rows: drones before, drones after, specific forces."""
 
-    def observe(step: Step, _: None) -> tuple[Any, ...]:
-        return step.before, step.after, step.moved.context.force_b
+    def next_row(model: ModelParameters, state: ReplayState, inputs: tuple[Any, Any]) -> Any:
+        after, step = replay_row(model, state, *inputs, is_gyro_fed=True)
+        return after, (step.before, step.after, step.moved.context.force_b)
 
     state = start_replay(model, jax.tree.map(operator.itemgetter(0), record))
-    return replay(model, state, record, gyro_b, observe, is_gyro_fed=True)[1]
+    return jax.lax.scan(partial(one_kernel(next_row), model), state, (record, gyro_b))[1]
 
 
 def predict(model: ModelParameters, filled: Filled) -> Prediction:
@@ -138,13 +125,13 @@ def predict(model: ModelParameters, filled: Filled) -> Prediction:
     filled = filled._replace(log=with_voltage(filled.log, model))
     log = filled.log
     record = build_record(filled)._replace(is_applied_known=np.full(len(log), "uprev" in log))
-    gyro_b = log["w"] if "w" in log else np.zeros((len(log), 3))
+    gyro_b = log.channels.get("w", np.zeros((len(log), 3)))
     with jax.enable_x64(True):
         steps = _step_from_every_row(record, gyro_b, in_float64(model))
         before, after, force_b = jax.tree.map(np.asarray, steps)
     is_settled = np.all(is_applied_certain(record, np.asarray(model.tau, float)), axis=1)
     if any(effect_of(effect).memory for effect in model.effects):
-        time_in_segment = log.time - log.time[record.begins][np.cumsum(record.begins) - 1]
+        time_in_segment = since_first(log.time, record.begins)
         is_settled = is_settled & (time_in_segment >= SETTLING_S)
-    step_s = float(np.median(usual_step(log)))
+    step_s = median_step(log)
     return Prediction(model, filled, before, after, columns(force_b), record, step_s, is_settled)

@@ -79,12 +79,10 @@ def to_vector(model: ModelParameters) -> np.ndarray:
 def from_vector(vector: Any, like: ModelParameters) -> ModelParameters:
     """Return a model with these numbers, and all else as in another; differentiable."""
     leaves, structure = jax.tree.flatten(_numbers_of(like))
-    sizes = [np.size(leaf) for leaf in leaves]
-    ends = np.cumsum(sizes)
-    split_values = [vector[end - size : end] for size, end in zip(sizes, ends, strict=True)]
-    shapes = [np.shape(leaf) for leaf in leaves]
+    ends = np.cumsum([np.size(leaf) for leaf in leaves])
     reshaped = [
-        jnp.reshape(values, shape) for values, shape in zip(split_values, shapes, strict=True)
+        jnp.reshape(vector[end - np.size(leaf) : end], np.shape(leaf))
+        for leaf, end in zip(leaves, ends, strict=True)
     ]
     model = jax.tree.unflatten(structure, reshaped)
     effects = tuple(
@@ -121,6 +119,11 @@ def in_batches(program: Callable[[np.ndarray], Any], values: np.ndarray, size: i
     return np.concatenate(results)
 
 
+def in_float64(model: ModelParameters) -> ModelParameters:
+    """Return the same model with leaves of float64."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
+
+
 def as_float32(model: ModelParameters) -> ModelParameters:
     """Return the model in the environment's precision: float32 arrays and Python floats."""
 
@@ -128,6 +131,11 @@ def as_float32(model: ModelParameters) -> ModelParameters:
         return np.asarray(value, np.float32) if np.ndim(value) else float(np.float32(value))
 
     return jax.tree.map(leaf, model)._replace(battery=model.battery)
+
+
+def values_of(model: ModelParameters) -> dict[str, float]:
+    """Return a model's numbers by name."""
+    return dict(zip(names_of(model), to_vector(model).tolist(), strict=True))
 
 
 def with_values(model: ModelParameters, values: Mapping[str, float]) -> ModelParameters:

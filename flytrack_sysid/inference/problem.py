@@ -42,7 +42,14 @@ from flytrack_sysid.inference.chunks import (
 )
 from flytrack_sysid.inference.lateness import Late
 from flytrack_sysid.inference.law_table import tabulated
-from flytrack_sysid.inference.parameters import TAUS, from_vector, names_of, range_of, to_vector
+from flytrack_sysid.inference.parameters import (
+    TAUS,
+    from_vector,
+    in_float64,
+    names_of,
+    range_of,
+    to_vector,
+)
 from flytrack_sysid.inference.record import Record
 from flytrack_sysid.inference.replay import ReplayState, Step, replay_row, start_replay
 from flytrack_sysid.inference.trace_cache import keep_trace
@@ -337,10 +344,10 @@ class Problem:
         """
         model = as_replayed(model)
         with_all_effects = model.with_effects(*(model.effect(effect.name) for effect in effects))
-        like = jax.tree.map(lambda leaf: np.asarray(leaf, float), with_all_effects)
+        like = in_float64(with_all_effects)
         names, start = names_of(like), to_vector(like)
         low, high = np.array([range_of(name)[:2] for name in names]).T
-        noise = noises.least_noise(chunks)
+        noise, _ = noises.noise_bounds(chunks)
         return cls(
             chunks=chunks,
             like=like,
@@ -384,8 +391,7 @@ class Problem:
 
         At the start, the scale of the law is 0. All laws share the compiled programs.
         """
-        like = self.like.with_effects(tabulated(law._replace(scale=0.0)))
-        like = jax.tree.map(lambda leaf: np.asarray(leaf, float), like)
+        like = in_float64(self.like.with_effects(tabulated(law._replace(scale=0.0))))
         names, start = names_of(like), to_vector(like)
         low, high = (
             np.array([range_of(name)[:2] for name in names[len(self.names) :]]).reshape(-1, 2).T
@@ -569,7 +575,7 @@ def vector_of(model: ModelParameters) -> np.ndarray:
 
 def _longest(names: Sequence[str], chunks: Chunks) -> np.ndarray:
     """Return the longest delay (s) that each effect remembers; infinity for other parameters."""
-    step_s = float(np.median(chunks.record.step_s))
+    step_s = chunks.record.median_step_s
     fields = [name.partition(".") for name in names]
     steps = [
         BY_NAME[effect].max_steps.get(field, np.inf) if field else np.inf

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.state import ACTION_SIZE
+from flytrack_sysid.kinematics import derivative, since_first
 from flytrack_sysid.log import GAP_STEPS, FlightLog, time_in_line, usual_step
 from flytrack_sysid.log_voltage import assumed_voltage
 from flytrack_sysid.resample import interpolate, interpolate_quaternions
@@ -63,6 +64,11 @@ class Record(NamedTuple):
     piece: np.ndarray
     time_s: np.ndarray
 
+    @property
+    def median_step_s(self) -> float:
+        """Usual time between rows, s."""
+        return float(np.median(self.step_s))
+
 
 def _new_times(
     log: FlightLog, usual_step_s: np.ndarray
@@ -110,12 +116,7 @@ def _velocity(log: FlightLog) -> np.ndarray:
     """Return the velocity, measured or differentiated from positions; 0 without either."""
     if "v" in log:
         return log["v"]
-    velocity = np.zeros((len(log), 3))
-    starts = np.flatnonzero(log.is_start())
-    for start, end in zip(starts, np.append(starts[1:], len(log)), strict=True):
-        if "p" in log and end - start > 1:
-            velocity[start:end] = np.gradient(log["p"][start:end], log.time[start:end], axis=0)
-    return velocity
+    return derivative(log, log["p"]) if "p" in log else np.zeros((len(log), 3))
 
 
 def _applied(log: FlightLog) -> np.ndarray:
@@ -191,7 +192,7 @@ def build_record(filled: Filled) -> Record:
         quat=log["q"] if "q" in log else np.tile(UPRIGHT, (len(log), 1)),
         battery_v=log["v_bat"][:, 0] if "v_bat" in log else zeros[:, 0] + assumed_voltage(log),
         piece=np.zeros(len(log), int),
-        time_s=log.time - log.time[np.flatnonzero(is_first_row)][np.cumsum(is_first_row) - 1],
+        time_s=since_first(log.time, is_first_row),
     )
 
 

@@ -3,10 +3,9 @@
 Every row is fed the measured attitude, velocity, position and voltage, so that one error in the
 model does not affect all channels. The applied action, the body rates and the effects' memories
 follow from the commands, which are known exactly. The fit, the validation and the diagnosis all
-replay logs with ``replay``.
+replay logs with ``replay_row``.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,7 +22,6 @@ from flytrack_env.dynamics import (
     read_gyro,
 )
 from flytrack_env.effects import MAX_DELAY_STEPS, at_row, start_memories, takes_motors
-from flytrack_env.fusion import one_kernel
 from flytrack_env.quaternion import Quaternion, Vec3
 from flytrack_env.state import Action, Drone
 from flytrack_sysid.inference.record import Record
@@ -39,14 +37,12 @@ class Step(NamedTuple):
     Attributes:
         row: the row of the log.
         before: the drone as measured at this row.
-        memories: of the effects, before the step.
         moved: result of the step; ``moved.after`` is the drone as modelled.
         model: the model of the step.
     """
 
     row: Record
     before: Drone
-    memories: tuple[Any, ...]
     moved: Moved
     model: ModelParameters
 
@@ -114,7 +110,18 @@ def replay_row(
     gyro_b: jax.Array,
     is_gyro_fed: bool = False,
 ) -> tuple[ReplayState, Step]:
-    """Return the state after a row, and the step from it; arguments are those of ``replay``."""
+    """Return the state after a row, and the step from it.
+
+    Differentiable in the model. It computes in float64 inside ``jax.enable_x64(True)``.
+
+    Args:
+        model: the replayed model.
+        state: before the row; unused where a flight begins there.
+        row: of a log.
+        gyro_b: rates with which a flight starts, or the step if ``is_gyro_fed``, (3,) rad/s; where
+            they are NaN, a flight starts with the rates of the sticks.
+        is_gyro_fed: whether the step starts with the measured rates.
+    """
     applied = where_true(row.begins | row.is_applied_known, Action(*row.applied), state.applied)
     steady_b = body_rates(applied, model.max_rate)
     first_b = where_true(jnp.isnan(gyro_b[0]), steady_b, Vec3(*gyro_b))
@@ -135,39 +142,4 @@ def replay_row(
         before, memories = _observed(model, before, memories, row, gyro_b, share)
     moved = move(before, memories, Action(*row.command), row.step_s, model)
     after = ReplayState(moved.after.applied, moved.after.rates_b, moved.memories)
-    return after, Step(row, before, memories, moved, model)
-
-
-def replay(
-    model: ModelParameters,
-    state: ReplayState,
-    record: Record,
-    gyro_b: jax.Array | np.ndarray,
-    observe: Callable[[Step, Any], Any],
-    extras: Any = None,
-    is_gyro_fed: bool = False,
-) -> tuple[ReplayState, Any]:
-    """Return the state after some rows, and the values of ``observe`` for the step from each row.
-
-    Differentiable in the model. It computes in float64 inside ``jax.enable_x64(True)``.
-
-    Args:
-        model: the replayed model.
-        state: before the first row; unused where a flight begins there.
-        record: rows of a log.
-        gyro_b: rates with which a flight starts, or every step if ``is_gyro_fed``, (num_rows, 3)
-            rad/s; where they are NaN, a flight starts with the rates of the sticks.
-        observe: called with a step and the row's part of ``extras``.
-        extras: a tree of leaves (num_rows, ...).
-        is_gyro_fed: whether every step starts with the measured rates.
-    """
-
-    def next_row(
-        model: ModelParameters, state: ReplayState, inputs: tuple[Any, ...]
-    ) -> tuple[ReplayState, Any]:
-        row, gyro, extra = inputs
-        after, step = replay_row(model, state, row, gyro, is_gyro_fed)
-        return after, observe(step, extra)
-
-    kernel = partial(one_kernel(next_row), model)
-    return jax.lax.scan(kernel, state, (record, gyro_b, extras))
+    return after, Step(row, before, moved, model)

@@ -323,7 +323,7 @@ class Linearization:
             return self
         fresh = self.problem.slopes(self.vector, indices)
         columns = np.copy(self.slopes.columns)
-        columns[[self.indices.index(index) for index in indices]] = fresh.columns
+        columns[self.columns_at(indices)] = fresh.columns
         slopes = Slopes(self.vector, fresh.residuals, self.slopes.indices, columns)
         return Linearization(self.problem, slopes, self.probes)
 
@@ -342,7 +342,7 @@ class Linearization:
 
     def narrowed(self, indices: Sequence[int]) -> "Linearization":
         """Return the linearization along some of the indices only."""
-        columns = [self.indices.index(index) for index in indices]
+        columns = self.columns_at(indices)
         narrow = copy.copy(self)
         narrow.indices, narrow.probes = list(indices), []
         narrow.prior, narrow.columns = self.prior[columns], self.columns[:, :, columns]
@@ -441,10 +441,8 @@ class Linearization:
         Parameters whose range begins at neutral do not move away from their probes: their step
         is 0.
         """
-        columns, probe_columns = (
-            self.columns_of(candidate),
-            [self.probe_column(probe) for probe in candidate.probes],
-        )
+        columns = self.columns_of(candidate)
+        probe_columns = columns[: len(candidate.probes)]
         one_way_columns = {
             self.probe_column(probe) for probe in candidate.probes if probe.is_one_way
         }

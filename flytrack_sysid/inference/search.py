@@ -149,12 +149,11 @@ class SearchState:
     @property
     def all_indices(self) -> list[int]:
         """The indices that may become free: of the base, and of all effects' parameters."""
-        base, groups = (
-            self.base_indices,
-            [candidate.fields for candidate in candidates_for(self.problem)],
-        )
+        base = self.base_indices
         others = {
-            index for fields in groups for index in self.problem.parameter_indices(fields)
+            index
+            for candidate in candidates_for(self.problem)
+            for index in self.problem.parameter_indices(candidate.fields)
         } - {*base}
         return base + sorted(others)
 

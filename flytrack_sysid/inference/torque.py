@@ -8,13 +8,13 @@ latter, up to eleven times too large.
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from flytrack_env.dynamics import ModelParameters, collective_thrust
 from flytrack_env.effects import takes_motors
 from flytrack_env.motors import NAMES
 from flytrack_sysid.inference.chunks import Chunks
-from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.kinematics import low_pass
+from flytrack_sysid.log import FlightLog, median_step
 from flytrack_sysid.log_voltage import flown_voltages
 
 AXES = ("roll", "pitch")  # yaw is turned by little, and by rotors that spin up
@@ -57,7 +57,7 @@ class MotorRecord(NamedTuple):
     @classmethod
     def of_log(cls, log: FlightLog) -> "MotorRecord":
         """Return the record of a log, in one chunk."""
-        step_s = float(np.median(usual_step(log)))
+        step_s = median_step(log)
         voltage = float(np.mean(flown_voltages(log)))
         is_joined = ~log.is_start()[:, None]
         return cls(log["u"][:, None], log["w"][:, None], is_joined, step_s, voltage)
@@ -66,7 +66,7 @@ class MotorRecord(NamedTuple):
     def of_chunks(cls, chunks: Chunks) -> "MotorRecord":
         """Return the record of chunks."""
         record = chunks.record
-        step_s, voltage = float(np.median(record.step_s)), float(np.median(record.battery_v))
+        step_s, voltage = record.median_step_s, float(np.median(record.battery_v))
         rates_b = chunks.measured["w"]
         return cls(record.command, rates_b, chunks.is_joined, step_s, voltage)
 
@@ -78,8 +78,8 @@ def torque_correlations(model: ModelParameters, record: MotorRecord) -> np.ndarr
     some latencies the best counts. NaN where too few rows are there.
     """
     motors, coeffs = model.effect("motors"), np.asarray(model.thrust_coeffs, float)
-    decay = np.exp(-record.step_s / (0.5 * float(motors.up_s + motors.down_s)))
-    lagged = lfilter([1.0 - decay], [1.0, -decay], record.commands, axis=0)
+    lag_s = 0.5 * float(motors.up_s + motors.down_s)
+    lagged = low_pass(record.commands, record.step_s, lag_s)
     thrusts = np.asarray(collective_thrust(lagged, record.battery_v, coeffs))
     levers: Any = np.array([[float(arm) for arm in lever] for lever in motors.levers])
     impulse = np.cumsum(thrusts @ levers[:, : len(AXES)], axis=0)

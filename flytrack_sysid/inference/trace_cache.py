@@ -86,7 +86,8 @@ def _digest(function: Callable[..., Any], structure: str, kinds: tuple[Any, ...]
         os.environ.get(fusion.SWITCH),
     )
     dependencies = (
-        _sources(),
+        jax.__version__,
+        digest_of_sources("flytrack_env", "flytrack_sysid/inference"),
         function.__module__,
         function.__qualname__,
         structure,
@@ -94,8 +95,3 @@ def _digest(function: Callable[..., Any], structure: str, kinds: tuple[Any, ...]
         settings,
     )
     return hashlib.sha256("\n".join(map(str, dependencies)).encode()).hexdigest()
-
-
-def _sources() -> str:
-    """Return JAX's version and a digest of all modules that may be traced."""
-    return f"{jax.__version__} {digest_of_sources('flytrack_env', 'flytrack_sysid/inference')}"

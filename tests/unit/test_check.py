@@ -104,8 +104,8 @@ def planar(truth):
 
 def position_pair(log):
     """Return the pair of position and velocity, and the frames it allows."""
-    compared = compare_pairs(log)
-    return next(pair for pair in compared.pairs if pair.name == "p and v"), compared.edges.positions
+    pairs, edges = compare_pairs(log)
+    return next(pair for pair in pairs if pair.name == "p and v"), edges.positions
 
 
 def test_sign_of_an_axis_without_motion_is_unseen(planar):

@@ -422,9 +422,9 @@ def test_a_long_log_is_thinned_with_a_warning_that_counts_judged_rows(state, mon
     chunks = state.problem.chunks
     half = chunks.counts & (np.arange(len(chunks.row)) % 2 == 0)[:, None, None, None]
     every = chunks._replace(counts=half)
-    assert thinned(every) is every and thinning_warning(every, every) == []
+    assert thinned(every) is every and thinning_warning(every) == []
     monkeypatch.setattr("flytrack_sysid.inference.chunks.MAX_ROWS", 4 * CHUNK_S * 100 + 10)
-    (warning,) = thinning_warning(every, thinned(every))
+    (warning,) = thinning_warning(every)
     kept, number = thinned(every).num_judged, every.num_judged
     assert kept < 0.8 * number and warning.startswith(
         f"only {kept} of {number} rows were learnt from"

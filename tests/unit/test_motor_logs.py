@@ -62,9 +62,9 @@ def test_a_known_craft_has_a_frame_that_a_mapping_may_change(log, tmp_path):
 
 
 def test_stated_numbers_replace_those_of_a_known_craft_whatever_they_are(monkeypatch):
-    crafts = mapping._load(mapping.FRAMES)
+    crafts = mapping.load_toml(mapping.FRAMES)
     crafts["crazyflie_2"] |= {"propellers": "out", "rotor_momentum": 1e-6}
-    monkeypatch.setattr(mapping, "_load", lambda path: crafts)
+    monkeypatch.setattr(mapping, "load_toml", lambda path: crafts)
     known = Frame(craft="crazyflie_2").known()
     assert (known.lag_s, known.propellers, known.rotor_momentum) == ((0.05, 0.05), "out", 1e-6)
     stated = {"lag_s": (0.03, 0.03), "propellers": "in", "rotor_momentum": 0.0}
