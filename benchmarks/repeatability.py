@@ -2,8 +2,9 @@
 
 Each measured flight is diagnosed alone, with the nominal model that is imported with it. A name is
 a statement about the craft only if another flight of the same craft gives it too. Plants, each with
-an effect of the list and another law outside it, fly twice for a minute, differently. Results are
-appended to docs/results/repeatability.jsonl, and a later run of the same commit resumes there;
+an effect of the list and another law outside it, fly twice for a minute, differently. Then flights
+of craft that differ, or do not, are compared by ``diagnose_change``. Results are
+appended to docs/results/repeatability.jsonl (of ``--changes`` to changes.jsonl), and a later run of the same commit resumes there;
 ``--page`` writes docs/results/repeatability.md from them.
 """
 
@@ -38,11 +39,11 @@ from benchmarks.report import (
 from benchmarks.seams.measured import measured_flights
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
-from flytrack_sysid import FlightLog, Imported, diagnose
+from flytrack_sysid import Diagnosis, FlightLog, Imported, diagnose, diagnose_change
 from flytrack_sysid.inference.parameters import STICKS
 from flytrack_sysid.split import held_out_rows
 
-LINES = RESULTS / "repeatability.jsonl"
+LINES, CHANGE_LINES = RESULTS / "repeatability.jsonl", RESULTS / "changes.jsonl"
 SHORTEST_S = 14.0
 RATE_POLICIES = "Crazyflie, rate policies"
 CRAFT = {  # and the beginnings of its flights' names
@@ -58,11 +59,32 @@ SMOOTHED_ROWS = 9  # of the velocity whose slope is the acceleration
 LAGS_S, DELAYS = (0.02, 0.03, 0.04, 0.05, 0.06), range(8)  # of thrust; delays in rows
 
 
+LEE, UPGRADED = "cf_lee_standard/log", "cf_lee_upgraded/log"
+CHANGES = {  # earlier and later flight -> what differs; empty: nothing
+    (LEE + "182", LEE + "183"): "",
+    (UPGRADED + "29", UPGRADED + "30"): "",
+    (UPGRADED + "202", UPGRADED + "203"): "",
+    (LEE + "182", UPGRADED + "202"): "5 g on a cable",
+    (LEE + "183", UPGRADED + "203"): "5 g on a cable",
+    (LEE + "182", UPGRADED + "45"): "motors and propellers",
+    (LEE + "183", UPGRADED + "30"): "motors and propellers",
+    (LEE + "182", UPGRADED + "108"): "motors and propellers",
+}
+OF_THRUST = {"thrust_curve": "thrust_curve.mean_factor", "thrust_scale": "thrust_scale.factor"}
+
+
 class Trial(NamedTuple):
     """A flight to diagnose, and the craft that flew it."""
 
     craft: str
     flight: str
+
+
+class ChangeTrial(NamedTuple):
+    """Two flights to compare."""
+
+    before: str
+    after: str
 
 
 class Flight(NamedTuple):
@@ -80,12 +102,16 @@ class Flight(NamedTuple):
 
 
 @cache
+def imported() -> dict[str, Imported]:
+    """Return the measured flights, by name."""
+    return dict(measured_flights(DATA)) if DATA.is_dir() else {}
+
+
 def flights() -> dict[str, Imported]:
     """Return the measured flights that are long enough, by name."""
-    imported = measured_flights(DATA) if DATA.is_dir() else ()
     return {
         name: flight
-        for name, flight in imported
+        for name, flight in imported().items()
         if flight.log.time[-1] - flight.log.time[0] > SHORTEST_S
     }
 
@@ -129,6 +155,27 @@ def trials(plants: int) -> list[Trial]:
     ]
 
 
+def measure_change(trial: ChangeTrial) -> Line:
+    """Compare two flights: what changed, and by how much the thrust did without the simulator."""
+    before, after = (imported()[name] for name in trial)
+    diagnosis = diagnose_change(after.log, before.log, before.nominal_model())
+    return {
+        "verdict": diagnosis.verdict,
+        "causes": [cause.effect for cause in diagnosis.causes],
+        "values": values_of(diagnosis),
+        "without_model": thrust_over_stick(after.log) / thrust_over_stick(before.log),
+    }
+
+
+def values_of(diagnosis: Diagnosis) -> dict[str, list[float]]:
+    """Return the values of causes with their intervals, by ``effect.parameter``."""
+    return {
+        f"{cause.effect}.{name}": [value.value, *value.ci95]
+        for cause in diagnosis.causes
+        for name, value in cause.parameters.items()
+    }
+
+
 def measure(trial: Trial) -> Line:
     """Diagnose a flight: causes with their classes, values and times to half response."""
     flight = (simulated if trial.craft.startswith(PLANT) else measured)(trial)
@@ -143,11 +190,7 @@ def measure(trial: Trial) -> Line:
         },
         "negligible": [cause.effect for cause in diagnosis.negligible],
         "unsettled": [*diagnosis.unsettled, *(cause.effect for cause in diagnosis.beyond)],
-        "values": {
-            f"{cause.effect}.{name}": [value.value, *value.ci95]
-            for cause in diagnosis.causes
-            for name, value in cause.parameters.items()
-        },
+        "values": values_of(diagnosis),
         "lift": {
             name: [value.value, *value.ci95]
             for lift in [diagnosis.lift.get("extended")]
@@ -235,18 +278,27 @@ def half_responses(lines: Sequence[Line], stick: str) -> str:
     return f"± {half_ms:.1f}; {alike} of {len(pairs)}"
 
 
+def felt_along_z(log: FlightLog) -> np.ndarray:
+    """Return the specific force along the body's z axis by differences of the velocity, m/s^2."""
+    step_s = float(np.median(np.diff(log.time)))
+    acceleration = savgol_filter(log["v"], SMOOTHED_ROWS, 2, deriv=1, delta=step_s, axis=0)
+    felt = acceleration + np.array([0.0, 0.0, GRAVITY])
+    up = Rotation.from_quat(log["q"], scalar_first=True).apply([0.0, 0.0, 1.0])
+    return np.sum(felt * up, axis=1)
+
+
+def thrust_over_stick(log: FlightLog) -> float:
+    """Return the mean specific force over the mean stick from idle, m/s^2."""
+    return float(felt_along_z(log).mean() / (0.5 * (1.0 + log["u"][:, 3])).mean())
+
+
 def hover_without_model(log: FlightLog) -> float:
     """Return the stick at which a log's drone neither climbs nor sinks, without the simulator.
 
     The acceleration along the body's z axis, by differences of the velocity, is fitted by a
     parabola of the stick after a lag and a delay, the best of a grid.
     """
-    step_s = float(np.median(np.diff(log.time)))
-    acceleration = savgol_filter(log["v"], SMOOTHED_ROWS, 2, deriv=1, delta=step_s, axis=0)
-    felt = acceleration + np.array([0.0, 0.0, GRAVITY])
-    up = Rotation.from_quat(log["q"], scalar_first=True).apply([0.0, 0.0, 1.0])
-    thrust = np.sum(felt * up, axis=1)
-    fits = []
+    step_s, thrust, fits = float(np.median(np.diff(log.time))), felt_along_z(log), []
     for lag_s in LAGS_S:
         decay = np.exp(-step_s / lag_s)
         stick = lfilter([0.0, 1.0 - decay], [1.0, -decay], log["u"][:, 3])
@@ -266,6 +318,22 @@ def compare_hovers(lines: Sequence[Line]) -> tuple[list[float], float]:
     return hovers, float(np.corrcoef(hovers, diagnosed)[0, 1])
 
 
+def list_changes(lines: Sequence[Line]) -> str:
+    """Return a table of pairs of flights: what differs, and what was named."""
+    rows = []
+    for line in lines:
+        before, after = line["before"], line["after"]
+        shown = [line["values"][key] for key in OF_THRUST.values() if key in line["values"]]
+        factor = "-" if not shown else "{:.2f} ({:.2f} to {:.2f})".format(*shown[0])
+        named = ", ".join(f"`{name}`" for name in line["causes"]) or "nothing"
+        differs = CHANGES[before, after] or "nothing"
+        rows.append([before, after, differs, named, factor, f"{line['without_model']:.2f}"])
+    header = (
+        "before | after | what differs | what is named | thrust, factor | without the simulator"
+    )
+    return table(header, rows)
+
+
 def is_in_class(line: Line) -> bool:
     """Return whether the effect that a log shows is a cause, an equivalent or negligible."""
     alike = (name for equivalents in line["causes"].values() for name in equivalents)
@@ -280,6 +348,7 @@ def is_coefficient(name: str) -> bool:
 def write_page() -> None:
     """Write docs/results/repeatability.md from the lines of the last commit."""
     lines = [line for line in lines_of_commit(LINES) if "error" not in line]
+    changes = lines_of_commit(CHANGE_LINES)
     by_craft = {craft: [line for line in lines if line["craft"] == craft] for craft in CRAFT}
     apart = Counter(
         name
@@ -298,6 +367,7 @@ def write_page() -> None:
     fill_page(
         RESULTS / "repeatability.md",
         "repeatability",
+        changes=list_changes(changes),
         crafts=table(header, [[craft, *compare(of)] for craft, of in by_craft.items() if of]),
         names=", ".join(f"`{name}` {count}" for name, count in names.most_common()),
         shortest=f"{SHORTEST_S:g}",
@@ -314,18 +384,28 @@ def write_page() -> None:
         num_flights=len(hovers),
         seconds=f"{np.median([line['cpu_s'] for line in lines]):.0f}",
         commit=lines[-1]["commit"],
+        commit_of_changes=changes[-1]["commit"],
     )
 
 
-def main(page: bool = False, plants: int = 10, jobs: JobFlags = IN_THIS_PROCESS) -> None:
+def main(
+    page: bool = False,
+    changes: bool = False,
+    plants: int = 10,
+    jobs: JobFlags = IN_THIS_PROCESS,
+) -> None:
     """Diagnose flights.
 
-    page: write the page from the lines instead. plants: the number of simulated craft.
+    page: write the page from the lines instead. changes: compare pairs of flights instead. plants:
+    the number of simulated craft.
     """
     if page:
         write_page()
-        return
-    record_trials(LINES, trials(plants), measure, jobs=jobs)
+    elif changes:
+        pairs = [ChangeTrial(*pair) for pair in CHANGES if imported().keys() >= {*pair}]
+        record_trials(CHANGE_LINES, pairs, measure_change, jobs=jobs)
+    else:
+        record_trials(LINES, trials(plants), measure, jobs=jobs)
 
 
 if __name__ == "__main__":
