@@ -3,9 +3,9 @@
 Each measured flight is diagnosed alone, with the nominal model that is imported with it. A name is
 a statement about the craft only if another flight of the same craft gives it too. Plants, each with
 an effect of the list and another law outside it, fly twice for a minute, differently. Then flights
-of craft that differ, or do not, are compared by ``diagnose_change``. Results are
-appended to docs/results/repeatability.jsonl (of ``--changes`` to changes.jsonl), and a later run of the same commit resumes there;
-``--page`` writes docs/results/repeatability.md from them.
+of craft that differ, or do not, are compared by ``diagnose_change`` (``--changes``). Results are
+appended to docs/results/repeatability.jsonl and changes.jsonl, and a later run of the same commit
+resumes there; ``--page`` writes docs/results/repeatability.md from them.
 """
 
 from collections import Counter
