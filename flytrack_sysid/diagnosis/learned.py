@@ -125,7 +125,7 @@ def improves_flights(ratio: np.ndarray, z_scores: np.ndarray, acts_there: bool) 
         z_scores: increase of each error in standard errors.
         acts_there: whether the law acts in the flights.
     """
-    is_better = float(np.mean(ratio**2)) < 1.0 - MIN_ERROR_REDUCTION
+    is_better = ratio.size > 0 and float(np.mean(ratio**2)) < 1.0 - MIN_ERROR_REDUCTION
     # A law that predicts flights no better overall has to be as good at every horizon.
     worst = WORSE_ANYWHERE if is_better else LIKELY
     is_worse = (ratio > LIKELY_WORSE) & (z_scores > worst)
