@@ -60,7 +60,7 @@ LAGS_S, DELAYS = (0.02, 0.03, 0.04, 0.05, 0.06), range(8)  # of thrust; delays i
 
 
 LEE, UPGRADED = "cf_lee_standard/log", "cf_lee_upgraded/log"
-CHANGES = {  # earlier and later flight -> what differs; empty: nothing
+CHANGES = {  # earlier and later flight -> what differs; empty: nothing that is known
     (LEE + "182", LEE + "183"): "",
     (UPGRADED + "29", UPGRADED + "30"): "",
     (UPGRADED + "202", UPGRADED + "203"): "",
@@ -326,7 +326,7 @@ def list_changes(lines: Sequence[Line]) -> str:
         shown = [line["values"][key] for key in OF_THRUST.values() if key in line["values"]]
         factor = "-" if not shown else "{:.2f} ({:.2f} to {:.2f})".format(*shown[0])
         named = ", ".join(f"`{name}`" for name in line["causes"]) or "nothing"
-        differs = CHANGES[before, after] or "nothing"
+        differs = CHANGES[before, after] or "nothing that is known"
         rows.append([before, after, differs, named, factor, f"{line['without_model']:.2f}"])
     header = (
         "before | after | what differs | what is named | thrust, factor | without the simulator"
