@@ -207,9 +207,8 @@ def find_stand_ins(
         rest_gain = sum(
             dependence.gain for dependence in dependences if dependence.side == own_side
         )
-        is_gone = after < min_gain or (
-            after < KEPT_SHARE * before and suspect.robust < OUTWEIGHS * rest_gain
-        )
+        outweighs = suspect.robust >= OUTWEIGHS * rest_gain > 0.0
+        is_gone = not outweighs and (after < min_gain or after < KEPT_SHARE * before)
         needed = min_gain * (DISTURBED_BASE if suspect.name in ALL_BASE_CAUSES else DISTURBED)
         if is_gone or (own_side in disturbed and suspect.robust < needed):
             result.append(suspect.name)
