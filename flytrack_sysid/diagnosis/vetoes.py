@@ -207,12 +207,31 @@ def find_stand_ins(
         rest_gain = sum(
             dependence.gain for dependence in dependences if dependence.side == own_side
         )
-        outweighs = suspect.robust >= OUTWEIGHS * rest_gain > 0.0
-        is_gone = not outweighs and (after < min_gain or after < KEPT_SHARE * before)
+        is_gone = is_absorbed(before, after, min_gain, suspect.robust, rest_gain)
         needed = min_gain * (DISTURBED_BASE if suspect.name in ALL_BASE_CAUSES else DISTURBED)
         if is_gone or (own_side in disturbed and suspect.robust < needed):
             result.append(suspect.name)
     return tuple(result)
+
+
+def is_absorbed(
+    before: float, after: float, min_gain: float, robust: float, rest_gain: float
+) -> bool:
+    """Return whether what the rest depends on takes a name's place.
+
+    On a short log, waves of a heading can take the place of nearly anything. So a name that
+    explains far more than the rest is not absorbed by it.
+
+    Args:
+        before: the name's noncentrality.
+        after: the same beside the dependences.
+        min_gain: that a name needs.
+        robust: the name's gain over its inflation.
+        rest_gain: of the dependences.
+    """
+    if robust >= OUTWEIGHS * rest_gain > 0.0:
+        return False
+    return after < min_gain or after < KEPT_SHARE * before
 
 
 def stands_in_for_unknown(selection: Selection, test: Problem) -> list[str]:

@@ -442,6 +442,12 @@ def test_what_is_learnt_has_to_improve_held_out_flights(ratio, lost, acts_there,
     assert improves_flights(np.array(ratio), np.array(lost), acts_there) is expected
 
 
+@pytest.mark.parametrize("row", table("diagnoses")["absorptions"])
+def test_a_name_that_outweighs_the_rest_is_not_absorbed_by_it(row):
+    *gains, expected = row
+    assert vetoes.is_absorbed(*gains) is expected
+
+
 def test_every_veto_has_a_reason_to_tell():
     rules = {veto.__name__ for veto in vetoes.VETOES}
     assert set(vetoes.REASONS) == rules - {vetoes.CONTRADICTED}
