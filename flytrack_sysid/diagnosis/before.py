@@ -201,6 +201,7 @@ def diagnose_change(
     causes = tuple(
         replace(one, equivalent=(drifts | equivalents).get(one.effect, ())) for one in causes
     )
+    is_of_thrust = any(base_fields(one.effect) == THRUST_COEFFS for one in causes)
     unchanged = {one.effect for one in named} - {one.effect for one in causes}
     return replace(
         diagnosis,
@@ -210,7 +211,7 @@ def diagnose_change(
         warnings=(
             *diagnosis.warnings,
             *(f"{name}: as in the log before, so no change" for name in sorted(unchanged)),
-            *([] if share_thrusts(later, earlier) else [NOT_SHARED]),
+            *([NOT_SHARED] if is_of_thrust and not share_thrusts(later, earlier) else []),
         ),
     )
 
