@@ -162,12 +162,12 @@ def measure_change(trial: ChangeTrial) -> Line:
     return {
         "verdict": diagnosis.verdict,
         "causes": [cause.effect for cause in diagnosis.causes],
-        "values": values_of(diagnosis),
+        "values": cause_values(diagnosis),
         "without_model": thrust_over_stick(after.log) / thrust_over_stick(before.log),
     }
 
 
-def values_of(diagnosis: Diagnosis) -> dict[str, list[float]]:
+def cause_values(diagnosis: Diagnosis) -> dict[str, list[float]]:
     """Return the values of causes with their intervals, by ``effect.parameter``."""
     return {
         f"{cause.effect}.{name}": [value.value, *value.ci95]
@@ -190,7 +190,7 @@ def measure(trial: Trial) -> Line:
         },
         "negligible": [cause.effect for cause in diagnosis.negligible],
         "unsettled": [*diagnosis.unsettled, *(cause.effect for cause in diagnosis.beyond)],
-        "values": values_of(diagnosis),
+        "values": cause_values(diagnosis),
         "lift": {
             name: [value.value, *value.ci95]
             for lift in [diagnosis.lift.get("extended")]

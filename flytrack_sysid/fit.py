@@ -24,8 +24,8 @@ from flytrack_sysid.inference.parameters import (
     fields_of_sticks,
     names_of,
     neutral_value,
+    parameter_values,
     range_of,
-    values_of,
     with_neutral_effects,
     with_values,
 )
@@ -179,7 +179,7 @@ def _free_names(
 
 
 def _intervals(result: Estimate) -> dict[str, Interval]:
-    values, intervals = values_of(result.model), {}
+    values, intervals = parameter_values(result.model), {}
     for name, deviation in zip(result.free, np.sqrt(np.diag(result.covariance)), strict=True):
         value, half = values[name], float(TWO_SIDED_95 * deviation)
         if name in TAUS:  # symmetric in the logarithm, so that no time is negative
@@ -402,7 +402,7 @@ def _likely_cause(log: FlightLog, tau: str) -> str:
 
 def _check_result(result: Estimate, log: FlightLog, scored_rows: np.ndarray) -> None:
     """Raise FitError if the best model is not plausible for a drone."""
-    values = values_of(result.model)
+    values = parameter_values(result.model)
     for name in TAUS:
         if (
             name in result.free

@@ -28,7 +28,7 @@ class Windows(NamedTuple):
     ends: np.ndarray
     durations: np.ndarray
 
-    def rate_of(self, values: np.ndarray) -> np.ndarray:
+    def mean_rate(self, values: np.ndarray) -> np.ndarray:
         """Return the change of values, (num_rows, n), over each window, a second."""
         return (values[self.ends] - values[self.starts]) / self.durations[:, None]
 
@@ -36,7 +36,7 @@ class Windows(NamedTuple):
         """Return the mean of values, (num_rows, n), over each window; linear between rows."""
         steps = np.diff(log.time)[:, None] * 0.5 * (values[1:] + values[:-1])
         integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
-        return self.rate_of(integral)
+        return self.mean_rate(integral)
 
 
 def cut_windows(log: FlightLog, length_s: float) -> Windows:

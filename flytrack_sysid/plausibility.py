@@ -98,7 +98,7 @@ def _acceleration(log: FlightLog) -> Iterator[str]:
     windows = cut_windows(log, WINDOW_S)
     if len(windows.starts) == 0:
         return
-    changes = windows.rate_of(log["v"])
+    changes = windows.mean_rate(log["v"])
     offset = float(np.median((windows.mean_of(log, log["a"]) - changes)[:, 2]))
     if abs(offset - GRAVITY) <= MAX_BIAS:
         problem = f"found {offset:.3g} m/s^2 more than v_z changes by, expected 0 in hover"

@@ -119,7 +119,7 @@ def compare(
     """
     found = []
     for length_s, windows in useful_windows(log):
-        shown = windows.rate_of(sums)
+        shown = windows.mean_rate(sums)
         measured = windows.mean_of(log, rates)
         values = [by_frame(shown[part], measured[part], floor) for part in parts_of(len(shown))]
         found.append(described(values, length_s, shown, measured))
@@ -163,7 +163,7 @@ def compare_forces(
     matrices = attitude.as_matrix()
     products = np.einsum("nij,nk->nijk", matrices, log["f"]).reshape(len(log), 27)
     for length_s, windows in useful_windows(log):
-        changes = windows.rate_of(log["v"])
+        changes = windows.mean_rate(log["v"])
         means = windows.mean_of(log, products).reshape(-1, 3, 3, 3)
         turned = windows.mean_of(log, matrices.reshape(len(log), 9)).reshape(-1, 3, 3)
         values = [
@@ -230,7 +230,7 @@ def compare_thrust(log: FlightLog, attitude: Rotation) -> Likelihoods | None:
     found = []
     columns = attitude.as_matrix().reshape(len(log), 9)
     for length_s, windows in useful_windows(log):
-        changes = windows.rate_of(log["v"])
+        changes = windows.mean_rate(log["v"])
         axes = windows.mean_of(log, columns).reshape(-1, 3, 3)
         values = [
             _likelihoods_of_thrust(changes[part], axes[part]) for part in parts_of(len(changes))

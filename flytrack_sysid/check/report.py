@@ -56,7 +56,7 @@ def signals_of(log: FlightLog, pair: str) -> Signals | None:
     else:
         return None
     windows = cut_windows(log, WINDOWS_S[0])
-    shown = windows.mean_of(log, log["w"]) if sums is None else windows.rate_of(sums)
+    shown = windows.mean_of(log, log["w"]) if sums is None else windows.mean_rate(sums)
     return time_in_line(log)[windows.starts], shown, windows.mean_of(log, rates)
 
 

@@ -59,7 +59,7 @@ def slope_between(log: FlightLog, sums: np.ndarray, rates: np.ndarray) -> Slope:
     """
     best, slope = 0.0, UNKNOWN
     for _, windows in useful_windows(log):
-        shown = windows.rate_of(sums)
+        shown = windows.mean_rate(sums)
         measured = windows.mean_of(log, rates)
         sizes = np.linalg.norm(shown, axis=0), np.linalg.norm(measured, axis=0)
         total = np.linalg.norm(sizes[0]), np.linalg.norm(sizes[1])
@@ -81,7 +81,7 @@ def scales_of_forces(log: FlightLog) -> tuple[float, float]:
     found = np.nan, np.nan
     best = MIN_CORRELATION**2
     for _, windows in useful_windows(log):
-        changes = windows.rate_of(log["v"])
+        changes = windows.mean_rate(log["v"])
         means = windows.mean_of(log, force_w)
         design = np.stack([means.ravel(), np.tile(-WEIGHT_W, len(means))], axis=1)
         (a, b), *_ = np.linalg.lstsq(design, changes.ravel(), rcond=None)

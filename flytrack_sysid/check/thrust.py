@@ -36,7 +36,7 @@ def force_along_z(log: FlightLog, windows: Windows) -> np.ndarray | None:
     if "q" not in log or "v" not in log:
         return None
     up_w = attitude_of(log).apply(UP)
-    changes = windows.rate_of(log["v"])
+    changes = windows.mean_rate(log["v"])
     return np.sum((changes + UP * GRAVITY) * windows.mean_of(log, up_w), axis=1)
 
 
@@ -120,7 +120,7 @@ def motor_changes(log: FlightLog, motors: np.ndarray) -> list[tuple[Change, ...]
         return [()]
     found = []
     for length_s, windows in useful_windows(log):
-        turned = windows.rate_of(log["w"])
+        turned = windows.mean_rate(log["w"])
         pushed = windows.mean_of(log, follow(log, motors, 0.0, MOTOR_LAG_S))
         pushed = pushed - pushed.mean(axis=0)
         nats = {}

@@ -74,7 +74,7 @@ def best_shift(
         elapsed_s = np.cumsum(windows.durations)
         if elapsed_s[-1] < MIN_S:
             continue
-        shown = windows.rate_of(sums)
+        shown = windows.mean_rate(sums)
         block = (elapsed_s / BLOCK_S).astype(int)
         residuals = np.array(
             [

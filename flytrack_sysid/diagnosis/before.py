@@ -58,7 +58,8 @@ MAX_EFFECTS = 4  # that changed between two logs
 # constant of the low-pass; AFTERMATH_S is how long the rows after a jump do not count.
 JUMP, JUMP_S, AFTERMATH_S = 0.5, 0.05, 0.2
 # Share of the earlier log's rows whose thrusts count as flown, from either end, and share of the
-# later log's rows that must lie within: below, the earlier thrust map would be extrapolated.
+# later log's rows that must lie within: below, the earlier thrust map would be extrapolated. Both
+# are choices, tried on the pairs of ``benchmarks.repeatability --changes`` alone.
 FLOWN, SHARED = 0.99, 0.2
 EXPONENT = 0.5  # motors' thrust goes with the 1st to 2nd power of their command
 WORSE = 1.5  # times what was left unexplained before: more than this is new

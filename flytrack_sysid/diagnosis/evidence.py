@@ -13,7 +13,7 @@ from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.toml_file import parse_toml, read_text
 from flytrack_sysid.diagnosis.result import DRIFT, TWO_SIDED_95
 from flytrack_sysid.diagnosis.traces import REGRESSORS, UNITS, Traces
-from flytrack_sysid.inference.parameters import values_of, with_values
+from flytrack_sysid.inference.parameters import parameter_values, with_values
 from flytrack_sysid.inference.score_test import ALL_BASE_CAUSES
 from flytrack_sysid.plots import BLUE, GREY, ORANGE, say
 
@@ -86,7 +86,7 @@ def without(extended: ModelParameters, nominal: ModelParameters, cause: str) -> 
         cause = "thrust_curve"  # the scale is one factor between two curves, not an effect
     if cause not in ALL_BASE_CAUSES:
         return extended.with_effects(nominal.effect(cause))
-    before = values_of(nominal)
+    before = parameter_values(nominal)
     return with_values(extended, {name: before[name] for name in ALL_BASE_CAUSES[cause]})
 
 

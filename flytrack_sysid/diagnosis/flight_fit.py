@@ -45,7 +45,7 @@ class Fit(NamedTuple):
     columns: np.ndarray
 
     @property
-    def half_width_of(self) -> dict[int, float]:
+    def half_widths_by_index(self) -> dict[int, float]:
         """``half_widths`` by index."""
         return dict(zip(self.indices, self.half_widths.tolist(), strict=True))
 

@@ -345,7 +345,7 @@ def active_windows(selection: Selection) -> list[Window]:
     return windows_of(selection.state, selection.model)
 
 
-def rows_of(windows: Iterable[Window]) -> set[int]:
+def change_rows(windows: Iterable[Window]) -> set[int]:
     """Return the rows of the record at which windows begin or end within a log."""
     return {row for one in windows for row in (one.start, one.end)} - {ALWAYS, NEVER}
 
@@ -365,7 +365,7 @@ def at_end(selection: Selection, model: FittedModel) -> FittedModel:
 
 def first_row_as_at_end(selection: Selection, test: Problem) -> int:
     """Return the row of the log after which the same effects act as at its end."""
-    rows = rows_of(active_windows(selection))
+    rows = change_rows(active_windows(selection))
     return int(np.ceil(log_rows(selection.state.problem, test, [max(rows)])[0])) if rows else 0
 
 
@@ -449,7 +449,7 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     )
     state, model = with_refitted_noise(at_best_row(state, test, model, first.row), model)
     state, base, model = extended(state, state.fitted((), selection.base.vector), model)
-    rows = rows_of(windows_of(state, model)) - rows_of(selection.state.problem.windows)
+    rows = change_rows(windows_of(state, model)) - change_rows(selection.state.problem.windows)
     if rows:
         state = at_best_row(state, test, model, max(rows))
     tried = Selection(state, base, state.fitted(model.candidates, model.vector), {})

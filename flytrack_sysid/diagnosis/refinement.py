@@ -404,7 +404,7 @@ def superfluous(problem: Problem, fit: Fit, candidate: Candidate) -> str | None:
 
     It is at a bound, or the nearest to its nominal value where all may be nominal.
     """
-    half = fit.half_width_of
+    half = fit.half_widths_by_index
     change = np.abs(fit.vector - problem.start)
     indices = problem.parameter_indices(candidate.fields)
     shown = [index for index in indices if half.get(index, 0.0) > 0.0]

@@ -460,7 +460,7 @@ def with_refined_values(
     nominal values are omitted: single steps show them, and flights do not.
     """
     problem, fit = refined.problem, refined.fit
-    half = {} if fit is None else fit.half_width_of
+    half = {} if fit is None else fit.half_widths_by_index
     result = []
     for cause in causes:
         prefix = f"{cause.effect}." if cause.effect in BY_NAME else ""
@@ -532,7 +532,7 @@ def changed_parameters(
     indices = [
         index for index in extended.indices if abs(vector[index] - problem.start[index]) > 0.0
     ]
-    widths = {} if fit is None else fit.half_width_of
+    widths = {} if fit is None else fit.half_widths_by_index
     acting = [
         index
         for index in indices
@@ -704,9 +704,7 @@ def _at_bound(cause: Cause) -> str:
     if cause.effect in BY_NAME:
         why += ", and is not in the extended model"
         if any(name in cause.beyond for name in BY_NAME[cause.effect].max_steps):
-            why = (
-                "only so many rows of the log are remembered; import it with fewer rows per second"
-            )
+            why = "the model remembers a limited number of rows; import fewer rows per second"
     return f"{cause.effect} is beyond the list: {cause.beyond}, the end of what is searched; {why}"
 
 

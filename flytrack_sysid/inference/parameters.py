@@ -133,7 +133,7 @@ def as_float32(model: ModelParameters) -> ModelParameters:
     return jax.tree.map(leaf, model)._replace(battery=model.battery)
 
 
-def values_of(model: ModelParameters) -> dict[str, float]:
+def parameter_values(model: ModelParameters) -> dict[str, float]:
     """Return a model's numbers by name."""
     return dict(zip(names_of(model), to_vector(model).tolist(), strict=True))
 

@@ -39,7 +39,7 @@ def check(imported, least, tolerance):
     windows = cut_windows(log, WINDOW_S)
     for change, rate in pairs:
         shown, measured = (
-            windows.rate_of(change),
+            windows.mean_rate(change),
             windows.mean_of(log, rate),
         )
         shown, measured = shown - shown.mean(axis=0), measured - measured.mean(axis=0)

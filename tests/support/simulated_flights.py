@@ -58,7 +58,7 @@ def flown(
 
 
 def padded(commands, num_steps=NUM_STEPS):
-    """Return commands of which the last is held, so that all flights are of one program."""
+    """Pad commands with the last one to a common length, so that all flights share a program."""
     return np.pad(commands, ((0, num_steps - len(commands)), (0, 0)), mode="edge")
 
 
