@@ -210,7 +210,7 @@ def speed_figures(repeats: int) -> list[report.Figure]:
 def flight_rows(checkpoints: tuple[Path, ...]) -> list[list[Any]]:
     """Return a row for each policy: how it flies by a perfect detector, and by a bad one."""
     from baselines.purejaxrl_ppo.evaluate import EvaluationSettings, Report
-    from flytrack_env.wrappers import GateCorners, layers_of
+    from flytrack_env.wrappers import CornersParams, GateCorners, layers_of
 
     rows = []
     for path in checkpoints:
@@ -221,7 +221,7 @@ def flight_rows(checkpoints: tuple[Path, ...]) -> list[list[Any]]:
             )
             flown = Report(settings)
             layer = next(part for part in layers_of(flown.env) if isinstance(part, GateCorners))
-            detector = layer.own_params(flown.params)._replace(**changes)
+            detector = CornersParams(**changes)
             flown.params = layer.with_own_params(flown.params, detector)
             flown.count(flown.fly())
             lap_s = flown.numbers["flying_lap_s"]["mean"]
