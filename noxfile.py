@@ -56,7 +56,7 @@ for extra, module in (("sysid", "flytrack_sysid"), ("train", "baselines.purejaxr
 """
 LOAD_CHAMPION = """
 from baselines.purejaxrl_ppo import load_checkpoint
-for name in ("champion", "robust"):
+for name in ("champion", "robust", "corners"):
     load_checkpoint(name)
 """
 SAVE_GHOST = """

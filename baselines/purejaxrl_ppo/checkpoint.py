@@ -39,10 +39,10 @@ MAX_HEADER_BYTES = 2**23  # the description of a track of ten thousand gates
 MAX_DIFFERENCES = 12  # in one message
 
 FINAL = f"final{SUFFIX}"
-# Names of the shipped policies, which docs/results/champion.md describes.
+# Names of the shipped policies, which docs/results/champion.md and camera.md describe.
 SHIPPED = {
     name: Path(__file__).parent / "champion" / f"{stem}{SUFFIX}"
-    for name, stem in (("champion", "flytrack"), ("robust", "robust"))
+    for name, stem in (("champion", "flytrack"), ("robust", "robust"), ("corners", "corners"))
 }
 STEP_FILE = re.compile(rf"step_(\d+)\{SUFFIX}")
 REWARD = "reward."  # prefix of the reward's weights among the environment's parameters
@@ -275,7 +275,7 @@ def save_run(path: Path, runner: Runner, config: Config, description: dict[str, 
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
-    """Return the checkpoint in a file, or a shipped one by its name: ``champion``, ``robust``.
+    """Return the checkpoint in a file, or a shipped one by its name, a key of ``SHIPPED``.
 
     A file of such a name comes first.
 

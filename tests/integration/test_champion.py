@@ -17,6 +17,7 @@ from flytrack_env.references import model_digest, shipped_reference
 
 MAX_BYTES = 100_000
 MAX_RATIO, MAX_RATIO_ROBUST, MIN_SUCCESS_ROBUST = 1.03, 1.1, 0.9  # the optimum; of few plants
+MAX_RATIO_CORNERS, MIN_SUCCESS_CORNERS = 1.25, 0.9  # by a camera
 ROBUST = FOLDER / "robust.safetensors"
 NUM_FLIGHTS, NUM_STEPS, NUM_LAPS = 32, 2500, 3
 SHORT = Settings(updates=20, learning_rate=3e-4, flights=8, laps=1, slowest_lap_s=4.6)
@@ -43,6 +44,16 @@ def test_robust_champion_races_on_plants_that_it_has_not_met():
     optimum = shipped_reference("flytrack", "flying", "black_box")
     assert result.success >= MIN_SUCCESS_ROBUST
     assert result.flying_lap_s <= MAX_RATIO_ROBUST * optimum.time_s
+
+
+def test_a_policy_that_sees_gate_corners_alone_races_on_the_black_box():
+    policy = load_checkpoint("corners")
+    env = plant_env(policy, blackbox.load(blackbox.SHIPPED))
+    keys = start_keys(9, NUM_FLIGHTS)
+    result = score(race_many(env, policy.policy, keys, NUM_STEPS, NUM_LAPS))
+    optimum = shipped_reference("flytrack", "flying", "black_box")
+    assert result.success >= MIN_SUCCESS_CORNERS
+    assert result.flying_lap_s <= MAX_RATIO_CORNERS * optimum.time_s
 
 
 def test_champion_is_a_small_policy_of_the_model_of_its_reference():
