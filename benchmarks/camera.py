@@ -2,8 +2,8 @@
 
 ``python -m benchmarks.camera [--poses 10000] [--repeats 7] [--checkpoints PATH ...] [--out PAGE]``
 prints a table and writes it. The ray caster (``benchmarks/hidden/ray_caster.py``) is NumPy in
-float64 and shares no code with the package. Checkpoints, of ``FlyTrackCorners-v0``, are flown on
-the shipped black box, whose states are seen through the same camera.
+float64 and shares no code with the package. Checkpoints, of ids with gate corners, are flown
+on the shipped black box, whose states are seen through the same camera.
 """
 
 import statistics
@@ -249,7 +249,7 @@ def main(
     """
     core = report.pin_to_one_core()
     figures = [*corner_figures(poses), mask_figure(poses), gradient_figure()]
-    header = "policy | finish | gates | flying lap (s) | times optimal"
+    header = "policy | finish, perfect detector | gates | flying lap (s) | times optimal"
     bad = "finish, bad detector | gates, bad | flying lap, bad (s) | times optimal, bad"
     report.fill_page(
         out,

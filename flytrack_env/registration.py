@@ -90,9 +90,9 @@ ENVIRONMENTS: dict[str, Variant] = {
 def make(env_id: str, **overrides: Any) -> EpisodicEnvironment:
     """Return the environment of an id; ``overrides`` are arguments of ``FlyTrack``.
 
-    With a plant that has its parameters baked in (a black box), ids that randomise the model fly
-    that plant as it is, with the same observation: what was trained on the id can be flown on the
-    plant.
+    An argument of None is the id's own. With a plant that has its parameters baked in (a black
+    box), ids that randomise the model fly that plant as it is, with the same observation: what was
+    trained on the id can be flown on the plant.
 
     Raises:
         ValueError: unknown id, a model without motors in an id whose commands are those, or a model
@@ -103,7 +103,8 @@ def make(env_id: str, **overrides: Any) -> EpisodicEnvironment:
         raise ValueError(f"env_id: found {env_id!r}, expected one of {', '.join(ENVIRONMENTS)}")
     check_keywords(overrides, ARGUMENTS)
     variant = ENVIRONMENTS[env_id]
-    env: EpisodicEnvironment = FlyTrack(**{**variant.arguments, **overrides})
+    given = {name: value for name, value in overrides.items() if value is not None}
+    env: EpisodicEnvironment = FlyTrack(**{**variant.arguments, **given})
     check_motors(env.default_params.model.effects)
     is_of_motors = takes_motors(env.default_params.model.effects)
     if "model" in variant.arguments and env.plant.dt is None and not is_of_motors:

@@ -3,6 +3,7 @@
 import importlib
 from functools import partial
 
+import chex
 import gymnasium
 import gymnax
 import jax
@@ -17,7 +18,7 @@ from flytrack_env import FlyTrack
 from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import ThrustScale
 from flytrack_env.extras import check_gymnax
-from flytrack_env.registration import ENVIRONMENTS, make, register_all
+from flytrack_env.registration import ARGUMENTS, ENVIRONMENTS, make, register_all
 from flytrack_env.state import Action
 from flytrack_env.wrappers import DomainRandomization, layers_of
 from tests.support.coasting import Coasting, drone_at
@@ -53,6 +54,14 @@ def test_every_id_follows_gymnaxs_protocol(env_id):
     assert reward == jax.ShapeDtypeStruct((), np.float32)
     assert terminated == truncated == jax.ShapeDtypeStruct((), bool)
     assert {*CAUSES, *RACE, "terminated", "truncated"} < info.keys()
+
+
+@OVER_IDS
+def test_an_argument_of_none_is_the_ids_own(env_id):
+    nothing = dict.fromkeys(ARGUMENTS)
+    assert repr(make(env_id, **nothing)) == repr(make(env_id))
+    given, own = (make(env_id, **arguments).default_params for arguments in (nothing, {}))
+    chex.assert_trees_all_equal(given, own)
 
 
 @OVER_IDS

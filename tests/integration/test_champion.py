@@ -46,7 +46,7 @@ def test_robust_champion_races_on_plants_that_it_has_not_met():
     assert result.flying_lap_s <= MAX_RATIO_ROBUST * optimum.time_s
 
 
-def test_a_policy_that_sees_gate_corners_alone_races_on_the_black_box():
+def test_a_policy_that_has_a_camera_races_on_the_black_box():
     policy = load_checkpoint("corners")
     env = plant_env(policy, blackbox.load(blackbox.SHIPPED))
     keys = start_keys(9, NUM_FLIGHTS)

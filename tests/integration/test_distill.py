@@ -1,18 +1,19 @@
 """A student that sees corners learns to command what a teacher that sees the state would."""
 
 import dataclasses
+import hashlib
 
 import pytest
 
 import flytrack_env
 from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import CheckpointError, observation_layout
-from baselines.purejaxrl_ppo.distill import CONFIG, Settings, check_teacher, distill, main
+from baselines.purejaxrl_ppo.config import ConfigError
+from baselines.purejaxrl_ppo.distill import CONFIG, Settings, check_teacher, distill, main, make_env
 from baselines.purejaxrl_ppo.evaluate import EvaluationSettings, evaluate
-from flytrack_env.model_file import model_from_json
 
 TEACHER = load_checkpoint("robust")
-MODEL = model_from_json(TEACHER.meta["model"], "model")
+ENV = make_env(TEACHER, "FlyTrackCorners-v0")
 
 
 def make_config(num_updates: int) -> Config:
@@ -22,8 +23,7 @@ def make_config(num_updates: int) -> Config:
 
 @pytest.mark.slow
 def test_a_student_comes_nearer_to_its_teacher_and_to_the_state():
-    env = flytrack_env.make("FlyTrackCorners-v0", model=MODEL)
-    _, errors = distill(env, check_teacher(TEACHER), make_config(60), seed=0)
+    _, errors = distill(ENV, check_teacher(TEACHER), make_config(60), seed=0)
     for values in errors:
         assert values.shape == (60,)
         # The teacher flies in the first updates, so that they see easier states than the last.
@@ -31,13 +31,16 @@ def test_a_student_comes_nearer_to_its_teacher_and_to_the_state():
 
 
 @pytest.mark.slow
-def test_the_checkpoint_of_a_run_flies_by_corners_alone(tmp_path):
+def test_the_checkpoint_of_a_run_flies_without_the_state(tmp_path):
     main(Settings(out=tmp_path, total_timesteps=CONFIG.batch_size))
     student = load_checkpoint(tmp_path / "final.safetensors")
-    assert student.meta["distilled"] == {"teacher": "robust", "updates": 1}
+    digest = hashlib.sha256(TEACHER.path.read_bytes()).hexdigest()
+    assert student.meta["distilled"] == {"teacher": "robust", "teacher_sha256": digest}
     assert student.observation_size == 35  # what FlyTrackCorners-v0 observes, and no state
     report = evaluate(EvaluationSettings(student.path, steps=50, out=tmp_path / "rollout.npy"))
     assert report.rollout.outcome.steps > 0
+    with pytest.raises(ValueError, match=r"--out: .* holds the checkpoints of a run"):
+        main(Settings(out=tmp_path))
 
 
 def test_a_teacher_that_cannot_teach_is_refused():
@@ -45,8 +48,24 @@ def test_a_teacher_that_cannot_teach_is_refused():
     blind = TEACHER._replace(
         meta={**TEACHER.meta, "observation": corners}, observation_size=35, env_id="FlyTrackCorners"
     )
-    with pytest.raises(CheckpointError, match=r"teacher: expected one that sees the state: .* 35"):
+    with pytest.raises(CheckpointError, match="teacher: expected one that observes"):
         check_teacher(blind)
     remembers = TEACHER._replace(config=dataclasses.replace(TEACHER.config, memory_size=8))
     with pytest.raises(CheckpointError, match="teacher: memory_size: found 8, expected 0"):
         check_teacher(remembers)
+    unknown = {name: value for name, value in TEACHER.meta.items() if name != "model"}
+    with pytest.raises(CheckpointError, match="teacher: model: found none"):
+        check_teacher(TEACHER._replace(meta=unknown))
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"critic_sees_state": False, "state_coef": 0.0}, "critic_sees_state: found False"),
+        ({"memory_size": 0, "num_envs": 6, "num_minibatches": 4}, "num_minibatches: found 4"),
+    ],
+)
+def test_a_configuration_without_a_lesson_is_refused(changes, expected):
+    config = dataclasses.replace(make_config(2), **changes)
+    with pytest.raises(ConfigError, match=expected):
+        distill(ENV, check_teacher(TEACHER), config, seed=0)
