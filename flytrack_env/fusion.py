@@ -151,7 +151,11 @@ def _jvp(primals, tangents):  # type: ignore[no-untyped-def]
 
 
 def _transpose(cotangents, *leaves):  # type: ignore[no-untyped-def]
-    return cotangents
+    # What comes back is shared, too: by all that a value was computed from.
+    given = [i for i, one in enumerate(cotangents) if type(one) is not ad.Zero]
+    fenced = _compute_once_p.bind(*(cotangents[i] for i in given)) if given else []
+    fenced_at = dict(zip(given, fenced, strict=True))
+    return [fenced_at.get(i, one) for i, one in enumerate(cotangents)]
 
 
 def _prune(is_used, equation):  # type: ignore[no-untyped-def]
