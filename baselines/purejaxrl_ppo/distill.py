@@ -61,9 +61,7 @@ CONFIG = Config(
     critic_sees_state=True,
     state_coef=0.1,
 )
-TEACHER_FLIES = (
-    0.2  # of the updates, in which the share of drones that the teacher flies falls to 0
-)
+TEACHER_FLIES = 0.2  # of the updates; in these the teacher flies ever fewer of the drones
 NOISE = 0.05  # standard deviation added to flown actions, so that more states are seen
 
 
