@@ -281,6 +281,7 @@ def test_heading_interpolated_across_its_wrap(flights):
 # --- thrust and motors ----------------------------------------------------------------------------
 
 THRUSTS = [("range", "pwm"), ("range", "0..1"), ("axes", "-")]
+CHANGED_RANGE = Change("u_thrust", "range", "0..1")
 
 
 @pytest.mark.parametrize("has_force", [True, False])
@@ -293,6 +294,16 @@ def test_range_and_sign_of_thrust(flights, kind, has_force):
     for how, value in THRUSTS:
         change = Change("u_thrust", how, value)
         assert found(changed(flights[kind], change).log) == [change]
+
+
+@pytest.mark.parametrize(("span", "changes"), [(0.2, []), (0.3, [CHANGED_RANGE])])
+def test_a_race_at_full_thrust_shows_no_range(flights, span, changes):
+    log = flights["race"].log
+    slow = np.sin(np.linspace(0.0, 40.0 * np.pi, len(log)))
+    thrust = 1.0 - 0.5 * span * (1.0 + slow)
+    force = np.outer(25.0 * thrust**2, [0.0, 0.0, 1.0])  # steep, as if 0 were no thrust
+    sticks = np.column_stack([log["u"][:, :3], thrust])
+    assert thrust_changes(with_channels(log, u=sticks, f=force)) == changes
 
 
 @pytest.mark.parametrize("kind", ["race", "excitation"])
