@@ -18,7 +18,7 @@ CLEAR, FLOWN = 0.9, (0.02, 0.98)  # correlation, and quantiles of the commands, 
 MIN_SPREAD = 0.5  # m/s^2, rms of the force about its mean: less is drag and noise
 PWM = (900.0, 2200.0)  # us, all that flight controllers use
 # Of the commands by which a range shows. In races at full thrust they span less: 0.17, 0.17, 0.21
-# and 0.25 in those of 16 that passed for 0..1 (benchmarks.adapt, seed 0). In 20 of 24 flights
+# and 0.25 in those of 19 that passed for 0..1 (benchmarks.adapt, seed 0). In 20 of 24 flights
 # (benchmarks.seams) the motion shows the range; true 0..1 spans 0.23 or more there.
 MIN_SPAN = 0.22
 MOTOR_LAG_S = 0.03
