@@ -13,9 +13,9 @@ from flytrack_env.scene import gates_of, rotations
 from flytrack_env.state import POSITION, QUATERNION
 from flytrack_env.tracks import Course
 
-STEPS_PER_FRAME = 4  # of 0.01 s
-VIEW_WIDTH, VIEW_HEIGHT = WIDTH_PX * 3 // 4, HEIGHT_PX * 3 // 4  # of each half of a picture
-MASK_WIDTH = 128
+STEPS_PER_FRAME = 6  # of 0.01 s
+VIEW_WIDTH, VIEW_HEIGHT = WIDTH_PX * 5 // 8, HEIGHT_PX * 5 // 8  # of each half of a picture
+MASK_WIDTH = 96
 MARGIN, DOT = 8, 4
 
 
@@ -56,7 +56,7 @@ def _onboard_camera(state: np.ndarray, width: int, height: int) -> Camera:
 
 
 def make_onboard_gif(course: Course, rows: np.ndarray, film: Film) -> bytes:
-    """Return a flight as an animated GIF, 960 x 360 pixels, at the speed at which it was flown.
+    """Return a flight as an animated GIF, 800 x 300 pixels, at the speed at which it was flown.
 
     From behind at the left; at the right what the camera sees, with the corners in it, and the mask
     in a corner.

@@ -159,8 +159,10 @@ def _compare_forces(log: FlightLog, rates: np.ndarray) -> tuple[Pair | None, np.
     values = np.stack([one.values for one in known.values()], axis=1)
     is_allowed = allowed(values)
     if "f" in log and not is_allowed.flat[0]:  # nothing contradicts that a bias explains
-        found = [compare_forces(log, attitudes[number], with_bias=True) for number in known]
-        is_allowed |= allowed(np.stack([one.values for one in found if one is not None], axis=1))
+        comparisons = [compare_forces(log, attitudes[number], with_bias=True) for number in known]
+        is_allowed |= allowed(
+            np.stack([one.values for one in comparisons if one is not None], axis=1)
+        )
     evidence = values.sum(axis=0)
     if evidence.max() - evidence.flat[0] < FORCE_MARGIN:
         is_allowed.flat[0] = True

@@ -60,8 +60,8 @@ def test_every_id_follows_gymnaxs_protocol(env_id):
 def test_an_argument_of_none_is_the_ids_own(env_id):
     nothing = dict.fromkeys(ARGUMENTS)
     assert repr(make(env_id, **nothing)) == repr(make(env_id))
-    given, own = (make(env_id, **arguments).default_params for arguments in (nothing, {}))
-    chex.assert_trees_all_equal(given, own)
+    without, default = (make(env_id, **arguments).default_params for arguments in (nothing, {}))
+    chex.assert_trees_all_equal(without, default)
 
 
 @OVER_IDS

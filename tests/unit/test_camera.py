@@ -255,7 +255,7 @@ def test_what_a_camera_saw_is_shown_in_recordings_and_pictures(tmp_path):
     states, actions = ghost_rollout(shipped_references(track, ("nominal",)), 24)
     flight = make_flight("ghost", states, actions, track)
     with open_image(write_camera_view(flight, tmp_path)) as gif:
-        assert gif.n_frames == 6 and gif.size == (960, 360)
+        assert gif.n_frames == 4 and gif.size == (800, 300)
     sizes = []
     for with_camera in (False, True):
         path = tmp_path / f"{with_camera}.rrd"
