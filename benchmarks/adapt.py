@@ -127,15 +127,24 @@ def figures(plants: list[Line], unchanged: list[Line]) -> list[report.Figure]:
         for low, high in [one["expected_lap_s"]]
     ]
     cpu_s = [one["cpu_s"] for one in plants]
+    # A law of the policy's model that is not in the plant is a difference, and is to be named.
+    known = load_checkpoint(POLICY).meta["model"]["effects"]
     invented = [
-        any(name in BY_NAME and f"{name}(" not in one["hidden"] for name in one["named"])
+        any(
+            name in BY_NAME and name not in known and f"{name}(" not in one["hidden"]
+            for name in one["named"]
+        )
         for one in plants
     ]
     kept = [one["is_new"] is False and one["verdict"] == "consistent" for one in unchanged]
     return [
         *lines,
         count_true("mean flying lap within what was expected of a flight", "", inside),
-        count_true("hidden plants with a named effect that is not in them", "none", invented),
+        count_true(
+            "hidden plants with a named effect that neither they nor the policy's model have",
+            "none",
+            invented,
+        ),
         report.Figure(
             "CPU s from log to policy, median (all)",
             "60",

@@ -60,6 +60,7 @@ from flytrack_sysid.inference.search import (
     FittedModel,
     SearchState,
     extended,
+    with_given_laws,
     with_refitted_noise,
 )
 from flytrack_sysid.inference.torque import torque_notes
@@ -135,7 +136,7 @@ def diagnose(
         report(1, len(STAGES))
         state, base = begun(parts)
         show(FirstLook.of(state, base))
-        selection = select(*extended(state, base, base))
+        selection = select(*extended(state, base, with_given_laws(state, base)))
         # Timestamps identify continuous motion and late poses; the two discrete integrators differ
         # only in their residuals. A measured log is continuous, and never gets here.
         motion_estimate = parts.motion_estimate
@@ -148,7 +149,7 @@ def diagnose(
             if likelier is not parts.motion_estimate.motion:
                 parts = split(log, model, held_out, likelier)
                 state, base = begun(parts)
-                selection = select(*extended(state, base, base))
+                selection = select(*extended(state, base, with_given_laws(state, base)))
         report(2, len(STAGES))
         selection = with_changes(selection, parts.test, parts.log)
         test = held_out_under(selection, parts.test)

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
-from flytrack_env.effects import Effect, takes_motors
+from flytrack_env.effects import BY_NAME, Effect, takes_motors
 from flytrack_sysid.inference import noise as noises
 from flytrack_sysid.inference.chunks import measured_voltage_range
-from flytrack_sysid.inference.parameters import DRAIN, base_of
+from flytrack_sysid.inference.parameters import DRAIN, base_of, neutral_value
 from flytrack_sysid.inference.problem import NUM_PAIRS, SEARCHED, Problem
 from flytrack_sysid.inference.score_test import (
     Candidate,
@@ -24,7 +24,7 @@ from flytrack_sysid.inference.torque import unseen_in_chunks
 from flytrack_sysid.log import FlightLog
 
 PER_PARAMETER = 4.0  # of chi2: the gain that one more parameter needs to be preferred
-MAX_EFFECTS = 6  # of a model
+MAX_EFFECTS = 6  # of a model, besides the laws that the given one has
 # of the best gain: candidates this close to first order are refitted before one is chosen
 CLOSE = 0.6
 MAX_REFITTED = 4  # candidates of a round
@@ -385,7 +385,7 @@ def add_best(
 
 def add_effects(state: SearchState, model: FittedModel) -> tuple[SearchState, FittedModel]:
     """Add effects while one explains enough, best first; return the same model if none does."""
-    while len(model.candidates) < MAX_EFFECTS:
+    while len(model.effects.difference(state.problem.given_effects)) < MAX_EFFECTS:
         state, linearization = state.linearized(model.vector)
         extended_model = add_best(state, linearization, model)
         if extended_model is None:
@@ -417,6 +417,38 @@ def with_refitted_noise(state: SearchState, model: FittedModel) -> tuple[SearchS
     state = state.with_noise(noises.fit_noise(state.problem.chunks, residuals, state.problem.noise))
     state, linearization = state.linearized(model.vector)
     return state, state.fitted(model.candidates, model.vector, linearization)
+
+
+def given_laws(problem: Problem) -> list[Candidate]:
+    """Return a candidate of each law that the given model has, with all that it sets.
+
+    Settings of the craft are not laws: they are searched for one by one.
+    """
+    laws: dict[str, Candidate] = {}
+    for candidate in candidates_for(problem):
+        effect = BY_NAME[candidate.effect]
+        if effect.name not in problem.given_effects or effect.search.is_setting:
+            continue
+        own = [f"{effect.name}.{field}" for field in effect.ranges]
+        starts = dict(zip(own, problem.start[problem.parameter_indices(own)], strict=True))
+        is_set = {field for field, start in starts.items() if start != neutral_value(field)}
+        if is_set <= {*candidate.fields}:
+            laws.setdefault(effect.name, candidate)
+    return list(laws.values())
+
+
+def with_given_laws(state: SearchState, base: FittedModel) -> FittedModel:
+    """Return the base with the laws of the given model refitted; the base if it has none.
+
+    A plant without a law of the given model differs by that law. A search that adds laws first
+    finds one that undoes it, such as a drag that accelerates, and does not leave it again.
+    """
+    laws = [
+        candidate
+        for candidate in given_laws(state.problem)
+        if candidate.effect not in state.unobservable and {*state.held}.isdisjoint(candidate.fields)
+    ]
+    return state.fitted(laws, base.vector) if laws else base
 
 
 def extended(

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from benchmarks.diagnosis import model_of
 from flytrack.cli import main
-from flytrack_env.effects import LinearDrag
+from flytrack_env.effects import CommandDelay, LinearDrag, RotorDrag, Wind
 from flytrack_sysid.diagnosis import DiagnosisError, diagnose, joined, onset, vetoes
 from flytrack_sysid.diagnosis.craft import summarize_half_responses
 from flytrack_sysid.diagnosis.diagnose import thinning_warning, unused_channels
@@ -39,7 +39,7 @@ from flytrack_sysid.inference.parameters import DRAIN, THRUST_COEFFS
 from flytrack_sysid.inference.problem import Problem, Window
 from flytrack_sysid.inference.record import make_record
 from flytrack_sysid.inference.score_test import Linearization
-from flytrack_sysid.inference.search import FittedModel, SearchState
+from flytrack_sysid.inference.search import FittedModel, SearchState, given_laws
 from flytrack_sysid.log_file import save_log
 from tests.support.compiling import programs
 from tests.support.hidden_flights import scripted
@@ -93,6 +93,21 @@ def disturbed(chunks):
     direct = acting + DIRECT * rng.standard_normal((count, NUM_AXES))
     series = np.stack([direct, np.diff(level, axis=0, prepend=level[:1])], axis=-1)
     return series[chunks.row] * chunks.is_joined[..., None, None]
+
+
+def test_a_given_law_is_refitted_with_what_it_sets(flown, chunks):
+    """An air that moves is no steady push; a delay of thrust alone is one of all commands, too."""
+    model = model_of(flown[0]).with_effects(
+        RotorDrag(0.01), Wind(v_x=2.0), CommandDelay(delay_s=0.01, thrust_extra_s=0.02)
+    )
+    with jax.enable_x64(True):
+        laws = given_laws(Problem.of(chunks, model))
+    fields = {law.effect: {name.partition(".")[2] for name in law.fields} for law in laws}
+    assert fields == {
+        "rotor_drag": {"h"},
+        "wind": {"v_x", "v_y", "v_z"},
+        "command_delay": {*CommandDelay._fields},
+    }
 
 
 def test_the_noise_of_residuals_is_found_again(chunks, disturbed):
