@@ -6,7 +6,7 @@ refitted base model, without any name, policies that were trained once for any p
 (``benchmarks.adapt_rivals``), and the limit: the same descent, longer, on the plant itself. Between
 them come plants without effects that the policy claims to be made for: nothing is to be adapted to.
 Appends a line a trial to docs/results/adapt.jsonl, and a later run resumes there; ``--page`` writes
-docs/results/adapt.md.
+docs/results/adapt.md from the last commit of each kind of trial.
 """
 
 import time
@@ -218,6 +218,7 @@ def write_page(lines: list[Line]) -> None:
     text += f", and {refused} more refused." if refused else "."
     if found:
         text += f" Something was found on {'; '.join(found)}."
+    commits = {line["kind"]: line["commit"] for line in lines}
     trials = list_trials(lines[0]["seconds"], lines[0]["seed"])
     planned = sum(trial.kind == PLANT for trial in trials)
     report.fill_page(
@@ -232,7 +233,7 @@ def write_page(lines: list[Line]) -> None:
         f"before the run was stopped, {len(plants) - len(whole)} of them refused as a log.",
         plants=plants_table(plants),
         unchanged=text,
-        commit=lines[-1]["commit"],
+        commits=", ".join(f"{kind} {commit}" for kind, commit in commits.items()),
         machine=lines[-1]["machine"],
     )
 
@@ -342,7 +343,9 @@ def main(
     kinds: of trials that are run.
     """
     if page:
-        write_page(report.lines_of_commit(LINES))
+        lines = report.lines_in(LINES)
+        last = {line["kind"]: line["commit"] for line in lines}
+        write_page([line for line in lines if line["commit"] == last[line["kind"]]])
     else:
         trials = [trial for trial in list_trials(seconds, seed) if trial.kind in kinds]
         report.record_trials(LINES, trials, measure_trial, 1, jobs)

@@ -187,7 +187,7 @@ def section_of(name: str, seeds: list[int]) -> tuple[str, bool]:
         f"PPO on {recipe.env_id}, {recipe.config.total_timesteps / 1e6:.0f} M steps, "
         f"{report.list_settings(CHANGES | recipe.changes)}; "
         f"polishing: {report.list_settings(recipe.settings._asdict())}. "
-        f"Shipped: a seed {shipped_seed}.",
+        f"The shipped one is of seed {shipped_seed}.",
         report.figures_table(figures),
         report.table(
             HEADER,
