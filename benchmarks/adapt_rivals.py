@@ -1,17 +1,14 @@
-"""Policies that are trained once, for any plant: ``python -m benchmarks.adapt_rivals``.
+"""Policies that are trained once, for plants around a model: ``python -m benchmarks.adapt_rivals``.
 
 They are made as ``robust`` is (``benchmarks.champion``), PPO and then polishing, from the same
 model. Three learn from plants that differ from it by up to 10, 20 and 30 % in mass, each lag and
-the size of each effect (R. Ferede et al., "One net to rule them all", 2025, draws all parameters in
-this way). One learns from the plants of ``robust`` and remembers its flight, so that it may adapt
-to its plant by itself. What is in runs/adapt is not trained again.
+the size of each effect, as R. Ferede et al. draw parameters ("One net to rule them all", 2025).
+Rates, the shape of the thrust map and effects that the model lacks are not drawn. What is in
+runs/adapt is not trained again.
 """
 
-from collections.abc import Callable
 from contextlib import closing
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +17,8 @@ import numpy as np
 import flytrack_env
 from baselines.purejaxrl_ppo import Config, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import describe_run, save_checkpoint
-from baselines.purejaxrl_ppo.checkpoint_env import draw_model
 from baselines.purejaxrl_ppo.networks import Policy
-from baselines.purejaxrl_ppo.polish import LostError, polish
+from baselines.purejaxrl_ppo.polish import polish
 from baselines.purejaxrl_ppo.ppo import make_network_for, make_ppo
 from baselines.purejaxrl_ppo.training import training_params
 from benchmarks import report
@@ -35,26 +31,10 @@ from flytrack_env.wrappers.domain_randomization import sample_model
 RUNS = Path("runs/adapt")
 SEED, STEPS = 0, 40_000_000
 ROBUST = RECIPES["robust"]
-MEMORY = 64  # numbers that the recurrent policy remembers
-Draw = Callable[[jax.Array, ModelParameters], ModelParameters]
+SHARES = {"randomised 10 %": 0.1, "randomised 20 %": 0.2, "randomised 30 %": 0.3}  # name -> share
 
 
-class Rival(NamedTuple):
-    """How a policy is made: share by which plants differ, None for those of robust; its memory."""
-
-    share: float | None
-    memory_size: int = 0
-
-
-RIVALS = {
-    "randomised 10 %": Rival(0.1),
-    "randomised 20 %": Rival(0.2),
-    "randomised 30 %": Rival(0.3),
-    "recurrent": Rival(None, MEMORY),
-}
-
-
-def ranges_of(share: float, model: ModelParameters) -> RandomizationParams:
+def make_ranges(share: float, model: ModelParameters) -> RandomizationParams:
     """Return ranges in which mass, lags and effects of a model differ from it by up to a share."""
     low, high = 1.0 - share, 1.0 + share
     effects = model.effects  # those that the model has are scaled, whatever their bounds here
@@ -71,17 +51,14 @@ def draw_within(
 
 def train_rival(name: str) -> Path:
     """Train a policy unless it is there; return its file."""
-    path, rival = RUNS / f"{name.replace(' %', '').replace(' ', '_')}.safetensors", RIVALS[name]
+    path = RUNS / f"{name.replace(' %', '').replace(' ', '_')}.safetensors"
     if path.exists():
         return path
-    changes: dict[str, Any] = {**CHANGES, **ROBUST.changes, "memory_size": rival.memory_size}
-    config = Config(total_timesteps=STEPS, **changes)
+    config = Config(total_timesteps=STEPS, **CHANGES, **ROBUST.changes)
     env = flytrack_env.make(ROBUST.env_id, model=MODEL, reward=REWARD)
-    params, draw = training_params(env, config), draw_model
-    if rival.share is not None:
-        ranges = ranges_of(rival.share, params.model)
-        params = params.replace(wrappers={**params.wrappers, DomainRandomization.key: ranges})
-        draw = partial(draw_within, ranges)
+    params = training_params(env, config)
+    ranges = make_ranges(SHARES[name], params.model)
+    params = params.replace(wrappers={**params.wrappers, DomainRandomization.key: ranges})
     ppo = make_ppo(env, params, config)
     runner, update = jax.jit(ppo.start)(jax.random.key(SEED)), jax.jit(ppo.update, donate_argnums=0)
     with closing(progress_bar("updates", config.num_updates, desc=name)) as bar:
@@ -92,17 +69,14 @@ def train_rival(name: str) -> Path:
     race = flytrack_env.make("FlyTrack-v0", model=MODEL)
     model = jax.tree.map(jnp.asarray, race.default_params.model)
     trained = Policy(network, runner.train_state.params)
-    try:
-        final = polish(
-            race,
-            trained,
-            SEED,
-            ROBUST.settings,
-            lambda key, done: draw(key, model),
-            ProgressBar("updates"),
-        )
-    except LostError:  # it stays as PPO left it
-        final = trained.params
+    final = polish(
+        race,
+        trained,
+        SEED,
+        ROBUST.settings,
+        lambda key, done: draw_within(ranges, key, model),
+        ProgressBar("updates"),
+    )
     description = describe_run(race, "FlyTrack-v0", "flytrack", config, SEED)
     save_checkpoint(path, final, config, description)
     return path
@@ -110,8 +84,7 @@ def train_rival(name: str) -> Path:
 
 def main() -> None:
     """Train the policies that are missing."""
-    RUNS.mkdir(parents=True, exist_ok=True)
-    for name in RIVALS:
+    for name in SHARES:
         policy = load_checkpoint(train_rival(name))
         size = sum(np.size(leaf) for leaf in jax.tree.leaves(policy.policy.params))
         print(f"{name}: {policy.path}, {size} parameters")

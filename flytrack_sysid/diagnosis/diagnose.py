@@ -60,7 +60,7 @@ from flytrack_sysid.inference.search import (
     FittedModel,
     SearchState,
     extended,
-    with_given_laws,
+    with_given_refitted,
     with_refitted_noise,
 )
 from flytrack_sysid.inference.torque import torque_notes
@@ -136,7 +136,7 @@ def diagnose(
         report(1, len(STAGES))
         state, base = begun(parts)
         show(FirstLook.of(state, base))
-        selection = select(*extended(state, base, with_given_laws(state, base)))
+        selection = select(*extended(*with_given_refitted(state, base)))
         # Timestamps identify continuous motion and late poses; the two discrete integrators differ
         # only in their residuals. A measured log is continuous, and never gets here.
         motion_estimate = parts.motion_estimate
@@ -149,7 +149,7 @@ def diagnose(
             if likelier is not parts.motion_estimate.motion:
                 parts = split(log, model, held_out, likelier)
                 state, base = begun(parts)
-                selection = select(*extended(state, base, with_given_laws(state, base)))
+                selection = select(*extended(*with_given_refitted(state, base)))
         report(2, len(STAGES))
         selection = with_changes(selection, parts.test, parts.log)
         test = held_out_under(selection, parts.test)

@@ -295,8 +295,7 @@ def with_moving_air(state: SearchState, model: FittedModel) -> list[FittedModel]
     """Return a model of drag and a steady push, refitted with each law of drag and moving air.
 
     Without drag a wind is a push, and where it is found first it stays one. Beside the wrong law of
-    drag that is a local minimum: neither the law nor the wind can be swapped alone. A drag that the
-    given model has is not touched.
+    drag that is a local minimum: neither the law nor the wind can be swapped alone.
     """
     by_name = {candidate.effect: candidate for candidate in model.candidates}
     is_push = "wind" in by_name and by_name["wind"].fields != MOVING_AIR.fields

@@ -24,7 +24,7 @@ from flytrack_sysid.inference.torque import unseen_in_chunks
 from flytrack_sysid.log import FlightLog
 
 PER_PARAMETER = 4.0  # of chi2: the gain that one more parameter needs to be preferred
-MAX_EFFECTS = 6  # of a model, besides the laws that the given one has
+MAX_EFFECTS = 6  # of a model, besides those that the given one has
 # of the best gain: candidates this close to first order are refitted before one is chosen
 CLOSE = 0.6
 MAX_REFITTED = 4  # candidates of a round
@@ -419,12 +419,13 @@ def with_refitted_noise(state: SearchState, model: FittedModel) -> tuple[SearchS
     return state, state.fitted(model.candidates, model.vector, linearization)
 
 
-def given_laws(problem: Problem) -> list[Candidate]:
-    """Return a candidate of each law that the given model has, with all that it sets.
+def candidates_of_given(problem: Problem) -> list[Candidate]:
+    """Return a candidate of each effect that the given model has, with all that it sets there.
 
-    Settings of the craft are not laws: they are searched for one by one.
+    Settings of the craft are left out: they are searched for one by one. So is an effect of which
+    no candidate has all that is set, as a wind that both pushes and moves the air.
     """
-    laws: dict[str, Candidate] = {}
+    found: dict[str, Candidate] = {}
     for candidate in candidates_for(problem):
         effect = BY_NAME[candidate.effect]
         if effect.name not in problem.given_effects or effect.search.is_setting:
@@ -433,22 +434,27 @@ def given_laws(problem: Problem) -> list[Candidate]:
         starts = dict(zip(own, problem.start[problem.parameter_indices(own)], strict=True))
         is_set = {field for field, start in starts.items() if start != neutral_value(field)}
         if is_set <= {*candidate.fields}:
-            laws.setdefault(effect.name, candidate)
-    return list(laws.values())
+            found.setdefault(effect.name, candidate)
+    return list(found.values())
 
 
-def with_given_laws(state: SearchState, base: FittedModel) -> FittedModel:
-    """Return the base with the laws of the given model refitted; the base if it has none.
+def with_given_refitted(
+    state: SearchState, base: FittedModel
+) -> tuple[SearchState, FittedModel, FittedModel]:
+    """Return the state, the base, and the base with the given model's effects refitted.
 
-    A plant without a law of the given model differs by that law. A search that adds laws first
-    finds one that undoes it, such as a drag that accelerates, and does not leave it again.
+    A plant without an effect of the given model differs by that effect. A search that adds effects
+    first finds one that undoes it, such as a drag that accelerates, and does not leave it again.
     """
-    laws = [
+    candidates = [
         candidate
-        for candidate in given_laws(state.problem)
+        for candidate in candidates_of_given(state.problem)
         if candidate.effect not in state.unobservable and {*state.held}.isdisjoint(candidate.fields)
     ]
-    return state.fitted(laws, base.vector) if laws else base
+    if not candidates:
+        return state, base, base
+    state, model = with_refitted_noise(state, state.fitted(candidates, base.vector))
+    return state, state.fitted((), base.vector), model
 
 
 def extended(

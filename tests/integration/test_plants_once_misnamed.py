@@ -4,16 +4,13 @@ The drawn ones were found by drawing plants that no rule was made on. Logs 52 an
 the suite misspec-v1. Each chose a rule since.
 """
 
-from dataclasses import replace
-
 import pytest
 
 from baselines.purejaxrl_ppo import load_checkpoint
-from benchmarks.adapt import fly
+from benchmarks import adapt
+from benchmarks.adapt import fly, make_plant
 from benchmarks.diagnosis import Trial, make_log
 from benchmarks.motors import nominal_model
-from flytrack_bench import load_suite
-from flytrack_bench.hidden import HiddenPlant
 from flytrack_bench.misspec.suite import load_log_suite
 from flytrack_env.effects import BY_NAME
 from flytrack_env.model_file import model_from_json
@@ -82,17 +79,16 @@ def test_logs_of_the_suite(log: str, names: set[str]) -> None:
     assert found.unexplained.flagged  # gusts, or the thermal
 
 
-def test_laws_of_the_given_model_that_are_not_in_the_plant() -> None:
+def test_effects_of_the_given_model_that_are_not_in_the_plant() -> None:
     """A drag that accelerates and a wind of 9 m/s had passed for rotor drag that is not there."""
-    policy, number = load_checkpoint("robust"), 2
-    plant = load_suite("v1").chosen((f"plant_{number}",))[0].craft
-    flown_by_it = HiddenPlant(replace(plant, motion="semi_implicit"))
-    log = fly(flown_by_it, policy, seconds=10.0, seed=0)
+    policy, seconds = load_checkpoint("robust"), 10.0
+    plant = make_plant(adapt.Trial(adapt.PLANT, 2, "semi_implicit", seconds, 0))
+    log = fly(plant, policy, seconds, seed=0)
     model = model_from_json(policy.meta["model"], "model")
     causes = {cause.effect: cause for cause in diagnose(log, model).causes}
     given = {"rotor_drag", "quadratic_drag", "translational_lift"}
     assert given <= causes.keys()
-    assert {name for name in causes if name in BY_NAME} <= given | plant.effects.keys() | {
+    assert {name for name in causes if name in BY_NAME} <= given | plant.truth.effects.keys() | {
         "thrust_scale"
     }
     low, high = causes["rotor_drag"].parameters["h"].ci95

@@ -39,7 +39,7 @@ from flytrack_sysid.inference.parameters import DRAIN, THRUST_COEFFS
 from flytrack_sysid.inference.problem import Problem, Window
 from flytrack_sysid.inference.record import make_record
 from flytrack_sysid.inference.score_test import Linearization
-from flytrack_sysid.inference.search import FittedModel, SearchState, given_laws
+from flytrack_sysid.inference.search import FittedModel, SearchState, candidates_of_given
 from flytrack_sysid.log_file import save_log
 from tests.support.compiling import programs
 from tests.support.hidden_flights import scripted
@@ -95,14 +95,14 @@ def disturbed(chunks):
     return series[chunks.row] * chunks.is_joined[..., None, None]
 
 
-def test_a_given_law_is_refitted_with_what_it_sets(flown, chunks):
+def test_a_given_effect_is_refitted_with_what_it_sets(flown, chunks):
     """An air that moves is no steady push; a delay of thrust alone is one of all commands, too."""
     model = model_of(flown[0]).with_effects(
         RotorDrag(0.01), Wind(v_x=2.0), CommandDelay(delay_s=0.01, thrust_extra_s=0.02)
     )
     with jax.enable_x64(True):
-        laws = given_laws(Problem.of(chunks, model))
-    fields = {law.effect: {name.partition(".")[2] for name in law.fields} for law in laws}
+        found = candidates_of_given(Problem.of(chunks, model))
+    fields = {one.effect: {name.partition(".")[2] for name in one.fields} for one in found}
     assert fields == {
         "rotor_drag": {"h"},
         "wind": {"v_x", "v_y", "v_z"},
