@@ -147,8 +147,8 @@ def figures(plants: list[Line], unchanged: list[Line]) -> list[report.Figure]:
         for low, high in [one["expected_lap_s"]]
     ]
     cpu_s = [one["cpu_s"] for one in plants]
-    # A law of the policy's model that is not in the plant is a difference, and is to be named. So is
-    # a scale of the thrust: the thrust map of each plant differs from the model's.
+    # A law of the policy's model that is not in the plant is a difference, and is to be named. So
+    # is a scale of the thrust: the thrust map of each plant differs from the model's.
     known = {*load_checkpoint(POLICY).meta["model"]["effects"], "thrust_scale"}
     invented = [
         any(
