@@ -44,7 +44,7 @@ POLICY, DT_S, NUM_LAPS, NUM_STEPS = "robust", 0.01, 25, 1000
 Kind = Literal["plant", "unchanged", "rivals"]
 PLANT: Kind = "plant"
 UNCHANGED: Kind = "unchanged"
-RIVAL: Kind = "rivals"
+RIVALS: Kind = "rivals"
 NUM_PLANTS, NUM_UNCHANGED = 8, 20
 LIMIT = "limit"
 ENTRIES = ("nothing", *SHARES, "refitted base", "adapted", LIMIT)
@@ -77,7 +77,7 @@ def list_trials(seconds: float, seed: int) -> list[Trial]:
     ]
     mixed = []
     for index, trial in enumerate(plants):
-        rivals = trial._replace(kind=RIVAL)
+        rivals = trial._replace(kind=RIVALS)
         mixed += [trial, rivals, *unchanged[2 * index : 2 * index + 2]]
     return mixed
 
@@ -206,7 +206,7 @@ def write_page(lines: list[Line]) -> None:
     failed = sum("error" in one for one in lines)
     lines = [one for one in lines if "error" not in one]
     of_rivals = {
-        (one["number"], one["motion"]): one["entries"] for one in lines if one["kind"] == RIVAL
+        (one["number"], one["motion"]): one["entries"] for one in lines if one["kind"] == RIVALS
     }
     plants = [
         {**one, "entries": one["entries"] | of_rivals.get((one["number"], one["motion"]), {})}
@@ -216,7 +216,7 @@ def write_page(lines: list[Line]) -> None:
     unchanged = [one for one in lines if one["kind"] == UNCHANGED]
     whole = [one for one in plants if "is_new" in one]
     judged = [one for one in unchanged if "is_new" in one]
-    found = [
+    deviations = [
         f"{one['motion']} {one['number']}: {', '.join(one['named']) or one['verdict']}"
         for one in judged
         if one["verdict"] != "consistent"
@@ -224,8 +224,8 @@ def write_page(lines: list[Line]) -> None:
     refused = len(unchanged) - len(judged)
     text = f"{len(judged)} of {NUM_UNCHANGED} were flown"
     text += f", and {refused} more refused." if refused else "."
-    if found:
-        text += f" Something was found on {'; '.join(found)}."
+    if deviations:
+        text += f" Something was found on {'; '.join(deviations)}."
     commits = {line["kind"]: line["commit"] for line in lines}
     trials = list_trials(lines[0]["seconds"], lines[0]["seed"])
     planned = sum(trial.kind == PLANT for trial in trials)
@@ -249,7 +249,7 @@ def write_page(lines: list[Line]) -> None:
 
 def measure_trial(trial: Trial) -> Line:
     """Return what is made of a trial's plant."""
-    kinds = {PLANT: measure_plant, UNCHANGED: measure_unchanged, RIVAL: measure_rivals}
+    kinds = {PLANT: measure_plant, UNCHANGED: measure_unchanged, RIVALS: measure_rivals}
     return kinds[trial.kind](trial)
 
 
@@ -261,7 +261,7 @@ def make_plant(trial: Trial) -> HiddenPlant:
 
 
 def measure_rivals(trial: Trial) -> Line:
-    """Return the races of policies that were trained once, for any plant."""
+    """Return the races of policies that were trained once, for plants around a model."""
     plant = make_plant(trial)
     policies = {name: load_checkpoint(train_rival(name)) for name in SHARES}
     return {"entries": {name: raced(policy, plant) for name, policy in policies.items()}}
@@ -344,7 +344,7 @@ def main(
     seconds: float = 10.0,
     seed: int = 0,
     page: bool = False,
-    kinds: tuple[Kind, ...] = (PLANT, UNCHANGED, RIVAL),
+    kinds: tuple[Kind, ...] = (PLANT, UNCHANGED, RIVALS),
     jobs: report.JobFlags = report.IN_THIS_PROCESS,
 ) -> None:
     """Run the trials that are missing, or write the page of those that are there.
@@ -357,7 +357,7 @@ def main(
         last = {line["kind"]: line["commit"] for line in lines}
         write_page([line for line in lines if line["commit"] == last[line["kind"]]])
     else:
-        if RIVAL in kinds:
+        if RIVALS in kinds:
             for name in SHARES:
                 train_rival(name)
         trials = [trial for trial in list_trials(seconds, seed) if trial.kind in kinds]

@@ -142,7 +142,7 @@ def train(name: str, seed: int) -> tuple[Path, Path]:
     return before, after
 
 
-def row_of(name: str, after: Flown, before: Flown | None = None) -> list[str]:
+def format_row(name: str, after: Flown, before: Flown | None = None) -> list[str]:
     """Return the row of a seed, or of the shipped policy, in the table."""
     numbers, meta = after.evaluation.numbers, after.evaluation.checkpoint.meta
     return [
@@ -193,10 +193,10 @@ def section_of(name: str, seeds: list[int]) -> tuple[str, bool]:
             HEADER,
             [
                 *(
-                    row_of(str(seed), after, before)
+                    format_row(str(seed), after, before)
                     for seed, (before, after) in zip(seeds, flown, strict=True)
                 ),
-                row_of("shipped", shipped),
+                format_row("shipped", shipped),
             ],
         ),
         f"The same flights again, with more figures: `flytrack eval --checkpoint {path} "

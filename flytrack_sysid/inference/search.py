@@ -425,17 +425,17 @@ def candidates_of_given(problem: Problem) -> list[Candidate]:
     Settings of the craft are left out: they are searched for one by one. So is an effect of which
     no candidate has all that is set, as a wind that both pushes and moves the air.
     """
-    found: dict[str, Candidate] = {}
+    candidates: dict[str, Candidate] = {}
     for candidate in candidates_for(problem):
         effect = BY_NAME[candidate.effect]
         if effect.name not in problem.given_effects or effect.search.is_setting:
             continue
-        own = [f"{effect.name}.{field}" for field in effect.ranges]
-        starts = dict(zip(own, problem.start[problem.parameter_indices(own)], strict=True))
+        names = [f"{effect.name}.{field}" for field in effect.ranges]
+        starts = dict(zip(names, problem.start[problem.parameter_indices(names)], strict=True))
         is_set = {field for field, start in starts.items() if start != neutral_value(field)}
         if is_set <= {*candidate.fields}:
-            found.setdefault(effect.name, candidate)
-    return list(found.values())
+            candidates.setdefault(effect.name, candidate)
+    return list(candidates.values())
 
 
 def with_given_refitted(

@@ -101,8 +101,8 @@ def test_a_given_effect_is_refitted_with_what_it_sets(flown, chunks):
         RotorDrag(0.01), Wind(v_x=2.0), CommandDelay(delay_s=0.01, thrust_extra_s=0.02)
     )
     with jax.enable_x64(True):
-        found = candidates_of_given(Problem.of(chunks, model))
-    fields = {one.effect: {name.partition(".")[2] for name in one.fields} for one in found}
+        candidates = candidates_of_given(Problem.of(chunks, model))
+    fields = {one.effect: {name.partition(".")[2] for name in one.fields} for one in candidates}
     assert fields == {
         "rotor_drag": {"h"},
         "wind": {"v_x", "v_y", "v_z"},
