@@ -218,6 +218,14 @@ class FlightTest(NamedTuple):
         """Return the test with those cells added as evidence where a model beats the placebo."""
         return self._with_evidence(self.tested(vector))
 
+    def with_base(self, vector: np.ndarray) -> "FlightTest":
+        """Return the test with another base."""
+        return self._replace(base=self.tested(vector))
+
+    def prefers(self, vector: np.ndarray, other: np.ndarray) -> bool:
+        """Return whether the other model predicts a horizon worse than the base, this one none."""
+        return self.worst_ratio(vector) == 0.0 < self.worst_ratio(other)
+
     def _with_evidence(self, errors: FlightErrors) -> "FlightTest":
         gain = self.placebo.by_block(self.scale)[0] - errors.by_block(self.scale)[0]
         beats = sureness(gain) > SURE_OF_COMMANDS

@@ -8,7 +8,8 @@ therefore
 2. fits all parameters to the flights on the training rows,
 3. removes effects that make no flight better that was not fitted, or any horizon worse: flights of
    held-out rows, and to first order those of each block of training rows without this block,
-4. holds parameters at nominal that an effect does not need.
+4. holds parameters at nominal that an effect does not need,
+5. keeps the values of single steps where those of flights predict a held-out horizon worse.
 
 Flights without position and velocity show no force: the thrust map of single steps stands, since
 rates alone show only its ratio to inertia.
@@ -240,10 +241,15 @@ class _Refinement(NamedTuple):
             problem = widened(problem, stuck)
             target = target._replace(problem=problem)
             fit = target.fitted(fit.vector, fit.indices, MAX_ROUNDS)
-        flight_test = self.flight_test.seeing(fit.vector)
         base = target.fitted(self.base, self.indices(problem, ()), MAX_ROUNDS).vector
+        flight_test = self.flight_test.seeing(fit.vector)
         refined = unrefined._replace(fit=fit, base=base, problem=problem, flight_test=flight_test)
-        return self._eliminate(refined, fit, flight_test, target)
+        # What a fit to flights makes worse, it makes worse without the effects, too.
+        refined = self._eliminate(refined, fit, flight_test.with_base(base), target)
+        last, is_whole = refined.fit, refined.kept == candidates
+        if last is not None and is_whole and flight_test.prefers(extended, last.vector):
+            return refined._replace(fit=last._replace(vector=extended))
+        return refined
 
     def _eliminate(
         self, refined: Refined, fit: Fit, flight_test: FlightTest, target: Target
