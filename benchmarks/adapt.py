@@ -4,9 +4,10 @@ The shipped robust policy flies the hidden plants of suite v1 in three motions, 
 each by the log of that flight. Beside it fly the policy as it was, the same descent on the refitted
 base model, without any name, policies that were trained once for plants around its model
 (``benchmarks.adapt_rivals``), and the limit, a descent on the plant itself. Between them come
-plants without effects that the policy claims to be made for: nothing is to be adapted to. Appends a
-line a trial to docs/results/adapt.jsonl, and a later run resumes there; ``--page`` writes
-docs/results/adapt.md from the last commit of each kind of trial.
+plants without effects that the policy claims to be made for: nothing is to be adapted to. Last come
+configurations of real firmware (docs/firmware.md), whose settings are known. Appends a line a trial
+to docs/results/adapt.jsonl, and a later run resumes there; ``--page`` writes docs/results/adapt.md
+from the last commit of each kind of trial and length of a log.
 """
 
 import time
@@ -24,13 +25,16 @@ from baselines.purejaxrl_ppo.polish import LostError, polish
 from benchmarks import report
 from benchmarks.adapt_rivals import SHARES, train_rival
 from benchmarks.diagnosis import MOTION_OF, model_of
+from benchmarks.firmware import KINDS, SETUPS, of_settings_and_body
 from benchmarks.loop.plants import draw_base
 from benchmarks.report import Line
+from firmware import Betaflight, Body
 from flytrack_bench import load_suite
 from flytrack_bench.hidden import MOTIONS, HiddenPlant
-from flytrack_env import nominal_parameters
+from flytrack_env import ModelParameters, nominal_parameters
 from flytrack_env.effects import BY_NAME
 from flytrack_env.model_file import model_as_json, model_from_json
+from flytrack_env.plants import Plant
 from flytrack_loop import race
 from flytrack_loop.adapt import Adapted, Settings, adapt, improve
 from flytrack_loop.stages import BATCH, log_of_flights, rounded
@@ -41,10 +45,14 @@ from flytrack_sysid.sensors import measure
 
 LINES = report.RESULTS / "adapt.jsonl"
 POLICY, DT_S, NUM_LAPS, NUM_STEPS = "robust", 0.01, 25, 1000
-Kind = Literal["plant", "unchanged", "rivals"]
+SECONDS = 10.0  # of a log that refitted base and limit are made of, too
+Kind = Literal["plant", "unchanged", "rivals", "firmware"]
 PLANT: Kind = "plant"
 UNCHANGED: Kind = "unchanged"
 RIVALS: Kind = "rivals"
+FIRMWARE: Kind = "firmware"
+# Set-ups, and changes of the stock one.
+CONFIGURATIONS = (*SETUPS, "P and D term", "a weak motor", "drag", "mass", "bent thrust")
 NUM_PLANTS, NUM_UNCHANGED = 8, 20
 LIMIT = "limit"
 ENTRIES = ("nothing", *SHARES, "refitted base", "adapted", LIMIT)
@@ -79,10 +87,14 @@ def list_trials(seconds: float, seed: int) -> list[Trial]:
     for index, trial in enumerate(plants):
         rivals = trial._replace(kind=RIVALS)
         mixed += [trial, rivals, *unchanged[2 * index : 2 * index + 2]]
-    return mixed
+    firmware = [
+        Trial(FIRMWARE, number, "continuous", seconds, seed)
+        for number in range(len(CONFIGURATIONS))
+    ]
+    return [*mixed, *firmware]
 
 
-def fly(plant: HiddenPlant, policy: Checkpoint, seconds: float, seed: int) -> FlightLog:
+def fly(plant: Plant, motion: str, policy: Checkpoint, seconds: float, seed: int) -> FlightLog:
     """Return the log, by common sensors, of a policy's flights of a total length.
 
     An accelerometer feels the force in the axes in which it acts, which depend on the motion.
@@ -92,7 +104,7 @@ def fly(plant: HiddenPlant, policy: Checkpoint, seconds: float, seed: int) -> Fl
     log = log_of_flights(flights, DT_S, seed, seconds, noise=0.0)
     log = log.select(np.arange(len(log)) < round(seconds / DT_S))
     gravity = float(nominal_parameters().g)
-    if plant.truth.motion != "handout":
+    if motion != "handout":
         log = replace(log, channels={**log.channels, "a": felt_after_step(log, gravity)})
     return measure(log, 1.0, gravity, np.random.default_rng(seed))
 
@@ -107,7 +119,7 @@ def felt_after_step(log: FlightLog, gravity: float) -> np.ndarray:
     return (before * attitude.inv()).apply(lifted) - [0.0, 0.0, gravity]
 
 
-def raced(policy: Checkpoint, plant: HiddenPlant) -> Line:
+def raced(policy: Checkpoint, plant: Plant) -> Line:
     """Return the share of starts that finish, and the mean flying lap, s."""
     outcome = race(policy, plant_env(policy, plant), START_SEED, STARTS)
     return {"success": outcome.success, "flying_lap_s": rounded(outcome.flying_lap_s)}
@@ -201,10 +213,43 @@ def plants_table(plants: list[Line]) -> str:
     return report.table(header, rows)
 
 
+def lengths_table(plants: list[Line]) -> str:
+    """Return a row for each length of the log."""
+    rows = []
+    for seconds in sorted({one["seconds"] for one in plants}):
+        of_length = [one for one in plants if one["seconds"] == seconds]
+        flown = [one for one in of_length if "is_new" in one]
+        finish = sum(one["entries"]["adapted"]["success"] >= 0.99 for one in flown)
+        cpu_s = report.spread([one["cpu_s"] for one in flown]) if flown else "-"
+        refused = len(of_length) - len(flown)
+        rows.append([f"{seconds:g}", f"{finish} of {len(of_length)}", str(refused), cpu_s])
+    return report.table(["seconds", "99 % finish, adapted", "refused", "CPU s"], rows)
+
+
+def firmware_table(lines: list[Line]) -> str:
+    """Return a row for each configuration of the firmware."""
+    rows = []
+    for one in sorted(lines, key=lambda line: line["number"]):
+        entries, named = one["entries"], ", ".join(one.get("named", ())) or "nothing"
+        flown_s = entries.get("adapted", {}).get("flying_lap_s")
+        simulated_s = one.get("simulated_lap_s")
+        gap = f"{flown_s / simulated_s - 1.0:+.2%}" if flown_s and simulated_s else "-"
+        verdict = one.get("refused") or one["verdict"]
+        laps = [
+            format_lap(entries[name]) if name in entries else "-" for name in ("nothing", "adapted")
+        ]
+        rows.append([one["hidden"], verdict, named, *laps, gap, str(one.get("cpu_s", "-"))])
+    header = "configuration | verdict | named | nothing | adapted | gap to its simulator | CPU s"
+    return report.table(header, rows)
+
+
 def write_page(lines: list[Line]) -> None:
     """Write the page of lines."""
     failed = sum("error" in one for one in lines)
     lines = [one for one in lines if "error" not in one]
+    of_all_lengths = [one for one in lines if one["kind"] == PLANT]
+    firmware = [one for one in lines if one["kind"] == FIRMWARE]
+    lines = [one for one in lines if one["seconds"] == SECONDS]
     of_rivals = {
         (one["number"], one["motion"]): one["entries"] for one in lines if one["kind"] == RIVALS
     }
@@ -227,12 +272,12 @@ def write_page(lines: list[Line]) -> None:
     if deviations:
         text += f" Something was found on {'; '.join(deviations)}."
     commits = {line["kind"]: line["commit"] for line in lines}
-    trials = list_trials(lines[0]["seconds"], lines[0]["seed"])
+    trials = list_trials(SECONDS, lines[0]["seed"])
     planned = sum(trial.kind == PLANT for trial in trials)
     report.fill_page(
         report.RESULTS / "adapt.md",
         "adapt",
-        seconds=lines[0]["seconds"],
+        seconds=SECONDS,
         seed=lines[0]["seed"],
         starts=STARTS,
         limit_updates=LIMIT_SETTINGS.updates,
@@ -241,6 +286,8 @@ def write_page(lines: list[Line]) -> None:
         not_run=f"{len(plants)} of {planned} pairs of plant and motion were flown, "
         f"{len(plants) - len(whole)} of them refused as a log. Errors: {failed}.",
         plants=plants_table(plants),
+        lengths=lengths_table(of_all_lengths),
+        firmware=firmware_table(firmware),
         unchanged=text,
         commits=", ".join(f"{kind} {commit}" for kind, commit in commits.items()),
         machine=lines[-1]["machine"],
@@ -249,7 +296,12 @@ def write_page(lines: list[Line]) -> None:
 
 def measure_trial(trial: Trial) -> Line:
     """Return what is made of a trial's plant."""
-    kinds = {PLANT: measure_plant, UNCHANGED: measure_unchanged, RIVALS: measure_rivals}
+    kinds = {
+        PLANT: measure_plant,
+        UNCHANGED: measure_unchanged,
+        RIVALS: measure_rivals,
+        FIRMWARE: measure_firmware,
+    }
     return kinds[trial.kind](trial)
 
 
@@ -276,17 +328,11 @@ def improve_on_plant(policy: Checkpoint, plant: HiddenPlant, seed: int) -> Check
 def measure_plant(trial: Trial) -> Line:
     """Return what each way makes of a hidden plant's log."""
     plant, policy = make_plant(trial), load_checkpoint(POLICY)
-    log = fly(plant, policy, trial.seconds, trial.seed)
-    result: Line = {"hidden": plant.truth.text(), "flights": len(np.unique(log.segment))}
-    entries = result["entries"] = {"nothing": raced(policy, plant)}
-    begun_s = time.process_time()
-    try:
-        adapted = adapt(log, policy, trial.seed)
-    except ValueError as error:
-        return {**result, "refused": str(error)}
-    result["cpu_s"] = round(time.process_time() - begun_s, 1)
-    result |= about(adapted)
-    entries["adapted"] = raced(adapted.checkpoint, plant)
+    result, adapted = measure_adapted(trial, plant, policy)
+    result["hidden"] = plant.truth.text()
+    if adapted is None or trial.seconds != SECONDS:
+        return result
+    entries = result["entries"]
     refitted = adapt_to_base(policy, adapted.diagnosis, trial.seed)
     entries["refitted base"] = raced(refitted.checkpoint, plant)
     if trial.motion in WITH_LIMIT:
@@ -296,18 +342,53 @@ def measure_plant(trial: Trial) -> Line:
     return result
 
 
+def measure_firmware(trial: Trial) -> Line:
+    """Return what is made of a log of real firmware, whose settings are known, on a body."""
+    name = CONFIGURATIONS[trial.number]
+    changes = dict(SETUPS.get(name, {}))
+    if name in KINDS:
+        changes |= KINDS[name].draw(np.random.default_rng([trial.seed, trial.number]))
+    settings, body = of_settings_and_body(changes)
+    with Betaflight(settings, Body(**body), seed=trial.seed) as plant:
+        result, _ = measure_adapted(
+            trial, plant, load_checkpoint(POLICY), craft=plant.nominal_model()
+        )
+    return {**result, "hidden": name}
+
+
+def measure_adapted(
+    trial: Trial, plant: Plant, policy: Checkpoint, craft: ModelParameters | None = None
+) -> tuple[Line, Adapted | None]:
+    """Return what is made of a plant's log, and the adapted policy; None if the log is refused."""
+    log = fly(plant, trial.motion, policy, trial.seconds, trial.seed)
+    result: Line = {"flights": len(np.unique(log.segment))}
+    entries = result["entries"] = {"nothing": raced(policy, plant)}
+    begun_s = time.process_time()
+    try:
+        adapted = adapt(log, policy, trial.seed, craft=craft)
+    except ValueError as error:
+        return {**result, "refused": str(error)}, None
+    result["cpu_s"] = round(time.process_time() - begun_s, 1)
+    result |= about(adapted)
+    entries["adapted"] = raced(adapted.checkpoint, plant)
+    return result, adapted
+
+
 def about(found: Adapted) -> Line:
     """Return what an adaptation found, and the flying lap that it expects, 95 %, s."""
     diagnosis, new = found.diagnosis, found.new
-    expected = None
+    expected = simulated_s = None
     if new is not None and new.is_complete.any():
-        expected = np.quantile(new.lap_s[new.is_complete], (0.025, 0.975)).round(3).tolist()
+        laps_s = new.lap_s[new.is_complete]
+        expected = np.quantile(laps_s, (0.025, 0.975)).round(3).tolist()
+        simulated_s = round(float(laps_s.mean()), 4)
     return {
         "motion_found": diagnosis.extended.motion.value,
         "named": [cause.effect for cause in diagnosis.causes],
         "verdict": diagnosis.verdict,
         "is_new": found.is_new,
         "expected_lap_s": expected,
+        "simulated_lap_s": simulated_s,
     }
 
 
@@ -331,7 +412,7 @@ def measure_unchanged(trial: Trial) -> Line:
     model = model_of(truth)._replace(motion=MOTION_OF[trial.motion])
     policy = load_checkpoint(POLICY)
     policy = policy._replace(meta={**policy.meta, "model": model_as_json(model)})
-    log = fly(HiddenPlant(truth), policy, trial.seconds, trial.seed + trial.number)
+    log = fly(HiddenPlant(truth), trial.motion, policy, trial.seconds, trial.seed + trial.number)
     begun_s = time.process_time()
     try:
         adapted = adapt(log, policy, trial.seed)
@@ -341,10 +422,10 @@ def measure_unchanged(trial: Trial) -> Line:
 
 
 def main(
-    seconds: float = 10.0,
+    seconds: float = SECONDS,
     seed: int = 0,
     page: bool = False,
-    kinds: tuple[Kind, ...] = (PLANT, UNCHANGED, RIVALS),
+    kinds: tuple[Kind, ...] = (PLANT, UNCHANGED, RIVALS, FIRMWARE),
     jobs: report.JobFlags = report.IN_THIS_PROCESS,
 ) -> None:
     """Run the trials that are missing, or write the page of those that are there.
@@ -354,8 +435,10 @@ def main(
     """
     if page:
         lines = report.lines_in(LINES)
-        last = {line["kind"]: line["commit"] for line in lines}
-        write_page([line for line in lines if line["commit"] == last[line["kind"]]])
+        last = {(line["kind"], line["seconds"]): line["commit"] for line in lines}
+        write_page(
+            [line for line in lines if line["commit"] == last[line["kind"], line["seconds"]]]
+        )
     else:
         if RIVALS in kinds:
             for name in SHARES:

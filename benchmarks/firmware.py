@@ -183,9 +183,7 @@ def grade_trial(trial: Trial) -> dict[str, Any]:
     changes = dict(SETUPS[trial.setup])
     for kind in trial.kinds:
         changes |= KINDS[kind].draw(rng)
-    nominal = asdict(Body())
-    fields = {name: value for name, value in changes.items() if name in nominal}
-    settings = {name: value for name, value in changes.items() if name not in nominal}
+    settings, fields = of_settings_and_body(changes)
     body = Body(**fields)
     log, _ = fly(settings, body, trial.flown, seed + 1000 + trial.number)
     apart = np.linalg.norm(places(settings, body, seed) - known.places_m, axis=1)
@@ -205,6 +203,15 @@ def grade_trial(trial: Trial) -> dict[str, Any]:
         "error": error_ratios(diagnosis),
         "cpu_s": round(time.process_time() - started, 1),
     }
+
+
+def of_settings_and_body(changes: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return those changes that are settings of the firmware, and those that are of the body."""
+    nominal = asdict(Body())
+    return (
+        {name: value for name, value in changes.items() if name not in nominal},
+        {name: value for name, value in changes.items() if name in nominal},
+    )
 
 
 def values_by_name(cause: Cause) -> dict[str, dict[str, list[float]]]:

@@ -127,6 +127,7 @@ def adapt(
     settings: Settings = Settings(),  # noqa: B008, a tuple of constants
     accept: bool = False,
     report: Callable[[str], Report] = lambda unit: lambda done, total: None,
+    craft: ModelParameters | None = None,
 ) -> Adapted:
     """Return a policy adapted to the plant that flew a log.
 
@@ -137,14 +138,17 @@ def adapt(
         settings: see ``Settings``.
         accept: adapt although the log contradicts itself or the policy's model.
         report: from a unit, what is called with the number done and of all.
+        craft: a model that has the settings of the craft; None if these are the policy's own.
 
     Raises:
         CheckpointError: a policy of another observation, or without its model.
         LogError: a log of no race, or of another craft.
     """
-    model = check_inputs(log, checkpoint, accept)
-    diagnosis = diagnose(log, model, report=report("stages"))
-    if not is_different(diagnosis, model):
+    model = model_of(checkpoint)
+    nominal = model if craft is None else with_settings(model, craft)
+    check_inputs(log, nominal, accept)
+    diagnosis = diagnose(log, nominal, report=report("stages"))
+    if nominal is model and not is_different(diagnosis, model):
         return Adapted(diagnosis, checkpoint, False)
     models = find_plausible_models(diagnosis)
     return improve(checkpoint, model, models, diagnosis, seed, settings, report)
@@ -161,8 +165,15 @@ def is_different(diagnosis: Diagnosis, model: ModelParameters) -> bool:
     )
 
 
-def check_inputs(log: FlightLog, checkpoint: Checkpoint, accept: bool) -> ModelParameters:
-    """Return the model of a policy; raise what ``adapt`` raises."""
+def with_settings(model: ModelParameters, craft: ModelParameters) -> ModelParameters:
+    """Return a model with a craft's full-stick rates and settings, such as its rate loop."""
+    settings = [one for one in craft.effects if effect_of(one).search.is_setting]
+    is_same = np.array_equal(model.max_rate, craft.max_rate) and not settings
+    return model if is_same else model._replace(max_rate=craft.max_rate).with_effects(*settings)
+
+
+def model_of(checkpoint: Checkpoint) -> ModelParameters:
+    """Return the model that a policy was made for; raise CheckpointError as ``adapt`` does."""
     if "model" not in checkpoint.meta:
         raise CheckpointError(
             f"{checkpoint.path}: model: found none, expected the one it was trained on"
@@ -175,6 +186,11 @@ def check_inputs(log: FlightLog, checkpoint: Checkpoint, accept: bool) -> ModelP
             f"{checkpoint.path}: found a policy of {checkpoint.env_id}, expected one that observes "
             f"what {ENV_ID} shows: {error}"
         ) from error
+    return model
+
+
+def check_inputs(log: FlightLog, model: ModelParameters, accept: bool) -> None:
+    """Raise LogError for a log of no race, or of another craft than a model's."""
     check_race(log)
     check_plausible(log, accept)
     remarks = () if accept else check_log(log, model).remarks
@@ -183,7 +199,6 @@ def check_inputs(log: FlightLog, checkpoint: Checkpoint, accept: bool) -> ModelP
             f"{log.source}: found another craft than the policy's: {'; '.join(remarks)}; "
             "--accept goes on"
         )
-    return model
 
 
 def check_race(log: FlightLog) -> None:
@@ -231,7 +246,10 @@ def improve(
     flown = (draw_plants(model, models, keys["judge"], settings.flights), seed)
     known, old = judge(env, policy, *flown)
     moving = partial(
-        draw_moving, models=models, start=to_vector(embed(model, models.like)), settings=settings
+        draw_moving,
+        models=models,
+        start=to_vector(embed(diagnosis.nominal, models.like)),
+        settings=settings,
     )
     seed_of_flights = int(jax.random.bits(keys["polish"], dtype=jnp.uint32) >> 1)
     try:

@@ -23,6 +23,7 @@ from flytrack_sysid.check.thrust import thrust_changes
 from flytrack_sysid.diagnosis import Cause, Diagnosis, Unexplained
 from flytrack_sysid.diagnosis.plausible import find_plausible_models
 from flytrack_sysid.diagnosis.result import Joint
+from flytrack_sysid.importing.betaflight_settings import GENERIC
 from flytrack_sysid.inference.parameters import THRUST_COEFFS, names_of, to_vector
 from flytrack_sysid.inference.problem import split_blocks
 from tests.support.evaluated import write_checkpoint
@@ -207,6 +208,32 @@ def test_the_old_policy_is_kept_where_the_new_one_is_worse(lap_s, finish, is_new
     assert ("96.3% to 100.0% of flights finish" in text) == is_new
     assert ("the old one is kept" in text) != is_new
     assert (found.checkpoint is champion) != is_new
+
+
+def test_the_settings_of_a_craft_are_there_from_the_start(log, monkeypatch):
+    """A rate loop that is there by half has no half of its response."""
+    champion = load_checkpoint("champion")
+    own = model_from_json(champion.meta["model"], "model")
+    craft = NOMINAL._replace(max_rate=np.float32([500.0, 500.0, 200.0])).with_effects(GENERIC)
+    nominal = adapting.with_settings(own, craft)
+    assert adapting.with_settings(own, own) is own
+    assert_array_equal(nominal.max_rate, craft.max_rate)
+    assert_array_equal(nominal.tau, own.tau)
+    faster = nominal.with_effects(GENERIC._replace(roll_arm=2.0 * GENERIC.roll_arm))
+    found = replace(diagnosis(faster), nominal=nominal)
+    asked, moved = [], []
+
+    def polish(env, policy, seed, settings, moving, report):
+        moved.extend(moving(jax.random.key(0), jnp.float32(done)) for done in (0.0, 1.0))
+        return policy.params
+
+    monkeypatch.setattr(adapting, "diagnose", lambda log, model, **_: asked.append(model) or found)
+    monkeypatch.setattr(adapting, "polish", polish)
+    monkeypatch.setattr(adapting, "judge", lambda *_: (judged(100, 3.7), judged(90, 4.2)))
+    adapt(log, champion, accept=True, craft=craft)
+    assert asked[0].effect("betaflight_loop") == GENERIC
+    arms = [float(model.effect("betaflight_loop").roll_arm) for model in moved]
+    assert_allclose(arms, [GENERIC.roll_arm, 2.0 * GENERIC.roll_arm], rtol=1e-6)
 
 
 def test_what_is_unexplained_is_said():

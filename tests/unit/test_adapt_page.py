@@ -61,3 +61,19 @@ def test_lines_that_lack_something(written):
     )
     assert "a hover" in page and "100.0%, 4.000 s" in page
     assert "| flying lap, adapted over limit, median (all) | 1.05 | - | 0 |" in page
+
+
+def test_firmware_and_other_lengths_have_tables_of_their_own(written):
+    raced = {**WHOLE, "simulated_lap_s": 3.96, "entries": {"nothing": LOST, "adapted": RACED}}
+    refused = {"hidden": "curved", "flights": 1, "entries": {"nothing": LOST}, "refused": "a hover"}
+    page = written(
+        line("plant", 1, **WHOLE),
+        {**line("plant", 1, **raced), "seconds": 5.0},
+        {**line("plant", 2, **refused), "seconds": 5.0},
+        line("firmware", 0, **raced),
+        line("firmware", 2, **refused),
+    )
+    assert "1 of 24 pairs of plant and motion" in page
+    assert "| 5 | 1 of 2 | 1 | 40 to 40 |" in page and "| 10 | 1 of 1 | 0 | 40 to 40 |" in page
+    assert "| 0.0%, - | 100.0%, 4.000 s | +1.01% | 40.0 |" in page
+    assert "| curved | a hover | nothing | 0.0%, - | - | - | - |" in page
