@@ -52,6 +52,7 @@ def test_lines_that_lack_something(written):
         line("plant", 2, **refused),
         line("plant", 3, error="crashed"),
         line("rivals", 1, entries={"randomised 10 %": RACED}),
+        line("residual", 1, entries={"residual network": RACED}),
         line("rivals", 2, error="crashed"),
         line("unchanged", 0, error="crashed"),
     )
@@ -59,6 +60,7 @@ def test_lines_that_lack_something(written):
         "2 of 24 pairs of plant and motion were flown, 1 of them refused as a log. Errors: 3."
         in page
     )
+    assert "99 % of starts finish: residual network |  | 1 of 1 |" in page
     assert "a hover" in page and "100.0%, 4.000 s" in page
     assert "| flying lap, adapted over limit, median (all) | 1.05 | - | 0 |" in page
 
@@ -74,6 +76,7 @@ def test_firmware_and_other_lengths_have_tables_of_their_own(written):
         line("firmware", 2, **refused),
     )
     assert "1 of 24 pairs of plant and motion" in page
-    assert "| 5 | 1 of 2 | 1 | 40 to 40 |" in page and "| 10 | 1 of 1 | 0 | 40 to 40 |" in page
+    assert "| 5 | 1 | 1 of 2 | 1 of 1 | 1 | 40 |" in page
+    assert "| 10 | 1 | 1 of 1 | 1 of 1 | 0 | 40 |" in page
     assert "| 0.0%, - | 100.0%, 4.000 s | +1.01% | 40.0 |" in page
     assert "| curved | a hover | nothing | 0.0%, - | - | - | - |" in page
