@@ -4,8 +4,8 @@
 100,...]`` flies every plant for a minute (benchmarks.hidden), shows the diagnosis the log and the
 model without the hidden effects, and grades the result by what the log could show
 (benchmarks.hidden.oracle). It appends a line a plant to docs/results/diagnosis.jsonl, with the
-commit and versions it was measured at, and skips plants that have a line of the same commit.
-``python -m benchmarks.diagnosis_page`` writes the page of the last commit's lines.
+commit and versions it was measured at, and skips plants that have a line of a commit with the same
+``CODE``. ``python -m benchmarks.diagnosis_page`` writes the page of the last line's code.
 """
 
 import time
@@ -27,6 +27,15 @@ from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import held_out_rows
 
 LINES = RESULTS / "diagnosis.jsonl"
+# What decides a line.
+CODE = (
+    "flytrack_env",
+    "flytrack_sysid",
+    "flytrack_bench/hidden",
+    "flytrack_bench/misspec/suite.py",
+    "benchmarks/diagnosis.py",
+    "benchmarks/hidden",
+)
 SECONDS = 60.0
 SEED = 29  # no rule was made on it; on 21 to 28 some were
 # How the package calls the plants' motions.
@@ -171,7 +180,7 @@ def main(
         range(first, plants), rows.split(","), motion.split(","), map(int, rate.split(","))
     )
     trials = [Trial(row, number, seed, moved, per_s) for number, row, moved, per_s in every]
-    record_trials(LINES, trials, plant, jobs=jobs)
+    record_trials(LINES, trials, plant, jobs=jobs, code=CODE)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """docs/results/diagnosis.md, from the lines that ``benchmarks.diagnosis`` wrote.
 
-``python -m benchmarks.diagnosis_page`` takes those of the last commit.
+``python -m benchmarks.diagnosis_page`` takes those of the last commit, and of others with its code.
 """
 
 from collections import Counter
@@ -8,11 +8,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from benchmarks.diagnosis import LINES, ROWS, Trial
+from benchmarks.diagnosis import CODE, LINES, ROWS, Trial
 from benchmarks.hidden import MOTIONS
 from benchmarks.report import (
     Figure,
     Line,
+    commits_of,
     figures_table,
     fill_page,
     lines_of_commit,
@@ -234,7 +235,7 @@ def misses(lines: list[Line]) -> str:
 
 def main() -> None:
     """Write the page."""
-    every_line = lines_of_commit(LINES)
+    every_line = lines_of_commit(LINES, code=CODE)
     lines = [line for line in every_line if "error" not in line]
     rows = Counter(line["row"] for line in lines)
     singles = [
@@ -254,7 +255,7 @@ def main() -> None:
         num_plants=len({(line["row"], line["number"], line["seed"]) for line in lines}),
         crashed=len(every_line) - len(lines),
         seeds=sorted({line["seed"] for line in every_line}),
-        commit=every_line[-1]["commit"],
+        commit=", ".join(commits_of(every_line)),
         date=every_line[-1]["date"],
         machines="; ".join(sorted({line["machine"] for line in every_line})),
         visible=VISIBLE,

@@ -243,6 +243,7 @@ def record_trials(
     measure: Callable[[Any], Line],
     programs_kept: int | None = None,
     jobs: Jobs = IN_THIS_PROCESS,
+    code: Sequence[str] = (),
 ) -> None:
     """Measure what has no line of this commit yet, and append a line of JSON for each trial.
 
@@ -258,6 +259,7 @@ def record_trials(
         programs_kept: trials after which a process drops its compiled programs, None for never; the
             system limits how many memory mappings a process may have.
         jobs: where trials are measured.
+        code: as of ``lines_of_commit``.
 
     Raises:
         OSError: no such cluster.
@@ -266,7 +268,7 @@ def record_trials(
 
     machine = f"{platform.machine()}, {os.cpu_count()} cores, jax {version('jax')}"
     stamp = {"commit": commit_of_checkout(), "date": str(date.today()), "machine": machine}
-    done = lines_of_commit(path, stamp["commit"])
+    done = lines_of_commit(path, stamp["commit"], code)
 
     def is_done(trial: Any) -> bool:
         fields = json.loads(json.dumps(trial._asdict()))
@@ -322,11 +324,33 @@ def measure_trial(
         return {"error": f"{type(error).__name__}: {error}"}
 
 
-def lines_of_commit(path: Path, commit: str | None = None) -> list[Line]:
-    """Return the lines in a file that were measured at a commit; None: at that of the last line."""
+def lines_of_commit(path: Path, commit: str | None = None, code: Sequence[str] = ()) -> list[Line]:
+    """Return the lines in a file that were measured at a commit; None: at that of the last line.
+
+    Args:
+        code: files and folders that decide what is measured. Lines of other commits count, too, if
+            these are the same there.
+    """
     lines = lines_in(path)
     commit = lines[-1]["commit"] if commit is None and lines else commit
-    return [line for line in lines if line["commit"] == commit]
+    counts = {one: one == commit or is_same(code, one, commit) for one in commits_of(lines)}
+    return [line for line in lines if counts[line["commit"]]]
+
+
+def commits_of(lines: Iterable[Line]) -> list[str]:
+    """Return the commits of lines, each once."""
+    return list(dict.fromkeys(line["commit"] for line in lines))
+
+
+def is_same(code: Sequence[str], commit: str, other: str | None) -> bool:
+    """Return whether some files are the same at two commits; False for none, and without git."""
+    if not code or other is None:
+        return False
+    command = ["git", "diff", "--quiet", commit, other, "--", *code]
+    try:
+        return subprocess.run(command, cwd=ROOT, check=False, capture_output=True).returncode == 0
+    except OSError:
+        return False
 
 
 def _write(path: Path, text: str) -> None:
