@@ -187,7 +187,7 @@ def run_validate(flags: Validate) -> None:
     """Validate the model and write the report."""
     model = load_model(flags.model)
     log = load_log(flags.log)
-    check_plausible(log, flags.accept)
+    check_plausible(log, flags.accept, model)
     rows, note = judged_rows(flags.model, log)
     with waiting("fly the model beside the log"):
         found = validate(model, log, rows)
@@ -208,12 +208,12 @@ def run_diagnose(flags: Diagnose) -> None:
         [load_log(path) for path in paths] for paths in (flags.logs, flags.hold_out, flags.before)
     )
     logs = train + test
+    model = None if flags.model is None else load_model(flags.model)
     for one in logs + before:
-        check_plausible(one, flags.accept)
+        check_plausible(one, flags.accept, model)
         print(describe(one), flush=True)  # what follows takes a while
     log = joined(logs)
     held_out = np.arange(len(log)) >= sum(map(len, train)) if test else None
-    model = None if flags.model is None else load_model(flags.model)
     motion = None if flags.motion == "auto" else Motion(flags.motion)
     if flags.quick:
         if before:

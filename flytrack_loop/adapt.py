@@ -192,7 +192,7 @@ def model_of(checkpoint: Checkpoint) -> ModelParameters:
 def check_inputs(log: FlightLog, model: ModelParameters, accept: bool) -> None:
     """Raise LogError for a log of no race, or of another craft than a model's."""
     check_race(log)
-    check_plausible(log, accept)
+    check_plausible(log, accept, model)
     remarks = () if accept else check_log(log, model).remarks
     if len(remarks) >= OTHER_CRAFT:
         raise LogError(

@@ -263,7 +263,7 @@ def what_is_fitted(
 
     Arguments and exceptions are those of ``fit``, which calls this first.
     """
-    check_plausible(log, accept)
+    check_plausible(log, accept, start)
     fixed, effects = dict(fixed or {}), tuple(effects)
     try:
         model = with_neutral_effects(nominal_parameters() if start is None else start, effects)

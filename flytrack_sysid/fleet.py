@@ -262,11 +262,11 @@ def diagnose_flight(flight: Flight) -> dict[str, Any]:
         log, settings = read_flight(flight)
     except (LogError, OSError) as error:
         return {"state": UNREADABLE, "reason": error_text(error)}
+    model = None if flight.model is None else load_model(flight.model)
     try:
-        check_plausible(log)
+        check_plausible(log, model=model)
     except LogError as error:
         return {"state": CONTRADICTS, "reason": error_text(error)}
-    model = None if flight.model is None else load_model(flight.model)
     diagnosis = diagnose(log, model).as_json()
     return {"state": DIAGNOSED, "settings": settings, "diagnosis": diagnosis}
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from flytrack_env import motors
-from flytrack_sysid.check import check_log, problems_of
+from flytrack_env.dynamics import ModelParameters
+from flytrack_sysid.check import after_rate_curve, check_log, problems_of
 from flytrack_sysid.kinematics import GRAVITY, cut_windows
 from flytrack_sysid.log import CHANNELS, FlightLog, LogError
 
@@ -105,9 +106,9 @@ def _acceleration(log: FlightLog) -> Iterator[str]:
         yield f"a_z: {problem}: gravity looks left in, as an accelerometer measures it"
 
 
-def _conventions(log: FlightLog) -> Iterator[str]:
+def _conventions(log: FlightLog, model: ModelParameters | None) -> Iterator[str]:
     """Find channels that contradict each other, but for what a diagnosis names by itself."""
-    found = check_log(log)
+    found = check_log(after_rate_curve(log, model))
     kinds = {change.kind for one in found.explanations for change in one}
     if kinds - set(DIAGNOSED) or (found.contradicts and not kinds):
         yield from problems_of(found)
@@ -116,7 +117,9 @@ def _conventions(log: FlightLog) -> Iterator[str]:
 CHECKS = (_length, _commands, _motors, _motion, _attitude, _acceleration)
 
 
-def find_problems(log: FlightLog, accept: bool = False) -> list[str]:
+def find_problems(
+    log: FlightLog, accept: bool = False, model: ModelParameters | None = None
+) -> list[str]:
     """Return the problems of a log that no flight can have, a sentence each; empty if none.
 
     Each sentence names the source, the columns, what was found, and why it looks wrong. If the time
@@ -125,16 +128,22 @@ def find_problems(log: FlightLog, accept: bool = False) -> list[str]:
     Args:
         log: a flight log.
         accept: do not compare channels with each other.
+        model: of the craft, whose rate curve is known; None if there is none.
     """
     log, problems = _with_time_in_s(log)
     problems = [*problems, *(problem for check in CHECKS for problem in check(log))]
     if not problems and not accept:
-        problems = list(_conventions(log))
+        problems = list(_conventions(log, model))
     return [f"{log.source}: {problem}" for problem in problems]
 
 
-def check_plausible(log: FlightLog, accept: bool = False) -> None:
-    """Raise LogError for a log that no flight can have; the message has a line for each problem."""
-    problems = find_problems(log, accept)
+def check_plausible(
+    log: FlightLog, accept: bool = False, model: ModelParameters | None = None
+) -> None:
+    """Raise LogError for a log that no flight can have; the message has a line for each problem.
+
+    Arguments are those of ``find_problems``.
+    """
+    problems = find_problems(log, accept, model)
     if problems:
         raise LogError("\n".join(problems))

@@ -8,6 +8,9 @@ import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 from scipy.signal import lfilter
 
+from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import effect_of
+from flytrack_env.state import Action
 from flytrack_sysid.check.explain import Change
 from flytrack_sysid.check.frames import NUM_FRAMES
 from flytrack_sysid.check.motion import (
@@ -228,6 +231,21 @@ MIN_BETTER = 2.0  # times: the residual variance without a curve over that with 
 MIN_BEND = 0.007
 ALIKE = 0.1  # of the log-likelihood that a curve gains: the lag is not known better
 MIN_FOLLOWED = 0.9  # correlation of rates with commands that are understood
+
+
+def after_rate_curve(log: FlightLog, model: ModelParameters | None) -> FlightLog:
+    """Return a log whose rate sticks are bent by the rate curve of a model's settings, if any."""
+    curves = [
+        one
+        for one in (() if model is None or log.has_motors else model.effects)
+        if effect_of(one).search.follows_sticks and effect_of(one).search.is_setting
+    ]
+    if not curves:
+        return log
+    sticks = Action(*log["u"].T)
+    for curve in curves:
+        sticks = effect_of(curve).hooks["command"](curve, None, sticks, None)
+    return replace(log, channels={**log.channels, "u": np.stack(sticks, axis=1).astype(float)})
 
 
 def curve_changes(log: FlightLog, found: list[Response]) -> list[Change]:

@@ -9,7 +9,13 @@ from scipy.spatial.transform import Rotation
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.thrust import hover_action
 from flytrack_sysid.check.battery import battery_changes, compare_battery
-from flytrack_sysid.check.commands import curve_changes, mean_delay, responses, thinned
+from flytrack_sysid.check.commands import (
+    after_rate_curve,
+    curve_changes,
+    mean_delay,
+    responses,
+    thinned,
+)
 from flytrack_sysid.check.explain import Change, Explanation, explain
 from flytrack_sysid.check.frames import FRAMES, IDENTITY, READINGS
 from flytrack_sysid.check.motion import MARGIN, RATE_FLOOR, compare
@@ -134,7 +140,8 @@ def check_log(
 
     Args:
         log: a flight.
-        model: whose lags are expected between commands and rates; None if they are unknown.
+        model: whose rate curve and lags are expected between commands and rates; None if they are
+            unknown.
         motors: outputs of four motors in Betaflight's order, (num_rows, 4); by default the
             commands of a log that has those of motors.
     """
@@ -146,6 +153,7 @@ def check_log(
             for part in (found.pairs, found.after)
         )
         return replace(found, pairs=pairs, after=after)
+    log = after_rate_curve(log, model)
     samples = sample_changes(log)
     held = {change.channel for change in samples if change.kind == "held"}
     # Rates about the world's axes also look like an inverted attitude: the simpler one counts.

@@ -7,6 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from flytrack_env import nominal_parameters
+from flytrack_env.effects.betaflight_rates import BetaflightRates
+from flytrack_sysid.check import check_log
 from flytrack_sysid.kinematics import GRAVITY
 from flytrack_sysid.log import CHANNELS, LogError
 from flytrack_sysid.plausibility import MIN_ROWS, check_plausible, find_problems
@@ -123,6 +126,19 @@ def test_drone_that_stands_while_commands_move(logs, measured):
     (problem,) = find_problems(log.without(*unseen))
     named = ", ".join(column for name in CHANNELS if name in measured for column in CHANNELS[name])
     assert f": {named}: found the same values in every row" in problem
+
+
+def test_a_rate_curve_that_the_model_has_contradicts_nothing(logs):
+    model = nominal_parameters().with_effects(BetaflightRates(0.7, 0.7, 0.7))
+    sticks = np.linspace(-1.0, 1.0, 2001)
+    bent = sticks * 0.3 / (1.0 - 0.7 * np.abs(sticks))
+    log = logs["noisy"]
+    rates = np.interp(log["u"][:, :3], bent, sticks)
+    log = with_channels(log, u=np.concatenate([rates, log["u"][:, 3:]], axis=1))
+    (problem,) = find_problems(log)
+    assert "before a rate curve (Betaflight's betaflight)" in problem
+    assert find_problems(log, model=model) == []
+    assert not check_log(log, model).contradicts
 
 
 def test_batteries_of_one_to_fourteen_cells_raise_no_problem(logs):
