@@ -278,11 +278,12 @@ def main(
 ) -> None:
     """Diagnose plants with all rules, and without one rule at a time.
 
-    plants: of each row and motion, up to this number.
-    rows: kinds of plants, or "measured" for measured flights.
-    motion: how they move.
-    rules: disabled one at a time.
-    page: write the page from the lines instead.
+    Args:
+        plants: of each row and motion, up to this number.
+        rows: kinds of plants, or "measured" for measured flights.
+        motion: how they move.
+        rules: disabled one at a time.
+        page: write the page from the lines instead.
     """
     if page:
         write_page()

@@ -461,8 +461,11 @@ def main(
 ) -> None:
     """Run the trials that are missing, or write the page of those that are there.
 
-    seconds: of flight in a log. seed: of flights, draws and starts. page: write the page only.
-    kinds: of trials that are run.
+    Args:
+        seconds: of flight in a log.
+        seed: of flights, draws and starts.
+        page: write the page only.
+        kinds: of trials that are run.
     """
     if page:
         lines = report.lines_in(LINES)

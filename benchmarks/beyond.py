@@ -211,8 +211,12 @@ def main(
 ) -> None:
     """Diagnose the plants, or write the page.
 
-    laws: plants of each kind of law. clean: without anything. listed: with listed effects only.
-    kinds: of laws, so that two processes can share them. page: write the page of what was measured.
+    Args:
+        laws: plants of each kind of law.
+        clean: without anything.
+        listed: with listed effects only.
+        kinds: of laws, so that two processes can share them.
+        page: write the page of what was measured.
     """
     if page:
         write_page()

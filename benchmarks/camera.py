@@ -244,8 +244,11 @@ def main(
 ) -> None:
     """Measure, print and write.
 
-    poses: that corners and masks are compared at. repeats: rounds of the speeds. checkpoints: of
-    policies to fly. out: page.
+    Args:
+        poses: that corners and masks are compared at.
+        repeats: rounds of the speeds.
+        checkpoints: of policies to fly.
+        out: page.
     """
     core = report.pin_to_one_core()
     figures = [*corner_figures(poses), mask_figure(poses), gradient_figure()]

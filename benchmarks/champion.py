@@ -49,9 +49,13 @@ STEPS, FLIGHTS, LAPS, FLIGHT_SEED = 2500, 256, 3, 100
 class Recipe(NamedTuple):
     """How a champion is made and judged.
 
-    env_id: that PPO trains on; changes: of its configuration. settings: of polishing. is_robust:
-    for drawn plants, in polishing and in judging. success: share of flights that has to finish.
-    times_optimal: at most, of the flying lap, the time-optimal one being 1.
+    Attributes:
+        env_id: that PPO trains on.
+        changes: of its configuration.
+        settings: of polishing.
+        is_robust: for drawn plants, in polishing and in judging.
+        success: share of flights that has to finish.
+        times_optimal: at most, of the flying lap, the time-optimal one being 1.
     """
 
     env_id: str

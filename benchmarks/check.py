@@ -352,11 +352,12 @@ def main(
 ) -> None:
     """Check logs and plants.
 
-    logs: clean ones and ones with two faults; each single fault is on a tenth of them.
-    part: only this one.
-    seed: of flights and faults; 7 is for development.
-    model: give the check the craft's full rates and lags.
-    page: write the page from the lines instead.
+    Args:
+        logs: clean ones and ones with two faults; each single fault is on a tenth of them.
+        part: only this one.
+        seed: of flights and faults; 7 is for development.
+        model: give the check the craft's full rates and lags.
+        page: write the page from the lines instead.
     """
     if page:
         write_page()

@@ -173,8 +173,10 @@ def main(
 ) -> None:
     """Diagnose plants.
 
-    plants: of each row, up to this number; first: from this one on. rate: rows per second of the
-    log.
+    Args:
+        plants: of each row, up to this number.
+        first: from this one on.
+        rate: rows per second of the log.
     """
     every = product(
         range(first, plants), rows.split(","), motion.split(","), map(int, rate.split(","))

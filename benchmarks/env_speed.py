@@ -253,8 +253,10 @@ def ratios(rates: dict[str, list[float]], name: str, peer: str) -> list[float]:
 def main(repeats: int = 7, out: Path | None = None, effects: bool = False) -> None:
     """Measure, print and write.
 
-    repeats: rounds, at least 5 for figures to publish. out: page. effects: measure the cost of each
-    instead.
+    Args:
+        repeats: rounds, at least 5 for figures to publish.
+        out: page.
+        effects: measure the cost of each instead.
     """
     core = report.pin_to_one_core()
     if effects:

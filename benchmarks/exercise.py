@@ -85,7 +85,8 @@ def draw_stages(checkpoints: dict[int, Path]) -> Figure:
 def main(seed: int = 0) -> None:
     """Train, draw, and write both pictures.
 
-    seed: of the training.
+    Args:
+        seed: of the training.
     """
     config = Config()
     with tempfile.TemporaryDirectory() as folder:

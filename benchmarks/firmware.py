@@ -58,7 +58,8 @@ Rng = np.random.Generator
 class Kind(NamedTuple):
     """Something that changes: how it is drawn, its names, and others that fly alike.
 
-    draw: settings and fields of the body.
+    Attributes:
+        draw: settings and fields of the body.
     """
 
     draw: Callable[[Rng], dict[str, Any]]
@@ -236,8 +237,9 @@ def names_of(kind: str, body: Body) -> tuple[set[str], set[str]]:
 def grade(changes: Sequence[tuple[set[str], set[str]]], names: list[str]) -> dict[str, bool]:
     """Return whether the names are exact, exact up to their classes, and whether one is false.
 
-    changes: as of ``names_of``. Each has at least one of its names, and each name belongs to a
-    change.
+    Args:
+        changes: as of ``names_of``. Each has at least one of its names, and each name belongs to a
+            change.
     """
     named = set(names)
     exact, equivalent = zip(*changes, strict=True) if changes else ((), ())
@@ -323,8 +325,11 @@ def main(
 ) -> None:
     """Fly, diagnose, and write the lines and the tables.
 
-    matched: flights of each set-up and excitation. single: draws of each kind of change. pairs:
-    set-ups with two changes. champion: starts of it, 0 for none.
+    Args:
+        matched: flights of each set-up and excitation.
+        single: draws of each kind of change.
+        pairs: set-ups with two changes.
+        champion: starts of it, 0 for none.
     """
     trials = [
         Trial("matched", setup, flown, (), number, seed)

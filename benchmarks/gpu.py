@@ -281,7 +281,8 @@ def race(config: Config) -> str:
 def main(cpu: bool = False) -> None:
     """Measure, and write the page where there is an accelerator.
 
-    cpu: measure a CPU with small sizes, write nothing.
+    Args:
+        cpu: measure a CPU with small sizes, write nothing.
     """
     path, parts = (None if cpu else PAGE), ["Not measured."]
     if cpu or jax.default_backend() != "cpu":

@@ -129,7 +129,9 @@ def draw(path: Path, curves: dict[int, list[Point]]) -> None:
 def main(seeds: int = 5, out: Path = report.RESULTS / "learning_curve.md") -> None:
     """Measure every seed, print and write page and chart; exit 1 if a seed misses the target.
 
-    seeds: how many. out: page to write.
+    Args:
+        seeds: how many.
+        out: page to write.
     """
     pinned = report.pin_to_one_core()
     trainer = Trainer(Config(**SHORT))

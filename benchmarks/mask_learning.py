@@ -34,7 +34,11 @@ def main(
 ) -> None:
     """Train, print and write.
 
-    steps: of the environments. seed: of the training. runs: folder of its checkpoint. out: page.
+    Args:
+        steps: of the environments.
+        seed: of the training.
+        runs: folder of its checkpoint.
+        out: page.
     """
     config = Config(total_timesteps=steps, **SETTINGS)
     final, metrics = train_policy(runs, config, seed, ENV_ID)

@@ -156,9 +156,12 @@ def step_function(model: ModelParameters) -> casadi.Function:
 class Flight(NamedTuple):
     """A first guess or a solution; SI units.
 
-    states: (N + 1, 21). commands: (N, 4). steps_s: (num_gates,), length of a step of each segment.
-    counts: (num_gates,), steps of each segment. fractions: (num_gates,), where in the last step of
-    each segment its gate is passed.
+    Attributes:
+        states: (N + 1, 21).
+        commands: (N, 4).
+        steps_s: (num_gates,), length of a step of each segment.
+        counts: (num_gates,), steps of each segment.
+        fractions: (num_gates,), where in the last step of each segment its gate is passed.
     """
 
     states: np.ndarray
@@ -199,7 +202,9 @@ class Solution(NamedTuple):
 class Task(NamedTuple):
     """The task: kind "flying" or "standing", gates and bounds, drone radius, and first state.
 
-    start: (21,): where a standing start begins; of a flying lap only the battery voltage is taken.
+    Attributes:
+        start: (21,): where a standing start begins; of a flying lap only the battery voltage is
+            taken.
     """
 
     kind: str
@@ -345,7 +350,10 @@ def first_guess(
 ) -> Flight:
     """Return a flight along the path at one speed, m/s, with a heading, rad, or along the path.
 
-    counts: (num_gates,), steps of each segment. The flight satisfies no equation of motion.
+    The flight satisfies no equation of motion.
+
+    Args:
+        counts: (num_gates,), steps of each segment.
     """
     ways = _paths(task)
     steps_s = segment_lengths(task) / speed_m_s / counts

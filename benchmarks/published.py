@@ -202,8 +202,10 @@ def main(
 ) -> None:
     """Fit to flights and predict others, or each flight from the others without ``test``.
 
-    layout: a mapping, shipped or a path. fix: NAME=VALUE of parameters that are not fitted. out:
-    where the model is written.
+    Args:
+        layout: a mapping, shipped or a path.
+        fix: NAME=VALUE of parameters that are not fitted.
+        out: where the model is written.
     """
     fixed = {name: float(value) for name, value in (pair.split("=") for pair in fix)}
     flights = import_log(train, "csv", layout)

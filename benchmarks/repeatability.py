@@ -396,8 +396,10 @@ def main(
 ) -> None:
     """Diagnose flights.
 
-    page: write the page from the lines instead. changes: compare pairs of flights instead. plants:
-    the number of simulated craft.
+    Args:
+        page: write the page from the lines instead.
+        changes: compare pairs of flights instead.
+        plants: the number of simulated craft.
     """
     if page:
         write_page()

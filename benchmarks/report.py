@@ -108,7 +108,8 @@ def command_line() -> str:
 def provenance(*packages: str) -> Line:
     """Return what every record names: commit, date, machine and versions, as JSON values.
 
-    packages: whose versions matter besides those of ``PACKAGES``; "not installed" if missing.
+    Args:
+        packages: whose versions matter besides those of ``PACKAGES``; "not installed" if missing.
     """
     versions = {"python": platform.python_version()}
     for package in (*PACKAGES, *packages):
@@ -136,7 +137,8 @@ def provenance_line(record: Line) -> str:
 def table(header: str | Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """Return a table in Markdown, without a newline at its end.
 
-    header: "column | column" or a sequence.
+    Args:
+        header: "column | column" or a sequence.
     """
     columns = header.split(" | ") if isinstance(header, str) else header
     lines = [columns, ["---"] * len(columns), *rows]

@@ -112,10 +112,13 @@ def optimise(track: Track, kind: str, model: ModelParameters, model_name: str) -
 class Replay(NamedTuple):
     """The outcome of a reference's commands.
 
-    states: (N + 1, 21), float32. gates_passed: in order, by the environment. time_s: to the last
-    gate as the environment interpolates it, NaN if it was not passed. ended_by: causes of
-    termination. drift_m: largest distance from the reference. frames_touched: of all gates, also
-    those that were not next.
+    Attributes:
+        states: (N + 1, 21), float32.
+        gates_passed: in order, by the environment.
+        time_s: to the last gate as the environment interpolates it, NaN if it was not passed.
+        ended_by: causes of termination.
+        drift_m: largest distance from the reference.
+        frames_touched: of all gates, also those that were not next.
     """
 
     states: np.ndarray
@@ -295,8 +298,12 @@ def main(
 ) -> None:
     """Find references, replay all and write the page; exit 1 if a replay is not as it should be.
 
-    tracks: names or files. model: file; by default the simulator's nominal model. verify: only
-    replay existing references. out: their folder. page: to write, with pictures beside it.
+    Args:
+        tracks: names or files.
+        model: file; by default the simulator's nominal model.
+        verify: only replay existing references.
+        out: their folder.
+        page: to write, with pictures beside it.
     """
     courses = list(map(flytrack_env.load_track, tracks))
     if not verify:

@@ -19,15 +19,18 @@ SECONDS_PER_MINUTE = 60.0
 class PlantParameters(NamedTuple):
     """Everything that makes one plant differ from another; the air's effects vanish at 0.
 
-    mass: kg. gravity: m/s^2. battery_drain: V/min.
-    lag: (4,) s, time constants of roll, pitch, yaw, thrust.
-    max_rate: (3,) deg/s, body rates at full stick.
-    thrust: (6,) N, of 1, u, u^2, u^3, V, u V.
-    body_drag: (3,) 1/m, quadratic drag along body x, y, z.
-    rotor_drag: s/m, in-plane drag per thrust and per airspeed.
-    translational_lift: 1, share of thrust gained at high in-plane airspeed.
-    translational_speed: m/s, airspeed at which half of that is gained; > 0.
-    ground_radius: m, radius of the one rotor that stands for all four near the ground.
+    Attributes:
+        mass: kg.
+        gravity: m/s^2.
+        battery_drain: V/min.
+        lag: (4,) s, time constants of roll, pitch, yaw, thrust.
+        max_rate: (3,) deg/s, body rates at full stick.
+        thrust: (6,) N, of 1, u, u^2, u^3, V, u V.
+        body_drag: (3,) 1/m, quadratic drag along body x, y, z.
+        rotor_drag: s/m, in-plane drag per thrust and per airspeed.
+        translational_lift: 1, share of thrust gained at high in-plane airspeed.
+        translational_speed: m/s, airspeed at which half of that is gained; > 0.
+        ground_radius: m, radius of the one rotor that stands for all four near the ground.
     """
 
     mass: float

@@ -23,7 +23,9 @@ def make_problem(env_id: str = "FlyTrack-v0") -> GymnaxProblem:
 def evaluate(problem: GymnaxProblem, network: Any, problem_state: Any) -> tuple[float, float]:
     """Return the mean return and gates of a network's first 2 s on the same starts.
 
-    network: the policy's variables. problem_state: how observations are normalised.
+    Args:
+        network: the policy's variables.
+        problem_state: how observations are normalised.
     """
     num_steps = problem.episode_length
     many = GymnaxProblem(

@@ -33,8 +33,10 @@ def mean_gates(
 ) -> float:
     """Return the gates passed in an episode, mean over ``NUM_FLIGHTS`` episodes on the same starts.
 
-    act: observation and key to action. env: with gymnax's 6-value step. num_steps: of the longest
-    episode.
+    Args:
+        act: observation and key to action.
+        env: with gymnax's 6-value step.
+        num_steps: of the longest episode.
     """
 
     def fly(key: jax.Array) -> jax.Array:

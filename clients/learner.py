@@ -41,9 +41,10 @@ def act(training: Any, observations: Any, key: jax.Array) -> jax.Array:
 def learn(training: Any, key: jax.Array, last: Any, steps: Any) -> Any:
     """Return the training after a flight. A truncation counts as an end.
 
-    last: observations after the flight. steps: observations before each step, actions, rewards,
-    whether the episode ended and whether the step counts, which a reset does not, (NUM_STEPS,
-    NUM_ENVS, ...).
+    Args:
+        last: observations after the flight.
+        steps: observations before each step, actions, rewards, whether the episode ended and
+            whether the step counts, which a reset does not, (NUM_STEPS, NUM_ENVS, ...).
     """
     observations, actions, rewards, done, counts = steps
     everything = jnp.concatenate([observations, last[None]])

@@ -122,7 +122,9 @@ class Body(Struct, frozen=True, forbid_unknown_fields=True):
     def command_of(self, speeds: np.ndarray, volts: np.ndarray) -> np.ndarray:
         """Return the mean command, (...) in [0, 1], of steady motors at these speeds, (..., 4).
 
-        speeds: as shares of full speed. volts: (...) under load, V.
+        Args:
+            speeds: as shares of full speed.
+            volts: (...) under load, V.
         """
         share = np.mean(speeds**2, axis=-1) / (volts / self.full_v) ** self.volt_exponent
         if self.linear == 1.0:
@@ -133,7 +135,8 @@ class Body(Struct, frozen=True, forbid_unknown_fields=True):
     def pack(self, is_reversed: bool) -> bytes:
         """Return the bytes of body.h's ``Body``.
 
-        is_reversed: the firmware's ``yaw_motors_reversed``.
+        Args:
+            is_reversed: the firmware's ``yaw_motors_reversed``.
         """
         values = structs.asdict(self)  # body.h has the fields in the same order
         for name in ("lag_up_s", "lag_down_s"):

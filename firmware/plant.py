@@ -120,7 +120,8 @@ class _Flight:
     def land(self, box: Path | None) -> None:
         """End the flight.
 
-        box: folder for its blackbox log, which the firmware ends after disarming.
+        Args:
+            box: folder for its blackbox log, which the firmware ends after disarming.
         """
         try:
             if box is not None and self.steps >= MIN_LOG_STEPS:
@@ -153,10 +154,13 @@ class Betaflight(Plant):
     ):
         """Start the firmware with settings, read them back, and have it ready to fly.
 
-        settings: the text of a ``dump`` or ``diff all``, or a dict above
-        ``firmware.settings.DEFAULTS``. skip: patterns of settings to leave out. seed: of the body's
-        sensor noise. blackbox: new folder for the firmware's own log of each flight of half a
-        second or more, written when the flight ends: when later ones replace it, or in ``close``.
+        Args:
+            settings: the text of a ``dump`` or ``diff all``, or a dict above
+                ``firmware.settings.DEFAULTS``.
+            skip: patterns of settings to leave out.
+            seed: of the body's sensor noise.
+            blackbox: new folder for the firmware's own log of each flight of half a second or more,
+                written when the flight ends: when later ones replace it, or in ``close``.
 
         Raises:
             FirmwareError: not built, settings that are refused or not kept, or it does not start.
@@ -235,7 +239,9 @@ class Betaflight(Plant):
     def fly(self, starts: np.ndarray, commands: np.ndarray) -> np.ndarray:
         """Return the states (N, T, 21) after each command of flights side by side.
 
-        starts: (N, 21). commands: (N, T, 4) in [-1, 1], each held for 0.01 s.
+        Args:
+            starts: (N, 21).
+            commands: (N, T, 4) in [-1, 1], each held for 0.01 s.
 
         Raises:
             FirmwareError: a flight that fails.

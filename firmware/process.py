@@ -71,7 +71,9 @@ class Link:
     ) -> None:
         """Send a request.
 
-        duration_us: how long the firmware flies or types. passed: a socket for the copy.
+        Args:
+            duration_us: how long the firmware flies or types.
+            passed: a socket for the copy.
         """
         frame_us = FRAME_US if kind == FLY else 0
         packed = REQUEST.pack(kind, duration_us, frame_us, is_held, len(payload), *rc) + payload

@@ -32,9 +32,12 @@ PPO = "baselines.purejaxrl_ppo"
 class Command(NamedTuple):
     """A command; ``run`` and ``flags`` are written ``module:name``.
 
-    summary: one line. extra: that it needs. run: called with the flags, or with words if it
-    ``reads_words``: those after the command's name. flags: their dataclass; None where ``run`` has
-    none.
+    Attributes:
+        summary: one line.
+        extra: that it needs.
+        run: called with the flags, or with words if it ``reads_words``: those after the command's
+            name.
+        flags: their dataclass; None where ``run`` has none.
     """
 
     summary: str

@@ -42,8 +42,11 @@ class Function:
 class Policy(NamedTuple):
     """What flies.
 
-    network: has ``first_memory()`` and ``act(params, memory, observation)``, which returns the next
-    memory and sticks. checkpoint: where it comes from one. sha256: of its file; empty without one.
+    Attributes:
+        network: has ``first_memory()`` and ``act(params, memory, observation)``, which returns the
+            next memory and sticks.
+        checkpoint: where it comes from one.
+        sha256: of its file; empty without one.
     """
 
     name: str

@@ -111,8 +111,10 @@ def run(
 ) -> dict[str, Any]:
     """Return the result of policies, one a training seed, on tasks, as JSON values.
 
-    seconds, adapt: with so much data of each task, each policy is replaced by what is made of it.
-    report: called with flights done and to do.
+    Args:
+        seconds, adapt: with so much data of each task, each policy is replaced by what is made of
+            it.
+        report: called with flights done and to do.
     """
     started_s, total = time.process_time(), len(tasks) * len(policies)
     flown: dict[str, list[dict[str, Any]]] = {}

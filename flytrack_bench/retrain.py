@@ -14,8 +14,9 @@ from flytrack_sysid import diagnose
 def diagnose_and_retrain(data: Data, policy: Policy) -> Policy:
     """Return a policy trained from scratch, by the default recipe, on a plant's extended model.
 
-    policy: flies all the data that are left. Flights are of its own seed, that of the training is
-    0.
+    Args:
+        policy: flies all the data that are left. Flights are of its own seed, that of the training
+            is 0.
     """
     found = diagnose(data.fly(policy, data.seconds_left))
     with tempfile.TemporaryDirectory() as folder:
@@ -28,7 +29,8 @@ def diagnose_and_retrain(data: Data, policy: Policy) -> Policy:
 def adapt_to_flight(data: Data, policy: Policy) -> Policy:
     """Return the policy that ``flytrack adapt`` makes of a plant's data.
 
-    policy: flies all the data that are left, and is improved.
+    Args:
+        policy: flies all the data that are left, and is improved.
 
     Raises:
         PolicyError: a policy that is no checkpoint.

@@ -34,8 +34,9 @@ class SuiteError(ValueError):
 class Task:
     """A course and what flies it.
 
-    craft: of a hidden plant; None: the simulator's nominal drone. optimal_lap_s: the nominal
-    drone's time-optimal flying lap, by which lap times are divided.
+    Attributes:
+        craft: of a hidden plant; None: the simulator's nominal drone.
+        optimal_lap_s: the nominal drone's time-optimal flying lap, by which lap times are divided.
     """
 
     id: str
@@ -53,7 +54,10 @@ class Task:
 class Suite:
     """A set of tasks.
 
-    starts: perturbed starts per task. laps: to fly from each. steps: at most, of a flight.
+    Attributes:
+        starts: perturbed starts per task.
+        laps: to fly from each.
+        steps: at most, of a flight.
     """
 
     name: str

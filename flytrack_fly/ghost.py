@@ -75,7 +75,8 @@ def make_ghost(
 ) -> tuple[Ghost | None, ModelParameters]:
     """Return the ghost of a kind, and the pilot's model.
 
-    model: if None, the champion's own or the nominal one.
+    Args:
+        model: if None, the champion's own or the nominal one.
 
     Raises:
         ValueError: no reference of this track, or a champion that flies no two laps here.
@@ -111,7 +112,8 @@ def fly_champion(
 ) -> tuple[np.ndarray, np.ndarray, ModelParameters]:
     """Return states (T, 21), commands (T, 4) and model of a flight of the shipped champion.
 
-    model: the champion's own if None.
+    Args:
+        model: the champion's own if None.
 
     Raises:
         ImportError: without the extra [train].

@@ -101,8 +101,9 @@ def play(
 ) -> None:
     """Let a pilot fly in real time until he quits.
 
-    show: shows a picture. tick: waits until the next one is due; returns the time since the last
-    one, s.
+    Args:
+        show: shows a picture.
+        tick: waits until the next one is due; returns the time since the last one, s.
     """
     renderer, behind_s = make_renderer(session.params.course, session.gate_ids), 0.0
     while not controls.is_over:

@@ -29,7 +29,10 @@ GRID = RaceRules()
 def steps_due(behind_s: float, frame_s: float, step_s: float) -> tuple[int, float]:
     """Return how many steps are due after a picture that took ``frame_s`` s, and the rest, s.
 
-    behind_s: left over before. No more than ``MAX_LAG_S`` are caught up on.
+    No more than ``MAX_LAG_S`` are caught up on.
+
+    Args:
+        behind_s: left over before.
     """
     due_s = min(behind_s + frame_s, MAX_LAG_S)
     steps = math.floor(due_s / step_s + ROUNDING)
@@ -40,8 +43,9 @@ def steps_due(behind_s: float, frame_s: float, step_s: float) -> tuple[int, floa
 class Flight:
     """A flight from the start: log, commands (4,), lap times, gates passed, why it ended.
 
-    gap: index of the last gate that was passed, and how much later within the lap than the ghost,
-    s.
+    Attributes:
+        gap: index of the last gate that was passed, and how much later within the lap than the
+            ghost, s.
     """
 
     log: FlightLog

@@ -53,7 +53,9 @@ class Gamepad:
 def move_by_keys(sticks: np.ndarray, pulls: np.ndarray, is_full: bool, dt_s: float) -> np.ndarray:
     """Return sticks (4,) after ``dt_s`` s of held keys; released, they go back to the middle.
 
-    pulls: (4,), the direction in which keys pull each stick: -1, 0 or 1. is_full: Shift is held.
+    Args:
+        pulls: (4,), the direction in which keys pull each stick: -1, 0 or 1.
+        is_full: Shift is held.
     """
     targets = pulls if is_full else pulls * KEY_REACH
     is_outwards = (pulls != 0.0) & ((targets - sticks) * pulls > 0.0)

@@ -40,9 +40,11 @@ class Settings:
 class Loop(NamedTuple):
     """The results of the loop on a plant.
 
-    before, after: policies of the minimal and of the extended model, the same if nothing was named.
-    diagnosis: of race_log, flights of the first policy, together with the excitation. held_out:
-    more flights of it, used for testing only.
+    Attributes:
+        before, after: policies of the minimal and of the extended model, the same if nothing was
+            named.
+        diagnosis: of race_log, flights of the first policy, together with the excitation.
+        held_out: more flights of it, used for testing only.
     """
 
     before: Stage

@@ -25,9 +25,11 @@ BATCH = 16  # flights that are flown at once
 class Errors(NamedTuple):
     """What a model gets wrong on flights that it has not seen.
 
-    one_step_nrmse: by channel; 1 is as bad as "nothing changes" or the mean. position_m: median
-    error of free flight, by seconds. Both lack what the log cannot tell: flights end where the
-    drone crashes.
+    Both numbers lack what the log cannot tell: flights end where the drone crashes.
+
+    Attributes:
+        one_step_nrmse: by channel; 1 is as bad as "nothing changes" or the mean.
+        position_m: median error of free flight, by seconds.
     """
 
     one_step_nrmse: dict[str, float]
@@ -37,7 +39,8 @@ class Errors(NamedTuple):
 class Gap(NamedTuple):
     """The same policy in its simulator and on the plant, from the same noisy starts.
 
-    simulator, plant: the race there.
+    Attributes:
+        simulator, plant: the race there.
     """
 
     simulator: Score
@@ -52,8 +55,11 @@ class Gap(NamedTuple):
 class Stage(NamedTuple):
     """A model and the policy that was trained on it.
 
-    name: of the stage, and of the training's folder. checkpoint: of the policy. gap: its race.
-    errors: of the model, None where there was no log to judge it by.
+    Attributes:
+        name: of the stage, and of the training's folder.
+        checkpoint: of the policy.
+        gap: its race.
+        errors: of the model, None where there was no log to judge it by.
     """
 
     name: str
@@ -100,9 +106,11 @@ def fly_log(
 ) -> FlightLog:
     """Return the log of a policy's flights on a plant, from noisy starts, a segment per flight.
 
-    seconds: flights are added until the log is that long, or there were 16 of them. noise: 0 logs
-    states as they are, 1 as common sensors would (``flytrack_sysid.sensors``). Three laps end a
-    flight, or 25 s, or a crash.
+    Three laps end a flight, or 25 s, or a crash.
+
+    Args:
+        seconds: flights are added until the log is that long, or there were 16 of them.
+        noise: 0 logs states as they are, 1 as common sensors would (``flytrack_sysid.sensors``).
 
     Raises:
         ValueError: no flight lasts half a second.
@@ -147,7 +155,9 @@ def train_stage(
 ) -> Stage:
     """Train a policy on a model, from scratch, and race it; ``out``/NAME holds the training.
 
-    evaluation_seed: of the noisy starts. held_out: a log to judge the model by, if there is one.
+    Args:
+        evaluation_seed: of the noisy starts.
+        held_out: a log to judge the model by, if there is one.
     """
     checkpoint, _ = train_policy(out / name, config, seed, env_id, model=model)
     return judge(name, model, checkpoint, plant, evaluation_seed, held_out)

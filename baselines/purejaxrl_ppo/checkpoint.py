@@ -206,8 +206,11 @@ def as_named_arrays(tree: Any) -> Arrays:
 def from_named_arrays(where: Any, arrays: Arrays, target: Any) -> Any:
     """Return named arrays as a tree.
 
-    Args: where: the file, for the message. arrays: as ``as_named_arrays`` returns them; random keys
-        are of JAX's default implementation. target: the tree, of shapes and types.
+    Args:
+        where: the file, for the message.
+        arrays: as ``as_named_arrays`` returns them; random keys are of JAX's default
+            implementation.
+        target: the tree, of shapes and types.
 
     Raises:
         CheckpointError: leaves that are missing, superfluous, or of another shape or type.
@@ -248,9 +251,14 @@ def save_checkpoint(
 ) -> None:
     """Write a checkpoint atomically.
 
-    Args: path: of the file. params: of the network. config: of the training. description: JSON
-        values; needs env_id, track, missed_gate and observation_size, may hold more. training:
-        named arrays of what else training needs to continue; None: the file is a policy alone.
+    Args:
+        path: of the file.
+        params: of the network.
+        config: of the training.
+        description: JSON values; needs env_id, track, missed_gate and observation_size, may hold
+            more.
+        training: named arrays of what else training needs to continue; None: the file is a policy
+            alone.
 
     Raises:
         OSError: the file cannot be written.

@@ -45,7 +45,8 @@ def plant_env(
 
     The plant may be a black box, for example.
 
-    track: name or file; the checkpoint's if None.
+    Args:
+        track: name or file; the checkpoint's if None.
 
     Raises:
         CheckpointError, TrackError: a checkpoint that does not fit, a track that cannot be used.

@@ -271,7 +271,8 @@ def _comment(text: str) -> str:
 def onnx_of(policy: ExportedPolicy, is_float64: bool = False) -> bytes:
     """Return the content of an ONNX file.
 
-    is_float64: compute in float64 between the float32 inputs and the float32 action.
+    Args:
+        is_float64: compute in float64 between the float32 inputs and the float32 action.
 
     Raises:
         ImportError: onnx is not installed.

@@ -296,7 +296,8 @@ def _race_batch(
 ) -> Outcomes:
     """Return the outcomes of one batch of flights.
 
-    models: one for each key, or None for that of ``params``.
+    Args:
+        models: one for each key, or None for that of ``params``.
     """
 
     def race(key: jax.Array, model: ModelParameters | None) -> Outcomes:

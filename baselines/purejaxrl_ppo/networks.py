@@ -241,8 +241,9 @@ class Policy:
 def make_network(config: Config, num_choices: int = 0, sees_image: bool = False) -> ActorCritic:
     """Return the network that a configuration describes.
 
-    num_choices: number of discrete actions; 0 for continuous ones. sees_image: whether an
-    observation is an image.
+    Args:
+        num_choices: number of discrete actions; 0 for continuous ones.
+        sees_image: whether an observation is an image.
     """
     return ActorCritic(
         hidden_sizes=config.hidden_sizes,

@@ -35,14 +35,18 @@ class LostError(ValueError):
 class Settings(NamedTuple):
     """How a policy is polished.
 
-    Attributes: updates: of the policy. learning_rate: at the start; it falls to 0 as a cosine.
-            flights: of one update, from noisy start poses. laps: of a flight. slowest_lap_s: mean
-            lap time from which a flight is cut off (s). offset_limit: of a pass, over the free half
-            opening, from which it is penalised. penalty_s: seconds for the square of an offset
-            beyond the limit. widened_m: by which half openings are widened. largest_gradient: norm
-            at which the gradient of an update is clipped. gradient_decay: share of a state's
-            gradient that is passed on to the step before; below 1 it looks ahead for 1 / (1 -
-            share) steps and cannot overflow.
+    Attributes:
+        updates: of the policy.
+        learning_rate: at the start; it falls to 0 as a cosine.
+        flights: of one update, from noisy start poses.
+        laps: of a flight.
+        slowest_lap_s: mean lap time from which a flight is cut off (s).
+        offset_limit: of a pass, over the free half opening, from which it is penalised.
+        penalty_s: seconds for the square of an offset beyond the limit.
+        widened_m: by which half openings are widened.
+        largest_gradient: norm at which the gradient of an update is clipped.
+        gradient_decay: share of a state's gradient that is passed on to the step before; below 1 it
+            looks ahead for 1 / (1 - share) steps and cannot overflow.
     """
 
     updates: int = 1500

@@ -43,9 +43,10 @@ def distribution(times_s: np.ndarray) -> dict[str, Any]:
 def summarize(outcomes: Outcomes, is_limited: bool) -> dict[str, Any]:
     """Return a summary of flights, as JSON values.
 
-    Args: outcomes: of the flights; several causes can end one. is_limited: whether there is a
-            number of laps to complete. Without, ``success`` is None, and a flight whose steps ran
-            out counts as ended by the time limit.
+    Args:
+        outcomes: of the flights; several causes can end one.
+        is_limited: whether there is a number of laps to complete. Without, ``success`` is None, and
+            a flight whose steps ran out counts as ended by the time limit.
     """
     is_complete = outcomes.is_complete()
     ended = {"laps_complete": is_complete, **outcomes.ends()}

@@ -150,8 +150,10 @@ def removed(
 ) -> tuple[float, float]:
     """Return the share of explainable error that a model removes on a clean flight, and the error.
 
-    base: refitted, without effects, in the same motion. The error is the rms whitened residual of
-    that, 1 is the noise.
+    The error is the rms whitened residual of the base; 1 is the noise.
+
+    Args:
+        base: refitted, without effects, in the same motion.
     """
     with jax.enable_x64(True):
         chunks = cut_chunks(clean, np.ones(len(clean), bool), base)
@@ -169,8 +171,9 @@ def removed(
 def _expected(truth: Truth, log: FlightLog, tau: np.ndarray, coeffs: np.ndarray) -> np.ndarray:
     """Return specific force, body rates and voltage of the plant without effects, (num_rows, 7).
 
-    tau, coeffs: lags, s, from the first command on, and coefficients of thrust, in place of the
-    truth's.
+    Args:
+        tau, coeffs: lags, s, from the first command on, and coefficients of thrust, in place of the
+            truth's.
     """
     before = np.maximum(np.arange(len(log)) - 1, 0)
     applied = lagged(tau, log["u"], float(log.time[1] - log.time[0]))

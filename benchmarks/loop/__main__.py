@@ -57,11 +57,16 @@ def main(
 ) -> None:
     """Run what is missing, print and write the page; exit 1 on a missed target.
 
-    plants: with hidden effects, beside the shipped one. laws: plants with a law outside the list,
-    instead. seed: of plants, trainings, logs and evaluations. steps: of every training. out: folder
-    of all runs. page: by default loop.md in it. redraw: records to write the page of, instead,
-    beside them. address: of a Ray cluster, whose nodes see this checkout and the folder of runs
-    under the same paths; by default processes of this machine.
+    Args:
+        plants: with hidden effects, beside the shipped one.
+        laws: plants with a law outside the list, instead.
+        seed: of plants, trainings, logs and evaluations.
+        steps: of every training.
+        out: folder of all runs.
+        page: by default loop.md in it.
+        redraw: records to write the page of, instead, beside them.
+        address: of a Ray cluster, whose nodes see this checkout and the folder of runs under the
+            same paths; by default processes of this machine.
     """
     if redraw is not None and page is not None:
         sys.exit("--page: found together with --redraw, which writes the page beside the records")

@@ -200,7 +200,8 @@ def fly(
 ) -> np.ndarray:
     """Return positions at the ends of flights (m), (num_flights, 3), by the model's motion.
 
-    residual: returns what force (m/s^2) and rates (rad/s) of the body have beyond the model.
+    Args:
+        residual: returns what force (m/s^2) and rates (rad/s) of the body have beyond the model.
     """
     step_s, past = flights.step_s, flights.past
     applied = lagged(model.tau, flights.commands.swapaxes(0, 1), step_s)

@@ -177,7 +177,8 @@ def _inputs(state: State) -> np.ndarray:
 def _learned(log: FlightLog, model: ModelParameters, learner: Any, rows: int) -> Answer:
     """Return predictions with what a learner makes of gyro and accelerometer beyond the model.
 
-    rows: of which inputs and targets are averaged, as the sensors are noisy.
+    Args:
+        rows: of which inputs and targets are averaged, as the sensors are noisy.
     """
     model = model._replace(motion=motion_of(log, model))
     found = replay(log, model)

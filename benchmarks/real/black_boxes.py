@@ -42,9 +42,11 @@ GRAVITY = np.array([0.0, 0.0, 9.80665])
 class Rows(NamedTuple):
     """Rows with enough of a past, and what comes of each; all (num_rows, ...).
 
-    commands: (num_rows, past, 4), the latest last. past_rates_b: (num_rows, past, 3). base: rates
-    after the step and specific force of the refitted base, body, (num_rows, 6). target: the
-    measured ones.
+    Attributes:
+        commands: (num_rows, past, 4), the latest last.
+        past_rates_b: (num_rows, past, 3).
+        base: rates after the step and specific force of the refitted base, body, (num_rows, 6).
+        target: the measured ones.
     """
 
     commands: np.ndarray
@@ -197,7 +199,8 @@ def fit_linear_boxes(rows: Rows) -> Mapping[str, BlackBox]:
 def fly_windows(black_box: BlackBox, windows: Windows, base: np.ndarray) -> FlightErrors:
     """Return a black box's errors on windows of a log.
 
-    base: ``base_steps`` of all rows of the log.
+    Args:
+        base: ``base_steps`` of all rows of the log.
     """
     record, first = windows.record, windows.first_free - 1
     step_s = float(np.median(record.step_s))

@@ -224,7 +224,8 @@ def in_proportion(model: ModelParameters, per_command: float) -> ModelParameters
 
     The command is in N. A flight near hover does not show the curve of the thrust.
 
-    per_command: specific force, m/s^2, of a command of one above the lowest.
+    Args:
+        per_command: specific force, m/s^2, of a command of one above the lowest.
     """
     slope = per_command * float(model.m)
     return model._replace(thrust_coeffs=np.array([slope, slope, 0.0, 0.0, 0.0, 0.0]))
@@ -316,8 +317,10 @@ def betaflight(data: Path) -> Record:
 class Craft(NamedTuple):
     """A drone: its title, the folder of its flights, how it is measured, and its part of the page.
 
-    folder: within the folder of all data, which ``measure`` is given. part: of a record, what
-    stands before its diagnoses; or a text. diagnoses: of a record, by title.
+    Attributes:
+        folder: within the folder of all data, which ``measure`` is given.
+        part: of a record, what stands before its diagnoses; or a text.
+        diagnoses: of a record, by title.
     """
 
     title: str

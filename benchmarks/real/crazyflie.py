@@ -148,7 +148,8 @@ def error_ratios(
 ) -> dict[str, list[list[float]]]:
     """Return the extended model's errors over the base's, (horizons, quantities), by flight.
 
-    segment: (windows,), the flight of each; 0 where a flight has no window.
+    Args:
+        segment: (windows,), the flight of each; 0 where a flight has no window.
     """
     ratios = {}
     for number in np.unique(segment):

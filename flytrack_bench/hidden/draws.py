@@ -186,7 +186,8 @@ def draw_base(rng: Rng) -> Truth:
 def draw_effect(name: str, rng: Rng, size: float | None = None, has_drag: bool = False) -> Values:
     """Return an effect's parameters, in a random direction; the size is drawn if not given.
 
-    has_drag: whether the plant has drag: wind is then moving air, else a steady push.
+    Args:
+        has_drag: whether the plant has drag: wind is then moving air, else a steady push.
 
     Raises:
         KeyError: if there is no such effect.

@@ -257,7 +257,10 @@ EFFECTS: dict[str, dict[str, Callable[[Parameters], Hook]]] = {
 class Start(NamedTuple):
     """The start of a flight, at rest in the air.
 
-    pos_w: m. heading: rad. open_v: voltage without load, V.
+    Attributes:
+        pos_w: m.
+        heading: rad.
+        open_v: voltage without load, V.
     """
 
     pos_w: Vector
@@ -269,7 +272,10 @@ class Start(NamedTuple):
 class Felt(NamedTuple):
     """What an inertial sensor measures.
 
-    force_b: specific force, m/s^2. rates_b: body rates, rad/s. slopes_b: of the rates, rad/s^2.
+    Attributes:
+        force_b: specific force, m/s^2.
+        rates_b: body rates, rad/s.
+        slopes_b: of the rates, rad/s^2.
     """
 
     force_b: Vector
@@ -288,8 +294,9 @@ class Tracked(NamedTuple):
 class Part(NamedTuple):
     """A part of a step.
 
-    is_new: whether the delayed command has arrived before it. is_felt, is_tracked: whether the
-    inertial sensor or motion capture reads at its end.
+    Attributes:
+        is_new: whether the delayed command has arrived before it.
+        is_felt, is_tracked: whether the inertial sensor or motion capture reads at its end.
     """
 
     length_s: float
@@ -320,7 +327,9 @@ class HiddenDrone:
     ):
         """Place the drone at a start.
 
-        duration_s, centre_w: of the flight, for effects outside the list. settle_s: before its log.
+        Args:
+            duration_s, centre_w: of the flight, for effects outside the list.
+            settle_s: before its log.
         """
         self.truth, self.duration_s, self.centre_w = truth, duration_s, centre_w
         self.pos_w, self.vel_w, self.acc_w = start.pos_w, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -468,7 +477,8 @@ class HiddenDrone:
     def _arriving(self, sticks: Sticks) -> tuple[Sticks, Sticks]:
         """Return the sticks that act in the first ``_late_share`` of a step, and in its rest.
 
-        sticks: sent in this step; those of the first step act as if they had been held before.
+        Args:
+            sticks: sent in this step; those of the first step act as if they had been held before.
         """
         self.past = tuple(
             tuple(where(self.has_flown, old, new) for old, new in zip(command, sticks, strict=True))

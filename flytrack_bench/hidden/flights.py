@@ -98,9 +98,12 @@ def imu_readings(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return accelerometer and gyro, (num_rows, 3), m/s^2 and rad/s.
 
-    force_b, rates_b, slopes_b: of the centre of mass, a row per step; slopes are not used but in
-    fine motion. Applied in this order: lever arm f + w x (w x r) + dw/dt x r of an IMU at r
-    ("imu_offset", m), scale, bias, latency ("imu_latency", s).
+    Applied in this order: lever arm f + w x (w x r) + dw/dt x r of an IMU at r ("imu_offset", m),
+    scale, bias, latency ("imu_latency", s).
+
+    Args:
+        force_b, rates_b, slopes_b: of the centre of mass, a row per step; slopes are not used but
+            in fine motion.
     """
     offset_b = _vector(truth, "imu_offset", 0.0)
     if truth.motion != "fine":

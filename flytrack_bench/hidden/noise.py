@@ -64,7 +64,8 @@ NOISES: dict[str, Draw] = {
 def measure(log: FlightLog, noise: str, rng: np.random.Generator) -> FlightLog:
     """Return a flight as sensors log it: noisy, quantised, with rows lost, without acceleration.
 
-    noise: of ``NOISES``; "none" only drops the acceleration, which no sensor measures.
+    Args:
+        noise: of ``NOISES``; "none" only drops the acceleration, which no sensor measures.
     """
     if noise == "none":
         return log.without("a")

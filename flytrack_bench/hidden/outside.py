@@ -136,7 +136,8 @@ def draw_outside(rng: Rng, kind: str | None = None, amplitude: float | None = No
 
     A drawn amplitude is log-uniform.
 
-    amplitude: as a multiple of the sensor noise in its channel.
+    Args:
+        amplitude: as a multiple of the sensor noise in its channel.
 
     Raises:
         KeyError: if there is no such kind.

@@ -74,7 +74,8 @@ AUTOMATIC = np.full(4, np.nan)  # no stick is moved by hand
 class Moment(NamedTuple):
     """The target at one time, world: m, m/s, m/s^2, rad.
 
-    sticks: (4,), those moved by hand; nan where the pilot flies.
+    Attributes:
+        sticks: (4,), those moved by hand; nan where the pilot flies.
     """
 
     pos_w: np.ndarray
@@ -277,7 +278,8 @@ def cycle(sketch: Sketch) -> None:
 def plan(seconds: float, rng: Rng, caution: int = 0) -> list[Moment]:
     """Return the plan of a flight, a moment per 10 ms.
 
-    caution: number of earlier attempts that were too low or too fast.
+    Args:
+        caution: number of earlier attempts that were too low or too fast.
     """
     start_w = np.append(rng.uniform(-START_SPREAD_M, START_SPREAD_M, 2), 0.0)
     start_w[2] = HIGHER_M * caution + rng.uniform(*HIGH_M)

@@ -15,8 +15,11 @@ MOTIONS = ("handout", "semi_implicit", "fine")
 class Outside:
     """An effect outside the package's list.
 
-    kind: of ``flytrack_bench.hidden.laws``. channel: what it changes, of ``laws.SCALES``.
-    amplitude: its largest size in that unit. shape: parameters of the kind.
+    Attributes:
+        kind: of ``flytrack_bench.hidden.laws``.
+        channel: what it changes, of ``laws.SCALES``.
+        amplitude: its largest size in that unit.
+        shape: parameters of the kind.
     """
 
     kind: str
@@ -29,8 +32,10 @@ class Outside:
 class Gust:
     """Gusts as a first-order random process per world axis, felt by the accelerometer.
 
-    std: m/s^2, specific force. time_constant: s. rate_std: rad/s, the same of body rates; 0 for
-    none.
+    Attributes:
+        std: m/s^2, specific force.
+        time_constant: s.
+        rate_std: rad/s, the same of body rates; 0 for none.
     """
 
     std: float
@@ -42,11 +47,18 @@ class Gust:
 class Truth:
     """A plant; the handout's if it has no effects.
 
-    tau: s. coeffs: N, of 1, u, u^2, u^3, V, u V. max_rate: deg/s. drain: V/min. mass: kg. gravity:
-    m/s^2. effects: name -> parameter -> value, of ``flytrack_bench.hidden.drone``, SI. onset_s:
-    time in the log at which all effects begin; None: before it. motion: of ``MOTIONS``, see
-    ``flytrack_bench.hidden.drone``. step_s: between rows of the log. mocap_late_s: by which
-    position, velocity and attitude are logged late.
+    Attributes:
+        tau: s.
+        coeffs: N, of 1, u, u^2, u^3, V, u V.
+        max_rate: deg/s.
+        drain: V/min.
+        mass: kg.
+        gravity: m/s^2.
+        effects: name -> parameter -> value, of ``flytrack_bench.hidden.drone``, SI.
+        onset_s: time in the log at which all effects begin; None: before it.
+        motion: of ``MOTIONS``, see ``flytrack_bench.hidden.drone``.
+        step_s: between rows of the log.
+        mocap_late_s: by which position, velocity and attitude are logged late.
     """
 
     tau: tuple[float, ...]

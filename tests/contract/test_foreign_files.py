@@ -69,7 +69,9 @@ class Trap:
 class Kind(NamedTuple):
     """A kind of file: a writer or content of a valid one, its loader, and the loader's error.
 
-    hostile: return files made to do harm from a valid one. is_slow: the loader starts a process.
+    Attributes:
+        hostile: return files made to do harm from a valid one.
+        is_slow: the loader starts a process.
     """
 
     suffix: str

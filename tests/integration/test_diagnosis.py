@@ -113,7 +113,8 @@ def _wind_in_hover(rng):
 def _changed(field, size, rng):
     """Return a plant of which the team believes an older base, flown as it is now.
 
-    size: |ln factor| of the field's values is at most that, and at least half of it.
+    Args:
+        size: |ln factor| of the field's values is at most that, and at least half of it.
     """
     believed = _drawn(rng)
     values = np.array(getattr(believed, field))

@@ -48,9 +48,13 @@ def falls(
 ):
     """Return a flight of 10 s, a fall of 10 s that does not turn, and a flight of 10 s.
 
-    Args: kind: "ballistic", without drag, or "descent", on quadratic drag, until drag carries the
-        weight. noise: factor of NOISE. terminal_speed: of the descent, m/s. throttle: during the
-        fall, as a fraction of its range. seed: of motion and noise.
+    Args:
+        kind: "ballistic", without drag, or "descent", on quadratic drag, until drag carries the
+            weight.
+        noise: factor of NOISE.
+        terminal_speed: of the descent, m/s.
+        throttle: during the fall, as a fraction of its range.
+        seed: of motion and noise.
     """
     flight = stands_flies_and_lands(seed=seed)
     part = flight.select((flight.time >= TAKE_OFF_S + 0.1) & (flight.time < LANDING_S - 0.1))

@@ -17,8 +17,13 @@ HOVER = -0.25  # about what holds the weight of ``HandoutPlant``
 class HandoutPlant:
     """A plant ``step(x, u)`` with parameters that no tool is told; one state or many at once.
 
-    tau: s. coeffs: N on 1 kg. max_rate: deg/s. drain: V/min. drag_b: 1/s, linear drag along the
-    body's axes. gravity: m/s^2.
+    Attributes:
+        tau: s.
+        coeffs: N on 1 kg.
+        max_rate: deg/s.
+        drain: V/min.
+        drag_b: 1/s, linear drag along the body's axes.
+        gravity: m/s^2.
     """
 
     tau: tuple[float, ...] = (0.021, 0.034, 0.057, 0.045)
@@ -82,8 +87,9 @@ def states_of(log):
 def excited(plant, skip=1, repeat=1, jitter=0.0):
     """Return the log of the excitation on a plant, float64, without noise.
 
-    skip, repeat: of commands, for steps of 0.01 s times skip over repeat. jitter: of steps,
-    relative.
+    Args:
+        skip, repeat: of commands, for steps of 0.01 s times skip over repeat.
+        jitter: of steps, relative.
     """
     rng = np.random.default_rng(5)
     planned = script(24, HOVER, rng)
