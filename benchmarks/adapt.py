@@ -6,9 +6,10 @@ base model, without any name, policies that were trained once for plants around 
 (``benchmarks.adapt_rivals``), a network that learns what the policy's model misses
 (``benchmarks.adapt_residual``), and the limit, a descent on the plant itself. Between them come
 plants without effects that the policy claims to be made for: nothing is to be adapted to. Last come
-configurations of real firmware (docs/firmware.md), whose settings are known. Appends a line a trial
-to docs/results/adapt.jsonl, and a later run resumes there; ``--page`` writes docs/results/adapt.md
-from the last commit of each kind of trial, length of a log and seed.
+plants of other batteries and masses, and configurations of real firmware (docs/firmware.md), whose
+settings are known. Appends a line a trial to docs/results/adapt.jsonl, and a later run resumes
+there; ``--page`` writes docs/results/adapt.md from the last commit of each kind of trial, length of
+a log and seed.
 """
 
 import time
@@ -32,8 +33,10 @@ from benchmarks.loop.plants import draw_base
 from benchmarks.report import Line
 from firmware import Betaflight, Body
 from flytrack_bench import load_suite
-from flytrack_bench.hidden import MOTIONS, HiddenPlant
+from flytrack_bench.hidden import MOTIONS, HiddenPlant, Truth
 from flytrack_env import ModelParameters, nominal_parameters
+from flytrack_env.battery import Battery
+from flytrack_env.dynamics import VOLTAGE_TERMS
 from flytrack_env.effects import BY_NAME
 from flytrack_env.model_file import model_as_json, model_from_json
 from flytrack_env.plants import Plant
@@ -48,12 +51,14 @@ from flytrack_sysid.sensors import measure
 LINES = report.RESULTS / "adapt.jsonl"
 POLICY, DT_S, NUM_LAPS, NUM_STEPS = "robust", 0.01, 25, 1000
 SECONDS, SEED = 10.0, 1  # of a log that refitted base and limit are made of, too
-Kind = Literal["plant", "unchanged", "rivals", "residual", "firmware"]
+Kind = Literal["plant", "unchanged", "rivals", "residual", "size", "firmware"]
 PLANT: Kind = "plant"
 UNCHANGED: Kind = "unchanged"
 RIVALS: Kind = "rivals"
 RESIDUAL: Kind = "residual"
+SIZE: Kind = "size"
 FIRMWARE: Kind = "firmware"
+SIZES = ((12.6, 0.12), (16.8, 0.3), (21.0, 0.5), (25.2, 0.75), (50.4, 4.0))  # full, V; mass, kg
 # Set-ups, and changes of the stock one.
 CONFIGURATIONS = (*SETUPS, "P and D term", "a weak motor", "drag", "mass", "bent thrust")
 NUM_PLANTS, NUM_UNCHANGED = 8, 20
@@ -90,11 +95,15 @@ def list_trials(seconds: float, seed: int) -> list[Trial]:
     for index, trial in enumerate(plants):
         rivals = [trial._replace(kind=kind) for kind in (RIVALS, RESIDUAL)]
         mixed += [trial, *rivals, *unchanged[2 * index : 2 * index + 2]]
+    sizes = [
+        Trial(SIZE, 1 + index, MOTIONS[index % len(MOTIONS)], seconds, seed)
+        for index in range(len(SIZES))
+    ]
     firmware = [
         Trial(FIRMWARE, number, "continuous", seconds, seed)
         for number in range(len(CONFIGURATIONS))
     ]
-    return [*mixed, *firmware]
+    return [*mixed, *sizes, *firmware]
 
 
 def fly(plant: Plant, motion: str, policy: Checkpoint, seconds: float, seed: int) -> FlightLog:
@@ -248,8 +257,8 @@ def is_as_expected(one: Line) -> bool:
     return bool(low <= one["entries"]["adapted"]["flying_lap_s"] <= high)
 
 
-def firmware_table(lines: list[Line]) -> str:
-    """Return a row for each configuration of the firmware."""
+def crafts_table(lines: list[Line]) -> str:
+    """Return a row for each craft that the policy was not made for."""
     rows = []
     for one in sorted(lines, key=lambda line: line["number"]):
         entries, named = one["entries"], ", ".join(one.get("named", ())) or "nothing"
@@ -261,7 +270,7 @@ def firmware_table(lines: list[Line]) -> str:
             format_lap(entries[name]) if name in entries else "-" for name in ("nothing", "adapted")
         ]
         rows.append([one["hidden"], verdict, named, *laps, gap, str(one.get("cpu_s", "-"))])
-    header = "configuration | verdict | named | nothing | adapted | gap to its simulator | CPU s"
+    header = "craft | verdict | named | nothing | adapted | gap to its simulator | CPU s"
     return report.table(header, rows)
 
 
@@ -270,7 +279,7 @@ def write_page(lines: list[Line]) -> None:
     failed = sum("error" in one for one in lines)
     lines = [one for one in lines if "error" not in one]
     of_all_logs = [one for one in lines if one["kind"] == PLANT]
-    firmware = [one for one in lines if one["kind"] == FIRMWARE]
+    of_kind = {kind: [one for one in lines if one["kind"] == kind] for kind in (SIZE, FIRMWARE)}
     lines = [one for one in lines if (one["seconds"], one["seed"]) == (SECONDS, SEED)]
     plants = [
         {**one, "entries": one["entries"] | entries_of_rivals(lines, one)}
@@ -306,7 +315,8 @@ def write_page(lines: list[Line]) -> None:
         f"{len(plants) - len(whole)} of them refused as a log. Errors: {failed}.",
         plants=plants_table(plants),
         logs=logs_table(of_all_logs),
-        firmware=firmware_table(firmware),
+        sizes=crafts_table(of_kind[SIZE]),
+        firmware=crafts_table(of_kind[FIRMWARE]),
         unchanged=text,
         commits=", ".join(f"{kind} {commit}" for kind, commit in commits.items()),
         machine=lines[-1]["machine"],
@@ -320,6 +330,7 @@ def measure_trial(trial: Trial) -> Line:
         UNCHANGED: measure_unchanged,
         RIVALS: measure_rivals,
         RESIDUAL: measure_residual,
+        SIZE: measure_size,
         FIRMWARE: measure_firmware,
     }
     return kinds[trial.kind](trial)
@@ -371,6 +382,43 @@ def measure_plant(trial: Trial) -> Line:
             limit = improve_on_plant(adapted.checkpoint, plant, trial.seed)
             entries[LIMIT] = raced(limit, plant)
     return result
+
+
+class SizedPlant(HiddenPlant):
+    """A hidden plant of another battery and mass, whose thrust over weight is as it was."""
+
+    def __init__(self, truth: Truth, full_v: float, mass: float):
+        per_volt, coeffs = float(Battery().full_v) / full_v, list(truth.coeffs)
+        coeffs[VOLTAGE_TERMS:] = [one * per_volt for one in coeffs[VOLTAGE_TERMS:]]
+        effects = dict(truth.effects)
+        if "voltage_sag" in effects:
+            effects["voltage_sag"] = {"at_full_v": effects["voltage_sag"]["at_full_v"] / per_volt}
+        super().__init__(
+            replace(
+                truth,
+                coeffs=tuple(one * mass / truth.mass for one in coeffs),
+                mass=mass,
+                drain=truth.drain / per_volt,
+                effects=effects,
+            )
+        )
+        self.battery = sized_battery(full_v)
+
+
+def sized_battery(full_v: float) -> Battery:
+    """Return a battery that ends at the same fraction of its highest voltage as the handout's."""
+    empty_v = full_v * float(Battery().empty_v) / float(Battery().full_v)
+    return Battery(full_v, empty_v, empty_v, full_v)
+
+
+def measure_size(trial: Trial) -> Line:
+    """Return what is made of a log of a craft whose battery and mass are known, and other."""
+    full_v, mass = SIZES[trial.number - 1]
+    plant = SizedPlant(make_plant(trial).truth, full_v, mass)
+    policy = load_checkpoint(POLICY)
+    craft = model_from_json(policy.meta["model"], "model").resized(mass, sized_battery(full_v))
+    result, _ = measure_adapted(trial, plant, policy, craft)
+    return {**result, "hidden": f"{full_v:g} V, {mass:g} kg: {plant.truth.text()}"}
 
 
 def measure_firmware(trial: Trial) -> Line:
@@ -456,7 +504,7 @@ def main(
     seconds: float = SECONDS,
     seed: int = SEED,
     page: bool = False,
-    kinds: tuple[Kind, ...] = (PLANT, UNCHANGED, RIVALS, RESIDUAL, FIRMWARE),
+    kinds: tuple[Kind, ...] = (PLANT, UNCHANGED, RIVALS, RESIDUAL, SIZE, FIRMWARE),
     jobs: report.JobFlags = report.IN_THIS_PROCESS,
 ) -> None:
     """Run the trials that are missing, or write the page of those that are there.

@@ -33,6 +33,7 @@ from flytrack_env.thrust import collective_thrust
 
 SECONDS_PER_MINUTE = 60.0
 FULL_STICKS = Action(1.0, 1.0, 1.0, 0.0)
+VOLTAGE_TERMS = 4  # of the thrust map: from this coefficient on they multiply the voltage
 HELD_S = 1e6  # s, long enough for lags and limits of the rates to settle, to float32's rounding
 
 
@@ -74,6 +75,26 @@ class ModelParameters(NamedTuple):
         merged = effects.merge(self.effects, *parameters)
         effects.check_beside_motors(merged)
         return self._replace(effects=merged)
+
+    def resized(self, mass: float, battery: Battery) -> "ModelParameters":
+        """Return the model of a craft of another mass and battery that flies alike.
+
+        Its thrust over weight is the same at the same fractions of the highest voltage. So thrust
+        scales with the mass, and its dependence on the voltage with the inverse of that voltage.
+
+        Args:
+            mass: kg.
+            battery: of the other craft.
+        """
+        per_volt = float(self.battery.full_v) / float(battery.full_v)
+        coeffs = np.asarray(self.thrust_coeffs, float) * mass / float(self.m)
+        coeffs[VOLTAGE_TERMS:] *= per_volt
+        return self._replace(
+            thrust_coeffs=coeffs.astype(np.float32),
+            m=mass,
+            battery_drain_v_per_min=float(self.battery_drain_v_per_min) / per_volt,
+            battery=battery,
+        )
 
     def effect(self, name: str) -> Any:
         """Return the parameters of an effect; neutral ones where the model does not have it.

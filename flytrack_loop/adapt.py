@@ -138,14 +138,15 @@ def adapt(
         settings: see ``Settings``.
         accept: adapt although the log contradicts itself or the policy's model.
         report: from a unit, what is called with the number done and of all.
-        craft: a model that has the settings of the craft; None if these are the policy's own.
+        craft: a model with mass, battery, full-stick rates and settings of the craft; None if these
+            are the policy's own.
 
     Raises:
         CheckpointError: a policy of another observation, or without its model.
         LogError: a log of no race, or of another craft.
     """
     model = model_of(checkpoint)
-    nominal = model if craft is None else with_settings(model, craft)
+    nominal = model if craft is None else as_craft(model, craft)
     check_inputs(log, nominal, accept)
     diagnosis = diagnose(log, nominal, report=report("stages"))
     if nominal is model and not is_different(diagnosis, model):
@@ -165,11 +166,19 @@ def is_different(diagnosis: Diagnosis, model: ModelParameters) -> bool:
     )
 
 
-def with_settings(model: ModelParameters, craft: ModelParameters) -> ModelParameters:
-    """Return a model with a craft's full-stick rates and settings, such as its rate loop."""
+def as_craft(model: ModelParameters, craft: ModelParameters) -> ModelParameters:
+    """Return a model with a craft's mass, battery, full-stick rates and settings.
+
+    Settings are its rate curve and its rate loop. The model itself is returned if it has all that.
+    """
     settings = [one for one in craft.effects if effect_of(one).search.is_setting]
-    is_same = np.array_equal(model.max_rate, craft.max_rate) and not settings
-    return model if is_same else model._replace(max_rate=craft.max_rate).with_effects(*settings)
+    known, own = (
+        [one.m, one.battery.full_v, one.battery.empty_v, *one.max_rate] for one in (model, craft)
+    )
+    if not settings and np.allclose(known, own):
+        return model
+    sized = model.resized(float(craft.m), craft.battery)
+    return sized._replace(max_rate=craft.max_rate).with_effects(*settings)
 
 
 def model_of(checkpoint: Checkpoint) -> ModelParameters:
@@ -291,7 +300,8 @@ def draw_moving(
 
 
 def embed(model: ModelParameters, like: ModelParameters) -> ModelParameters:
-    """Return a model with effects, motion and battery of another; what it lacks is neutral."""
+    """Return a model with effects, motion and size of another; what it lacks is neutral."""
+    model = model.resized(float(like.m), like.battery)
 
     def own(parameters: Any) -> Any:
         effect = effect_of(parameters)

@@ -18,7 +18,6 @@ from flytrack_sysid.log import FlightLog, LogError
 from flytrack_sysid.log_table import Table, columns_of, log_of_table
 
 MAX_LIST_LENGTH = 1000  # characters of a list of names in a message
-VOLTAGE_TERMS = 4  # of the thrust map: from this coefficient on they multiply the voltage
 
 
 class Craft(NamedTuple):
@@ -57,8 +56,7 @@ class Craft(NamedTuple):
         """Return the generic racing quadcopter scaled to this craft, as a start for fits.
 
         Assumption: the craft has the nominal craft's lags, and its thrust-to-weight ratios at the
-        same fractions of the highest voltage. So thrust scales with the mass, and its dependence on
-        the voltage with the inverse of the highest voltage.
+        same fractions of the highest voltage.
 
         Args:
             source: the log, for messages.
@@ -75,19 +73,10 @@ class Craft(NamedTuple):
             name = next(name for name in Craft._fields if getattr(needed, name) is None)
             raise LogError(f"{source}: craft.{name}: missing in log and mapping; a model needs it")
         empty_v, full_v = self.voltage_v
-        per_volt = float(nominal.battery.full_v) / full_v
-        coeffs = np.asarray(nominal.thrust_coeffs, float) * self.mass_kg / float(nominal.m)
-        coeffs[VOLTAGE_TERMS:] *= per_volt
-        leaves: dict[str, Any] = {  # NumPy arrays
-            "thrust_coeffs": coeffs.astype(np.float32),
-            "max_rate": np.asarray(max_rate, np.float32),
-        }
-        model = nominal._replace(
-            **leaves,
-            m=self.mass_kg,
+        battery = Battery(full_v, empty_v, fitted_low_v=empty_v, fitted_high_v=full_v)
+        model = nominal.resized(self.mass_kg, battery)._replace(
+            max_rate=np.asarray(max_rate, np.float32),
             motion=Motion.CONTINUOUS,  # as drones move
-            battery_drain_v_per_min=float(nominal.battery_drain_v_per_min) / per_volt,
-            battery=Battery(full_v, empty_v, fitted_low_v=empty_v, fitted_high_v=full_v),
         )
         return model if self.motors is None else model.with_effects(self.motors)
 

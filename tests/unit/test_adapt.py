@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from baselines.purejaxrl_ppo import CheckpointError, load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint import SHIPPED
 from flytrack_env import nominal_parameters
+from flytrack_env.battery import Battery
 from flytrack_env.dynamics import step
 from flytrack_env.effects import WIND, CommandDelay, LinearDrag, QuadraticDrag
 from flytrack_env.model_file import model_from_json
@@ -115,6 +116,21 @@ def test_a_model_in_the_structure_of_another_flies_as_it_did():
     assert np.abs(after[0] - after[2]).max() > 1e-4
 
 
+def test_a_policys_model_flies_alike_with_another_battery_and_mass():
+    """A charge of a half, of 24 V and 1 kg and of 16.8 V and 0.6 kg."""
+    battery = Battery(full_v=16.8, empty_v=15.4, fitted_low_v=15.4, fitted_high_v=16.8)
+    craft = adapting.as_craft(NOMINAL, NOMINAL._replace(m=0.6, battery=battery))
+    assert (craft.m, craft.battery) == (0.6, battery)
+    assert adapting.as_craft(NOMINAL, NOMINAL._replace(battery=Battery(24.0, 22.0))) is NOMINAL
+    after = []
+    for model in (NOMINAL, craft):
+        state = np.zeros(21, np.float32)
+        state[[2, 9, 20]] = 5.0, 1.0, model.battery.voltage(0.5)
+        after.append(np.asarray(step(state, jnp.array([0.3, -0.2, 0.1, 0.4]), 0.01, model)))
+    assert_allclose(after[0][:20], after[1][:20], rtol=1e-5, atol=1e-6)
+    assert_allclose(after[0][20] / 24.0, after[1][20] / 16.8, rtol=1e-6)
+
+
 def test_models_move_from_the_policys_own_to_the_plants():
     models = find_plausible_models(diagnosis(DRAG))
     start = to_vector(embed(NOMINAL, DRAG))
@@ -215,8 +231,8 @@ def test_the_settings_of_a_craft_are_there_from_the_start(log, monkeypatch):
     champion = load_checkpoint("champion")
     own = model_from_json(champion.meta["model"], "model")
     craft = NOMINAL._replace(max_rate=np.float32([500.0, 500.0, 200.0])).with_effects(GENERIC)
-    nominal = adapting.with_settings(own, craft)
-    assert adapting.with_settings(own, own) is own
+    nominal = adapting.as_craft(own, craft)
+    assert adapting.as_craft(own, own) is own
     assert_array_equal(nominal.max_rate, craft.max_rate)
     assert_array_equal(nominal.tau, own.tau)
     faster = nominal.with_effects(GENERIC._replace(roll_arm=2.0 * GENERIC.roll_arm))
