@@ -9,12 +9,14 @@ from numpy.testing import assert_allclose
 from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint_env import plant_env
 from baselines.purejaxrl_ppo.flights import Score, fly_many
+from benchmarks.adapt import SizedPlant, sized_battery
 from benchmarks.champion import CHAMPION
 from benchmarks.loop.plants import draw_plant
 from flytrack.cli import main
 from flytrack_bench import load_suite
 from flytrack_bench.hidden import HiddenPlant
-from flytrack_env import nominal_parameters
+from flytrack_env import BatteryWarning, nominal_parameters
+from flytrack_env.model_file import save_model
 from flytrack_loop import Gap, errors_of, fly_log, race
 from flytrack_loop.stages import log_of_flights, measure_gap
 from flytrack_sysid import save_log
@@ -76,16 +78,19 @@ def test_the_gap_is_between_the_plant_and_the_simulator_learnt_in(champion):
 
 @pytest.mark.slow
 def test_a_policy_that_crashes_on_a_hidden_plant_is_adapted_to_ten_seconds_of_it(tmp_path):
-    """The plant has equations of its own; the log is what common sensors measure."""
-    craft = load_suite("v1").chosen(("plant_1",))[0].craft
-    plant, policy = HiddenPlant(craft), load_checkpoint("robust")
-    log = fly_log(plant, policy, 3, 10.0, 1.0)
+    """The plant has equations, battery and mass of its own; its log is that of common sensors."""
+    hidden = load_suite("v1").chosen(("plant_1",))[0].craft
+    plant, policy = SizedPlant(hidden, 16.8, 0.6), load_checkpoint("robust")
+    known = nominal_parameters().resized(0.6, sized_battery(16.8))
+    save_model(tmp_path / "craft.json", known, {})
+    with pytest.warns(BatteryWarning, match="15.4 to 16.8 V"):
+        log = fly_log(plant, policy, 3, 10.0, 1.0)
+        old = race(policy, plant_env(policy, plant), 5, 64)
     save_log(tmp_path / "race.npz", log.select(np.arange(len(log)) < 1000))
     new = tmp_path / "new.safetensors"
-    main(["adapt", str(tmp_path / "race.npz"), "--checkpoint", "robust", "--out", str(new)])
-    old, adapted = (
-        race(one, plant_env(one, plant), 5, 64) for one in (policy, load_checkpoint(new))
-    )
+    named = "--checkpoint", "robust", "--model", str(tmp_path / "craft.json"), "--out", str(new)
+    main(["adapt", str(tmp_path / "race.npz"), *named])
+    adapted = race(load_checkpoint(new), plant_env(load_checkpoint(new), plant), 5, 64)
     assert old.success < 0.1 and adapted.success > 0.9
     assert adapted.flying_lap_s < 3.6
 
