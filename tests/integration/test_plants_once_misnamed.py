@@ -79,11 +79,21 @@ def test_logs_of_the_suite(log: str, names: set[str]) -> None:
     assert found.unexplained.flagged  # gusts, or the thermal
 
 
-def test_effects_of_the_given_model_that_are_not_in_the_plant() -> None:
-    """A drag that accelerates and a wind of 9 m/s had passed for rotor drag that is not there."""
+@pytest.mark.parametrize(
+    ("number", "motion", "seed"),
+    [
+        # A drag that accelerates and a wind of 9 m/s had passed for rotor drag that is not there.
+        (2, "semi_implicit", 0),
+        # A fit to five short flights that spin made rates worse with effects and without them.
+        (1, "fine", 1),
+    ],
+)
+def test_effects_of_the_given_model_that_are_not_in_the_plant(
+    number: int, motion: str, seed: int
+) -> None:
     policy, seconds = load_checkpoint("robust"), 10.0
-    plant = make_plant(adapt.Trial(adapt.PLANT, 2, "semi_implicit", seconds, 0))
-    log = fly(plant, policy, seconds, seed=0)
+    plant = make_plant(adapt.Trial(adapt.PLANT, number, motion, seconds, seed))
+    log = fly(plant, motion, policy, seconds, seed)
     model = model_from_json(policy.meta["model"], "model")
     causes = {cause.effect: cause for cause in diagnose(log, model).causes}
     given = {"rotor_drag", "quadratic_drag", "translational_lift"}

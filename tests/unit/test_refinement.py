@@ -84,6 +84,16 @@ def test_values_are_refined_by_flights(dragged):
     assert found.flight_test.worst_ratio(found.fit.vector) < 1.0
 
 
+def test_models_are_compared_with_the_base_that_is_given(dragged):
+    problem, found = dragged[2], dragged[3]
+    right, wrong = found.fit.vector, problem.start
+    with jax.enable_x64(True):
+        flight_test = found.flight_test.with_base(right)
+        assert flight_test.worst_ratio(wrong) > 1.0
+        assert flight_test.prefers(right, wrong) and not flight_test.prefers(wrong, right)
+        assert not flight_test.with_base(wrong).prefers(right, wrong)  # none is worse
+
+
 @pytest.mark.parametrize(
     ("candidate", "values", "doubted"),
     [
