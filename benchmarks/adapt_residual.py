@@ -84,10 +84,11 @@ def without_law(model: ModelParameters) -> ModelParameters:
 def learn(log: FlightLog, base: ModelParameters, seed: int) -> Any:
     """Return the network's weights: sums of its accelerations are what the model misses."""
     dt = float(np.median(np.diff(log.time)))
-    fades = np.exp(-dt / np.asarray(base.tau))
+    steps_s = np.diff(log.time, prepend=log.time[0])  # sensors lose rows
     commands = log["u"].astype(np.float32)
     applied = commands.copy()
     for row in np.flatnonzero(~log.is_start()):
+        fades = np.exp(-steps_s[row] / np.asarray(base.tau))
         applied[row] = commands[row - 1] + (applied[row - 1] - commands[row - 1]) * fades
     states = np.concatenate(
         [log["p"], log["v"], np.zeros((len(log), 3)), log["q"], log["w"], applied, log["v_bat"]],
@@ -98,6 +99,7 @@ def learn(log: FlightLog, base: ModelParameters, seed: int) -> Any:
     starts = np.maximum.accumulate(np.where(log.is_start(), np.arange(len(log)), 0))
     rows = np.arange(len(log) - WINDOW)
     rows = rows[(rows - starts[rows] >= LEAD_IN) & (starts[rows] == starts[rows + WINDOW])]
+    rows = rows[log.time[rows + WINDOW] - log.time[rows] < (WINDOW + 0.5) * dt]  # without gaps
     windows = rows[:, None] + np.arange(WINDOW)
     missed = states[rows + WINDOW][:, VELOCITY] - states[rows][:, VELOCITY]
     missed = (missed - explained[windows].sum(axis=1)) / dt

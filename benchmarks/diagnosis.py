@@ -35,6 +35,7 @@ CODE = (
     "flytrack_bench/misspec/suite.py",
     "benchmarks/diagnosis.py",
     "benchmarks/hidden",
+    "benchmarks/misspec/replay.py",
 )
 SECONDS = 60.0
 SEED = 29  # no rule was made on it; on 21 to 28 some were

@@ -247,7 +247,7 @@ def record_trials(
     jobs: Jobs = IN_THIS_PROCESS,
     code: Sequence[str] = (),
 ) -> None:
-    """Measure what has no line of this commit yet, and append a line of JSON for each trial.
+    """Measure trials without a line of this commit or its code, and append a line of JSON for each.
 
     Prints a summary of each line, and how many there are.
 

@@ -207,8 +207,8 @@ class Adapt:
     checkpoint: Annotated[Path, arg(metavar="PATH|champion|robust")] = Path("champion")
     """The policy: a checkpoint, or a shipped policy's name."""
     model: OptionalPath = None
-    """A model with mass, battery, full-stick rates, rate curve and rate loop of the craft, as
-    `flytrack import --model-out` writes one; default: they are the policy's."""
+    """A model with mass, battery, full-stick rates, rate curve and rate loop of the craft; default:
+    they are the policy's. `flytrack import --model-out` writes one without curve and loop."""
     seed: int = 0
     """Seed of the drawn plants and of the starts."""
     accept: bool = False

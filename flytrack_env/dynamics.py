@@ -81,6 +81,7 @@ class ModelParameters(NamedTuple):
 
         Its thrust over weight is the same at the same fractions of the highest voltage. So thrust
         scales with the mass, and its dependence on the voltage with the inverse of that voltage.
+        Effects stay as they are.
 
         Args:
             mass: kg.

@@ -4,7 +4,8 @@ The plant is known up to what the log leaves possible: models are drawn from the
 of the diagnosis. The policy descends the gradient of its race's time through some of them and is
 judged on others, as is the one that it was made from. A policy that cannot fly the plant has no
 such gradient there. So the models move, update by update, from the one that the policy flies to the
-plant's, and the policy follows.
+plant's, and the policy follows. Only a craft's rate loop is there from the start: half a loop is
+none.
 """
 
 from collections.abc import Callable
@@ -24,7 +25,7 @@ from baselines.purejaxrl_ppo.polish import LostError, polish
 from baselines.purejaxrl_ppo.polish import Settings as Polishing
 from baselines.purejaxrl_ppo.report import describe_share, share
 from flytrack_env import ModelParameters
-from flytrack_env.effects import effect_of
+from flytrack_env.effects import effect_of, takes_motors
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.model_file import model_as_json, model_from_json
 from flytrack_sysid import Diagnosis, FlightLog, LogError, diagnose
@@ -144,6 +145,7 @@ def adapt(
     Raises:
         CheckpointError: a policy of another observation, or without its model.
         LogError: a log of no race, or of another craft.
+        ValueError: a craft whose motors are commanded.
     """
     model = model_of(checkpoint)
     nominal = model if craft is None else as_craft(model, craft)
@@ -169,16 +171,45 @@ def is_different(diagnosis: Diagnosis, model: ModelParameters) -> bool:
 def as_craft(model: ModelParameters, craft: ModelParameters) -> ModelParameters:
     """Return a model with a craft's mass, battery, full-stick rates and settings.
 
-    Settings are its rate curve and its rate loop. The model itself is returned if it has all that.
+    Settings are its rate curve and its rate loop. The model itself is returned if it has all that:
+    what was fitted of a loop, such as the motors' lag, stays.
+
+    Raises:
+        ValueError: a craft whose motors are commanded.
     """
-    settings = [one for one in craft.effects if effect_of(one).search.is_setting]
-    known, own = (
-        [one.m, one.battery.full_v, one.battery.empty_v, *one.max_rate] for one in (model, craft)
-    )
-    if not settings and np.allclose(known, own):
+    if takes_motors(craft.effects):
+        raise ValueError("craft: found a model commanded by motors, expected one by sticks")
+    known, own = describe_craft(model), describe_craft(craft)
+    if known.keys() == own.keys() and np.allclose([*known.values()], [own[name] for name in known]):
         return model
+    laws = tuple(one for one in model.effects if not effect_of(one).search.is_setting)
+    settings = [one for one in craft.effects if effect_of(one).search.is_setting]
     sized = model.resized(float(craft.m), craft.battery)
-    return sized._replace(max_rate=craft.max_rate).with_effects(*settings)
+    return sized._replace(max_rate=craft.max_rate, effects=laws).with_effects(*settings)
+
+
+def describe_craft(model: ModelParameters) -> dict[str, float]:
+    """Return what of a model is known of a craft without flying it, by name."""
+    known = {"m": float(model.m), "full_v": float(model.battery.full_v)}
+    known |= {"empty_v": float(model.battery.empty_v)}
+    known |= {f"max_rate_{axis}": float(rate) for axis, rate in enumerate(model.max_rate)}
+    for parameters in model.effects:
+        effect = effect_of(parameters)
+        if effect.search.is_setting:
+            known |= {
+                f"{effect.name}.{name}": float(value)
+                for name, value in parameters._asdict().items()
+                if name not in effect.search.fitted
+            }
+    return known
+
+
+def with_loop(model: ModelParameters, craft: ModelParameters) -> ModelParameters:
+    """Return a model with those settings of a craft that have a memory: its rate loop."""
+    settings = [(effect_of(one), one) for one in craft.effects]
+    return model.with_effects(
+        *(one for effect, one in settings if effect.search.is_setting and effect.memory)
+    )
 
 
 def model_of(checkpoint: Checkpoint) -> ModelParameters:
@@ -257,7 +288,7 @@ def improve(
     moving = partial(
         draw_moving,
         models=models,
-        start=to_vector(embed(diagnosis.nominal, models.like)),
+        start=to_vector(embed(with_loop(model, diagnosis.nominal), models.like)),
         settings=settings,
     )
     seed_of_flights = int(jax.random.bits(keys["polish"], dtype=jnp.uint32) >> 1)

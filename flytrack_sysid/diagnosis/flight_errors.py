@@ -219,7 +219,7 @@ class FlightTest(NamedTuple):
         return self._with_evidence(self.tested(vector))
 
     def with_base(self, vector: np.ndarray) -> "FlightTest":
-        """Return the test with another base."""
+        """Return the test that compares models with another base; ``scale`` stays."""
         return self._replace(base=self.tested(vector))
 
     def prefers(self, vector: np.ndarray, other: np.ndarray) -> bool:
