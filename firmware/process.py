@@ -130,7 +130,9 @@ class Link:
 class Firmware:
     """The firmware with its settings, ready to be armed, in a process that is copied for flights.
 
-    values: every setting it has, by scope, profile and name. is_reversed: ``yaw_motors_reversed``.
+    Attributes:
+        values: every setting it has, by scope, profile and name.
+        is_reversed: ``yaw_motors_reversed``.
     """
 
     def __init__(self, executable: Path, settings: list[Setting], body: Body):

@@ -32,20 +32,23 @@ class DataError(ValueError):
 
 
 class Data:
-    """Flights on a task's plant, as common sensors log them; seconds_left counts down.
+    """Flights on a task's plant, as common sensors log them.
 
-    task: what will be flown. Its plant is hidden: an honest entry looks at the logs alone.
+    Attributes:
+        task: what will be flown. Its plant is hidden: an honest entry looks at the logs alone.
+        seconds_left: of flight that may still be logged; it counts down.
     """
 
     def __init__(self, task: Task, suite: Suite, seconds: float):
-        """seconds: of flight that may be logged in all."""
+        """Begin with the seconds of flight that may be logged in all."""
         self.task, self.seconds_left, self._seed = task, seconds, suite.seed
 
     def fly(self, policy: Policy, seconds: float) -> FlightLog:
         """Return the log of a policy's flights on the plant, from perturbed starts.
 
         Raises:
-            DataError: more seconds than are left. ValueError: a policy that crashes at once.
+            DataError: more seconds than are left.
+            ValueError: a policy that crashes at once.
         """
         if seconds > self.seconds_left + 1e-9:
             raise DataError(
@@ -69,9 +72,9 @@ Adapt = Callable[[Data, Policy], Policy]
 def fly_task(task: Task, suite: Suite, policy: Policy) -> dict[str, Any]:
     """Return the results of a policy on a task.
 
-    They are success, mean lap times, s, score, and why flights ended. The score is the share of
-    starts that finish times the time-optimal lap over the mean flying lap. gates: passed, mean.
-    ended: share of all flights by what ended them, but for those that finished.
+    They are success, mean lap times, s, score, the mean of gates passed, and the share of all
+    flights by what ended them, but for those that finished. The score is the share of starts that
+    finish times the time-optimal lap over the mean flying lap.
     """
     env = policy.env(task.plant, task.track)
     params = with_model_as_given(env.default_params)

@@ -116,8 +116,10 @@ def _yaw_reaction(values: Parameters) -> Hook:
 class RateLoop:
     """y'' / wn^2 + lag_s y' + y = omega, with lag_s = 2 damping / wn: an oscillator per axis.
 
-    Exact for rates held over the step. Each axis has its own lag, s, and damping. rates_b,
-    slopes_b: y and y', rad/s and rad/s^2.
+    Exact for rates held over the step. Each axis has its own lag, s, and damping.
+
+    Attributes:
+        rates_b, slopes_b: y and y', rad/s and rad/s^2.
     """
 
     def __init__(self, values: Parameters):
@@ -308,12 +310,21 @@ class Part(NamedTuple):
 class HiddenDrone:
     """A drone in flight; attributes are its state, updated by ``step``.
 
-    pos_w, vel_w, acc_w: m, m/s, m/s^2. quat: body to world; rows: of the matrix in which the force
-    acted. rates_b: rad/s. force_b: specific force, m/s^2. applied: lagged sticks;
-    thrust_stick_slope: of the last of them, 1/s. battery_v, open_v: V, under load and without.
-    thrust_acc: thrust over mass, m/s^2. airspeed_b: m/s. time_s: s. past: commands that a delay
-    remembers, the latest first, once has_flown. felt, tracked: what the sensors report of this
-    step; in fine motion, at a late sensor's instant in it.
+    Attributes:
+        pos_w, vel_w, acc_w: m, m/s, m/s^2.
+        quat: body to world.
+        rows: of the matrix in which the force acted.
+        rates_b: rad/s.
+        force_b: specific force, m/s^2.
+        applied: lagged sticks.
+        thrust_stick_slope: of the last of them, 1/s.
+        battery_v, open_v: V, under load and without.
+        thrust_acc: thrust over mass, m/s^2.
+        airspeed_b: m/s.
+        time_s: s.
+        past: commands that a delay remembers, the latest first, once has_flown.
+        felt, tracked: what the sensors report of this step; in fine motion, at a late sensor's
+            instant in it.
     """
 
     def __init__(

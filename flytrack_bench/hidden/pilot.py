@@ -88,7 +88,8 @@ class Moment(NamedTuple):
 class Sketch:
     """A plan under construction: velocities, headings and sticks, a row per 10 ms.
 
-    caution: number of earlier attempts that were too low or too fast.
+    Attributes:
+        caution: number of earlier attempts that were too low or too fast.
     """
 
     def __init__(self, rng: Rng, start_w: np.ndarray, heading: float, caution: int):

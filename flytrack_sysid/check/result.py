@@ -58,7 +58,8 @@ class Check:
         explanations: alternatives by which all pairs would agree, simplest first; each lists the
             changes of the log. Empty if nothing contradicts; one empty explanation if something
             does that no known change explains.
-        corrected: the log by the first explanation's axes, scales and clocks.
+        corrected: the log by the first explanation's axes, scales and clocks, its rate sticks after
+            the model's rate curve.
         after: the pairs of the corrected log; empty if nothing contradicts.
         remarks: on columns that never change, and constants of the model that the log contradicts.
     """

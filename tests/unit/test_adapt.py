@@ -13,7 +13,9 @@ from baselines.purejaxrl_ppo.checkpoint import SHIPPED
 from flytrack_env import nominal_parameters
 from flytrack_env.battery import Battery
 from flytrack_env.dynamics import step
-from flytrack_env.effects import WIND, CommandDelay, LinearDrag, QuadraticDrag
+from flytrack_env.effects import WIND, CommandDelay, LinearDrag, Motors, QuadraticDrag
+from flytrack_env.effects.actual_rates import ActualRates
+from flytrack_env.effects.betaflight_rates import BetaflightRates
 from flytrack_env.model_file import model_from_json
 from flytrack_env.motion import Motion
 from flytrack_env.thrust import collective_thrust
@@ -129,6 +131,18 @@ def test_a_policys_model_flies_alike_with_another_battery_and_mass():
         after.append(np.asarray(step(state, jnp.array([0.3, -0.2, 0.1, 0.4]), 0.01, model)))
     assert_allclose(after[0][:20], after[1][:20], rtol=1e-5, atol=1e-6)
     assert_allclose(after[0][20] / 24.0, after[1][20] / 16.8, rtol=1e-6)
+
+
+def test_settings_of_a_craft_replace_the_policys_but_for_what_was_fitted():
+    own = NOMINAL.with_effects(BetaflightRates(0.3, 0.3, 0.3), LinearDrag(0.3, 0.2, 0.1))
+    craft = adapting.as_craft(own, NOMINAL.with_effects(ActualRates(0.5, 0.5, 0.5)))
+    assert {type(one) for one in craft.effects} == {ActualRates, LinearDrag}
+    flown = NOMINAL.with_effects(GENERIC._replace(roll_arm=33.0))
+    assert adapting.as_craft(flown, NOMINAL.with_effects(GENERIC)) is flown
+    other = NOMINAL.with_effects(GENERIC._replace(p_roll=50.0))
+    assert adapting.as_craft(flown, other).effects == other.effects
+    with pytest.raises(ValueError, match="commanded by motors, expected one by sticks"):
+        adapting.as_craft(NOMINAL, NOMINAL.with_effects(Motors()))
 
 
 def test_models_move_from_the_policys_own_to_the_plants():
