@@ -26,7 +26,7 @@ from baselines.purejaxrl_ppo.flights import fly_many
 from baselines.purejaxrl_ppo.polish import LostError, polish
 from benchmarks import report
 from benchmarks.adapt_residual import adapt_with_residual
-from benchmarks.adapt_rivals import SHARES, train_rival
+from benchmarks.adapt_rivals import POLICIES, train_rival
 from benchmarks.diagnosis import MOTION_OF, model_of
 from benchmarks.firmware import KINDS, SETUPS, of_settings_and_body
 from benchmarks.loop.plants import draw_base
@@ -63,7 +63,7 @@ SIZES = ((12.6, 0.12), (16.8, 0.3), (21.0, 0.5), (25.2, 0.75), (50.4, 4.0))  # f
 CONFIGURATIONS = (*SETUPS, "P and D term", "a weak motor", "drag", "mass", "bent thrust")
 NUM_PLANTS, NUM_UNCHANGED = 8, 20
 LIMIT, NETWORK = "limit", "residual network"
-ENTRIES = ("nothing", *SHARES, NETWORK, "refitted base", "adapted", LIMIT)
+ENTRIES = ("nothing", *POLICIES, NETWORK, "refitted base", "adapted", LIMIT)
 LIMIT_SETTINGS = Settings().polishing._replace(updates=300, offset_limit=0.95)
 # XLA does not compile the gradient of parts of 1 ms within eight minutes.
 WITH_LIMIT = ("handout", "semi_implicit")
@@ -346,7 +346,7 @@ def make_plant(trial: Trial) -> HiddenPlant:
 def measure_rivals(trial: Trial) -> Line:
     """Return the races of policies that were trained once, for plants around a model."""
     plant = make_plant(trial)
-    policies = {name: load_checkpoint(train_rival(name)) for name in SHARES}
+    policies = {name: load_checkpoint(train_rival(name)) for name in POLICIES}
     return {"entries": {name: raced(policy, plant) for name, policy in policies.items()}}
 
 
@@ -522,7 +522,7 @@ def main(
         )
     else:
         if RIVALS in kinds:
-            for name in SHARES:
+            for name in POLICIES:
                 train_rival(name)
         trials = [trial for trial in list_trials(seconds, seed) if trial.kind in kinds]
         report.record_trials(LINES, trials, measure_trial, 1, jobs)

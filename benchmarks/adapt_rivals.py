@@ -2,13 +2,15 @@
 
 They are made as ``robust`` is (``benchmarks.champion``), PPO and then polishing, from the same
 model. Three learn from plants that differ from it by up to 10, 20 and 30 % in mass, each lag and
-the size of each effect, as R. Ferede et al. draw parameters ("One net to rule them all", 2025).
-Rates, the shape of the thrust map and effects that the model lacks are not drawn. What is in
-runs/adapt is not trained again.
+the size of each effect, as R. Ferede et al. draw parameters ("One net to rule them all", 2025). A
+fourth remembers the flight, so that it can find out what it flies; it is not polished, which would
+take 40 minutes. Rates, the shape of the thrust map and effects that the model lacks are not drawn.
+What is in runs/adapt is not trained again.
 """
 
 from contextlib import closing
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +33,26 @@ from flytrack_env.wrappers.domain_randomization import sample_model
 RUNS = Path("runs/adapt")
 SEED, STEPS = 0, 40_000_000
 ROBUST = RECIPES["robust"]
-SHARES = {"randomised 10 %": 0.1, "randomised 20 %": 0.2, "randomised 30 %": 0.3}  # name -> share
+
+
+class Rival(NamedTuple):
+    """How plants are drawn for a policy, and the width of its memory.
+
+    Attributes:
+        share: by which a plant differs at most.
+        memory_size: 0 for a policy without memory.
+    """
+
+    share: float
+    memory_size: int = 0
+
+
+POLICIES = {
+    "randomised 10 %": Rival(0.1),
+    "randomised 20 %": Rival(0.2),
+    "randomised 30 %": Rival(0.3),
+    "recurrent 30 %": Rival(0.3, 32),
+}
 
 
 def make_ranges(share: float, model: ModelParameters) -> RandomizationParams:
@@ -54,10 +75,12 @@ def train_rival(name: str) -> Path:
     path = RUNS / f"{name.replace(' %', '').replace(' ', '_')}.safetensors"
     if path.exists():
         return path
-    config = Config(total_timesteps=STEPS, **CHANGES, **ROBUST.changes)
+    rival = POLICIES[name]
+    changes = {**CHANGES, **ROBUST.changes, "memory_size": rival.memory_size}
+    config = Config(total_timesteps=STEPS, **changes)
     env = flytrack_env.make(ROBUST.env_id, model=MODEL, reward=REWARD)
     params = training_params(env, config)
-    ranges = make_ranges(SHARES[name], params.model)
+    ranges = make_ranges(rival.share, params.model)
     params = params.replace(wrappers={**params.wrappers, DomainRandomization.key: ranges})
     ppo = make_ppo(env, params, config)
     runner, update = jax.jit(ppo.start)(jax.random.key(SEED)), jax.jit(ppo.update, donate_argnums=0)
@@ -68,15 +91,16 @@ def train_rival(name: str) -> Path:
     network = make_network_for(env, params, config)
     race = flytrack_env.make("FlyTrack-v0", model=MODEL)
     model = jax.tree.map(jnp.asarray, race.default_params.model)
-    trained = Policy(network, runner.train_state.params)
-    final = polish(
-        race,
-        trained,
-        SEED,
-        ROBUST.settings,
-        lambda key, done: draw_within(ranges, key, model),
-        ProgressBar("updates"),
-    )
+    final = runner.train_state.params
+    if not rival.memory_size:
+        final = polish(
+            race,
+            Policy(network, final),
+            SEED,
+            ROBUST.settings,
+            lambda key, done: draw_within(ranges, key, model),
+            ProgressBar("updates"),
+        )
     description = describe_run(race, "FlyTrack-v0", "flytrack", config, SEED)
     save_checkpoint(path, final, config, description)
     return path
@@ -84,7 +108,7 @@ def train_rival(name: str) -> Path:
 
 def main() -> None:
     """Train the policies that are missing."""
-    for name in SHARES:
+    for name in POLICIES:
         policy = load_checkpoint(train_rival(name))
         size = sum(np.size(leaf) for leaf in jax.tree.leaves(policy.policy.params))
         print(f"{name}: {policy.path}, {size} parameters")
