@@ -82,3 +82,11 @@ def test_firmware_and_other_lengths_have_tables_of_their_own(written):
     assert "| 0.0%, - | 100.0%, 4.000 s | +1.01% | 40.0 |" in page
     assert "| 12.6 V | causes_found | wind, rotor_drag |" in page
     assert "| curved | a hover | nothing | 0.0%, - | - | - | - |" in page
+
+
+def test_rivals_are_compared_by_races_a_second():
+    half = {**WHOLE, "entries": {**WHOLE["entries"], "nothing": {**RACED, "success": 0.5}}}
+    assert adapt.speed_ratio(half, "nothing") == 0.5
+    assert adapt.speed_ratio(WHOLE, "refitted base") == 0.0
+    text, count = adapt.describe_ratios([0.0, 0.0, 0.5, 0.6, 0.7, 0.8, 1.0, 9.0])
+    assert text.startswith("0.650 (") and count == 8
