@@ -157,7 +157,7 @@ def figures(plants: list[Line], unchanged: list[Line]) -> list[report.Figure]:
             "all" if name == "adapted" else "",
             [one["entries"][name]["success"] >= 0.99 for one in plants if name in one["entries"]],
         )
-        for name in ENTRIES
+        for name in flown_entries(plants)
     ]
     over_limit = [
         one["entries"]["adapted"]["flying_lap_s"] / one["entries"][LIMIT]["flying_lap_s"]
@@ -173,8 +173,8 @@ def figures(plants: list[Line], unchanged: list[Line]) -> list[report.Figure]:
             "below 1" if name in (*POLICIES, NETWORK) else "",
             *describe_ratios([speed_ratio(one, name) for one in plants if name in one["entries"]]),
         )
-        for name in ENTRIES
-        if name != "adapted" and any(name in one["entries"] for one in plants)
+        for name in flown_entries(plants)
+        if name != "adapted"
     ]
     cpu_s = [one["cpu_s"] for one in plants]
     # A law of the policy's model that is not in the plant is a difference, and is to be named. So
@@ -217,6 +217,11 @@ def figures(plants: list[Line], unchanged: list[Line]) -> list[report.Figure]:
     ]
 
 
+def flown_entries(plants: list[Line]) -> list[str]:
+    """Return the entries that flew any of some plants."""
+    return [name for name in ENTRIES if any(name in one["entries"] for one in plants)]
+
+
 def speed_ratio(one: Line, name: str) -> float:
     """Return how often an entry finishes in a time, over how often the adapted policy does."""
     rates = [
@@ -242,16 +247,17 @@ def describe_ratios(ratios: list[float]) -> tuple[str, int]:
 
 def plants_table(plants: list[Line]) -> str:
     """Return a row for each hidden plant."""
+    names = flown_entries(plants)
     rows = []
     for one in sorted(plants, key=lambda line: (line["number"], line["motion"])):
         entries = one["entries"]
-        cells = [format_lap(entries[name]) if name in entries else "-" for name in ENTRIES]
+        cells = [format_lap(entries[name]) if name in entries else "-" for name in names]
         expected = one.get("expected_lap_s")
         cells += ["{:.3f} to {:.3f} s".format(*expected) if expected else "-"]
         named = ", ".join(one.get("named", ())) or one.get("refused", "nothing")
         head = [str(one["number"]), one["motion"], one.get("motion_found", "-"), one["flights"]]
         rows.append([*head, one["hidden"], named, *cells])
-    header = ["plant", "motion", "found", "flights", "hidden", "named", *ENTRIES, "expected"]
+    header = ["plant", "motion", "found", "flights", "hidden", "named", *names, "expected"]
     return report.table(header, rows)
 
 
@@ -276,8 +282,10 @@ def logs_table(plants: list[Line]) -> str:
         cpu_s = f"{np.median([one['cpu_s'] for one in flown]):.0f}" if flown else "-"
         refused = f"{len(alike) - len(flown)}"
         shares = f"{finish} of {len(alike)}", f"{sum(inside)} of {len(inside)}"
-        rows.append([f"{seconds:g}", str(seed), *shares, refused, cpu_s])
-    header = "seconds | seed | 99 % finish, adapted | lap as expected | refused | CPU s, median"
+        rows.append([f"{seconds:g}", str(seed), *shares, refused, cpu_s, alike[0]["commit"]])
+    header = (
+        "seconds | seed | 99 % finish, adapted | lap as expected | refused | CPU s, median | commit"
+    )
     return report.table(header, rows)
 
 
