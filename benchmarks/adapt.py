@@ -239,10 +239,10 @@ def describe_ratios(ratios: list[float]) -> tuple[str, int]:
     middle = partial(stats.trim_mean, proportiontocut=0.25, axis=-1)
     if len(ratios) < 2:
         return f"{middle(ratios):.3f}", len(ratios)
-    found = stats.bootstrap(
+    interval = stats.bootstrap(
         (ratios,), middle, method="percentile", rng=np.random.default_rng(SEED)
     ).confidence_interval
-    return f"{middle(ratios):.3f} ({found.low:.3f} to {found.high:.3f})", len(ratios)
+    return f"{middle(ratios):.3f} ({interval.low:.3f} to {interval.high:.3f})", len(ratios)
 
 
 def plants_table(plants: list[Line]) -> str:

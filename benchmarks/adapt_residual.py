@@ -45,7 +45,7 @@ class Residual(nn.Module):
         return nn.Dense(3, kernel_init=nn.initializers.zeros)(hidden)
 
 
-def features_of(drone: Drone, full_v: Scalar) -> jax.Array:
+def compute_features(drone: Drone, full_v: Scalar) -> jax.Array:
     """Return velocity, rates and the vertical in body axes, applied thrust and voltage, (11,)."""
     to_body = Quaternion(drone.quat.w, -drone.quat.x, -drone.quat.y, -drone.quat.z)
     seen = to_body.rotate(drone.vel_w), drone.rates_b, to_body.rotate(Vec3(0.0, 0.0, 1.0))
@@ -68,7 +68,7 @@ class WithResidual(Simulator):
     ) -> SimulatorState:
         """Return the next state of the model, and of the network's acceleration over the step."""
         after = super().step(state, command, dt, without_law(model))
-        features = features_of(state.drone, model.battery.full_v)
+        features = compute_features(state.drone, model.battery.full_v)
         change_b = jnp.asarray(Residual().apply(self.weights, features)) * dt
         change = state.drone.quat.rotate(Vec3(*(change_b * model.effect("learned_law").scale)))
         velocity = Vec3(*(a + b for a, b in zip(after.drone.vel_w, change, strict=True)))
@@ -103,7 +103,7 @@ def learn(log: FlightLog, base: ModelParameters, seed: int) -> Any:
     windows = rows[:, None] + np.arange(WINDOW)
     missed = states[rows + WINDOW][:, VELOCITY] - states[rows][:, VELOCITY]
     missed = (missed - explained[windows].sum(axis=1)) / dt
-    features = jax.vmap(lambda x: features_of(unpack(x), base.battery.full_v))(states)
+    features = jax.vmap(lambda x: compute_features(unpack(x), base.battery.full_v))(states)
     weights = Residual().init(jax.random.key(seed), features[0])
     optimizer = optax.adamw(optax.cosine_decay_schedule(LEARNING_RATE, UPDATES), weight_decay=DECAY)
 

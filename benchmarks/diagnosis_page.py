@@ -13,10 +13,10 @@ from benchmarks.hidden import MOTIONS
 from benchmarks.report import (
     Figure,
     Line,
-    commits_of,
     figures_table,
     fill_page,
     lines_of_commit,
+    list_commits,
     share_figure,
     table,
 )
@@ -255,7 +255,7 @@ def main() -> None:
         num_plants=len({(line["row"], line["number"], line["seed"]) for line in lines}),
         crashed=len(every_line) - len(lines),
         seeds=sorted({line["seed"] for line in every_line}),
-        commit=", ".join(commits_of(every_line)),
+        commit=", ".join(list_commits(every_line)),
         date=every_line[-1]["date"],
         machines="; ".join(sorted({line["machine"] for line in every_line})),
         visible=VISIBLE,

@@ -335,16 +335,18 @@ def lines_of_commit(path: Path, commit: str | None = None, code: Sequence[str] =
     """
     lines = lines_in(path)
     commit = lines[-1]["commit"] if commit is None and lines else commit
-    counts = {one: one == commit or is_same(code, one, commit) for one in commits_of(lines)}
-    return [line for line in lines if counts[line["commit"]]]
+    is_counted = {
+        other: other == commit or is_unchanged(code, other, commit) for other in list_commits(lines)
+    }
+    return [line for line in lines if is_counted[line["commit"]]]
 
 
-def commits_of(lines: Iterable[Line]) -> list[str]:
+def list_commits(lines: Iterable[Line]) -> list[str]:
     """Return the commits of lines, each once."""
     return list(dict.fromkeys(line["commit"] for line in lines))
 
 
-def is_same(code: Sequence[str], commit: str, other: str | None) -> bool:
+def is_unchanged(code: Sequence[str], commit: str, other: str | None) -> bool:
     """Return whether some files are the same at two commits; False for none, and without git."""
     if not code or other is None:
         return False

@@ -147,7 +147,7 @@ def adapt(
         LogError: a log of no race, or of another craft.
         ValueError: a craft whose motors are commanded.
     """
-    model = model_of(checkpoint)
+    model = read_policy_model(checkpoint)
     nominal = model if craft is None else as_craft(model, craft)
     check_inputs(log, nominal, accept)
     diagnosis = diagnose(log, nominal, report=report("stages"))
@@ -179,8 +179,10 @@ def as_craft(model: ModelParameters, craft: ModelParameters) -> ModelParameters:
     """
     if takes_motors(craft.effects):
         raise ValueError("craft: found a model commanded by motors, expected one by sticks")
-    known, own = describe_craft(model), describe_craft(craft)
-    if known.keys() == own.keys() and np.allclose([*known.values()], [own[name] for name in known]):
+    constants, craft_constants = list_craft_constants(model), list_craft_constants(craft)
+    if constants.keys() == craft_constants.keys() and all(
+        np.isclose(value, craft_constants[name]) for name, value in constants.items()
+    ):
         return model
     laws = tuple(one for one in model.effects if not effect_of(one).search.is_setting)
     settings = [one for one in craft.effects if effect_of(one).search.is_setting]
@@ -188,23 +190,23 @@ def as_craft(model: ModelParameters, craft: ModelParameters) -> ModelParameters:
     return sized._replace(max_rate=craft.max_rate, effects=laws).with_effects(*settings)
 
 
-def describe_craft(model: ModelParameters) -> dict[str, float]:
+def list_craft_constants(model: ModelParameters) -> dict[str, float]:
     """Return what of a model is known of a craft without flying it, by name."""
-    known = {"m": float(model.m), "full_v": float(model.battery.full_v)}
-    known |= {"empty_v": float(model.battery.empty_v)}
-    known |= {f"max_rate_{axis}": float(rate) for axis, rate in enumerate(model.max_rate)}
+    constants = {"m": float(model.m), "full_v": float(model.battery.full_v)}
+    constants |= {"empty_v": float(model.battery.empty_v)}
+    constants |= {f"max_rate_{axis}": float(rate) for axis, rate in enumerate(model.max_rate)}
     for parameters in model.effects:
         effect = effect_of(parameters)
         if effect.search.is_setting:
-            known |= {
+            constants |= {
                 f"{effect.name}.{name}": float(value)
                 for name, value in parameters._asdict().items()
                 if name not in effect.search.fitted
             }
-    return known
+    return constants
 
 
-def with_loop(model: ModelParameters, craft: ModelParameters) -> ModelParameters:
+def with_rate_loop(model: ModelParameters, craft: ModelParameters) -> ModelParameters:
     """Return a model with those settings of a craft that have a memory: its rate loop."""
     settings = [(effect_of(one), one) for one in craft.effects]
     return model.with_effects(
@@ -212,7 +214,7 @@ def with_loop(model: ModelParameters, craft: ModelParameters) -> ModelParameters
     )
 
 
-def model_of(checkpoint: Checkpoint) -> ModelParameters:
+def read_policy_model(checkpoint: Checkpoint) -> ModelParameters:
     """Return the model that a policy was made for; raise CheckpointError as ``adapt`` does."""
     if "model" not in checkpoint.meta:
         raise CheckpointError(
@@ -288,7 +290,7 @@ def improve(
     moving = partial(
         draw_moving,
         models=models,
-        start=to_vector(embed(with_loop(model, diagnosis.nominal), models.like)),
+        start=to_vector(embed(with_rate_loop(model, diagnosis.nominal), models.like)),
         settings=settings,
     )
     seed_of_flights = int(jax.random.bits(keys["polish"], dtype=jnp.uint32) >> 1)

@@ -108,10 +108,10 @@ def _acceleration(log: FlightLog) -> Iterator[str]:
 
 def _conventions(log: FlightLog, model: ModelParameters | None) -> Iterator[str]:
     """Find channels that contradict each other, but for what a diagnosis names by itself."""
-    found = check_log(after_rate_curve(log, model))
-    kinds = {change.kind for one in found.explanations for change in one}
-    if kinds - set(DIAGNOSED) or (found.contradicts and not kinds):
-        yield from problems_of(found)
+    check = check_log(after_rate_curve(log, model))
+    kinds = {change.kind for one in check.explanations for change in one}
+    if kinds - set(DIAGNOSED) or (check.contradicts and not kinds):
+        yield from problems_of(check)
 
 
 CHECKS = (_length, _commands, _motors, _motion, _attitude, _acceleration)

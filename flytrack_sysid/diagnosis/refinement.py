@@ -247,9 +247,9 @@ class _Refinement(NamedTuple):
         if not stuck and flight_test.prefers(extended, fit.vector):
             # The fit is to blame for a worse horizon. So effects are compared with a base that was
             # fitted to the same flights; if all are needed, the values of single steps stand.
-            found = self._eliminate(refined, fit, flight_test.with_base(base), target)
-            if found.fit is not None and found.kept == candidates:
-                return found._replace(fit=found.fit._replace(vector=extended))
+            remaining = self._eliminate(refined, fit, flight_test.with_base(base), target)
+            if remaining.fit is not None and remaining.kept == candidates:
+                return remaining._replace(fit=remaining.fit._replace(vector=extended))
         return self._eliminate(refined, fit, flight_test, target)
 
     def _eliminate(

@@ -134,8 +134,8 @@ def test_a_policys_model_flies_alike_with_another_battery_and_mass():
 
 
 def test_settings_of_a_craft_replace_the_policys_but_for_what_was_fitted():
-    own = NOMINAL.with_effects(BetaflightRates(0.3, 0.3, 0.3), LinearDrag(0.3, 0.2, 0.1))
-    craft = adapting.as_craft(own, NOMINAL.with_effects(ActualRates(0.5, 0.5, 0.5)))
+    policy_model = NOMINAL.with_effects(BetaflightRates(0.3, 0.3, 0.3), LinearDrag(0.3, 0.2, 0.1))
+    craft = adapting.as_craft(policy_model, NOMINAL.with_effects(ActualRates(0.5, 0.5, 0.5)))
     assert {type(one) for one in craft.effects} == {ActualRates, LinearDrag}
     flown = NOMINAL.with_effects(GENERIC._replace(roll_arm=33.0))
     assert adapting.as_craft(flown, NOMINAL.with_effects(GENERIC)) is flown

@@ -38,6 +38,6 @@ def test_lines_of_a_commit_with_the_same_code_count(commit_of, tmp_path):
     for commit in (first, second, f"{third}-dirty", "unknown", third):
         report.append_line(path, {"commit": commit})
     of_code = report.lines_of_commit(path, code=["code"])
-    assert report.commits_of(of_code) == [second, third]
-    assert report.commits_of(report.lines_of_commit(path)) == [third]
+    assert report.list_commits(of_code) == [second, third]
+    assert report.list_commits(report.lines_of_commit(path)) == [third]
     assert report.lines_of_commit(path, first, ["code"]) == [{"commit": first}]
