@@ -129,12 +129,7 @@ def adapt_with_residual(
     like = model.with_effects(LearnedLaw(scale=1.0))
     vector = to_vector(like)
     exact = PlausibleModels(like, vector, np.zeros((len(vector), 1)), vector, vector)
-    moving = partial(
-        draw_moving,
-        models=exact,
-        start=to_vector(embed(model, like)),
-        settings=Settings(),
-    )
+    moving = partial(draw_moving, models=exact, start=to_vector(embed(model, like)))
     try:
         params = polish(plant_env(policy, plant), policy.policy, seed, Settings().polishing, moving)
     except LostError:

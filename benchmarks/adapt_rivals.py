@@ -98,7 +98,7 @@ def train_rival(name: str) -> Path:
             Policy(network, final),
             SEED,
             ROBUST.settings,
-            lambda key, done: draw_within(ranges, key, model),
+            lambda key, way: draw_within(ranges, key, model),
             ProgressBar("updates"),
         )
     description = describe_run(race, "FlyTrack-v0", "flytrack", config, SEED)

@@ -137,7 +137,7 @@ def train(name: str, seed: int) -> tuple[Path, Path]:
         trained = load_checkpoint(before)
         env = flytrack_env.make("FlyTrack-v0", model=MODEL)
         model = jax.tree.map(jnp.asarray, env.default_params.model)
-        draw = (lambda key, done: draw_model(key, model)) if recipe.is_robust else None
+        draw = (lambda key, way: draw_model(key, model)) if recipe.is_robust else None
         started_s = time.perf_counter()
         policy = polish(env, trained.policy, seed, recipe.settings, draw, ProgressBar("updates"))
         seconds = time.perf_counter() - started_s

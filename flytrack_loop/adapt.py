@@ -3,9 +3,8 @@
 The plant is known up to what the log leaves possible: models are drawn from the joint uncertainty
 of the diagnosis. The policy descends the gradient of its race's time through some of them and is
 judged on others, as is the one that it was made from. A policy that cannot fly the plant has no
-such gradient there. So the models move, update by update, from the one that the policy flies to the
-plant's, and the policy follows. Only a craft's rate loop is there from the start: half a loop is
-none.
+such gradient there. So the models move from the one that the policy flies to the plant's, as fast
+as the policy follows. Only a craft's rate loop is there from the start: half a loop is none.
 """
 
 from collections.abc import Callable
@@ -55,14 +54,13 @@ class Settings(NamedTuple):
 
     Attributes:
         flights: drawn plants that a policy is judged on, one flight each.
-        move_share: share of the updates in which models move to the plant's.
         polishing: descent along the gradient of the race's time.
     """
 
     flights: int = 256
-    move_share: float = 0.5
     polishing: Polishing = Polishing(
-        updates=200,
+        updates=100,
+        way_steps=100,
         flights=16,
         laps=2,
         slowest_lap_s=5.5,
@@ -291,7 +289,6 @@ def improve(
         draw_moving,
         models=models,
         start=to_vector(embed(with_rate_loop(model, diagnosis.nominal), models.like)),
-        settings=settings,
     )
     seed_of_flights = int(jax.random.bits(keys["polish"], dtype=jnp.uint32) >> 1)
     try:
@@ -320,15 +317,10 @@ def judge(
 
 
 def draw_moving(
-    key: jax.Array,
-    done: jax.Array,
-    models: PlausibleModels,
-    start: np.ndarray,
-    settings: Settings,
+    key: jax.Array, way: jax.Array, models: PlausibleModels, start: np.ndarray
 ) -> ModelParameters:
-    """Draw a model on the way from a start to a plausible one, by the share of updates done."""
+    """Draw a model on the way from a start to a plausible one; at 1, the way is done."""
     drawn = models.draw_vector(key)
-    way = jnp.minimum(done / settings.move_share, 1.0)
     return from_vector(start + way * (drawn - start), models.like)
 
 

@@ -5,6 +5,10 @@ simulator is differentiable, and a policy that already races is stable, so that 
 time of its last gate along the whole flight (backpropagation through time) says how to fly faster.
 A gate's opening is wider here, so that a pass beyond its edge still counts and has a gradient; the
 real edge is a penalty. Only the actor changes. The policy is that of the mean action.
+
+A policy that does not race has no such gradient. Where its simulator is to become another one, the
+models move from the one to the other as fast as the policy follows: a step further after an update
+in which half of the flights finish, a step back after any other.
 """
 
 from collections.abc import Callable
@@ -26,6 +30,7 @@ from flytrack_env.tracks import cross_gate
 
 # offset beyond the limit up to which the penalty is quadratic, linear from there
 QUADRATIC_OFFSET = 0.1
+FOLLOWED = 0.5  # share of an update's flights that finish, after which models move on
 
 
 class LostError(ValueError):
@@ -36,8 +41,10 @@ class Settings(NamedTuple):
     """How a policy is polished.
 
     Attributes:
-        updates: of the policy.
-        learning_rate: at the start; it falls to 0 as a cosine.
+        updates: of the policy on the models that it is meant for.
+        way_steps: in which models move there before that; 0 if they do not move.
+        way_updates: at most, for these steps.
+        learning_rate: on the way; after it, it falls to 0 as a cosine.
         flights: of one update, from noisy start poses.
         laps: of a flight.
         slowest_lap_s: mean lap time from which a flight is cut off (s).
@@ -50,6 +57,8 @@ class Settings(NamedTuple):
     """
 
     updates: int = 1500
+    way_steps: int = 0
+    way_updates: int = 400
     learning_rate: float = 1e-3
     flights: int = 32
     laps: int = 3
@@ -151,24 +160,25 @@ def polish(
         policy: that races already.
         seed: of the flights.
         settings: see ``Settings``.
-        draw_model: from a key and the share of the updates that is done, the model of one flight;
-            that of the environment if None.
-        report: called with the number of updates done and of all.
+        draw_model: from a key and the share of the way, the model of one flight; that of the
+            environment if None.
+        report: called with the number of updates done, and of all if the policy follows from now.
 
     Raises:
-        LostError: no flight of an update passes all gates.
+        LostError: no flight of an update passes all gates, or models have not arrived.
     """
     params = start_pose_params(env.default_params, 10**6)
     last_gate = settings.laps * params.course.num_gates
-    optimizer = optax.adam(optax.cosine_decay_schedule(settings.learning_rate, settings.updates))
+    optimizer = optax.scale_by_adam()
+    learning_rate = optax.cosine_decay_schedule(settings.learning_rate, settings.updates)
 
     def compute_cost(
-        policy_params: Any, key: jax.Array, done: jax.Array
+        policy_params: Any, key: jax.Array, way: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         key_model, key_start = jax.random.split(key)
         flown_params = params
         if draw_model is not None:
-            flown_params = params.replace(model=draw_model(key_model, done))
+            flown_params = params.replace(model=draw_model(key_model, way))
         flown = fly(env, Policy(policy.network, policy_params), key_start, flown_params, settings)
         is_complete = flown.gates >= last_gate
         return jnp.where(
@@ -177,11 +187,11 @@ def polish(
 
     @partial(jax.jit, donate_argnums=(0, 1))
     def update(
-        policy_params: Any, optimizer_state: Any, key: jax.Array, done: jax.Array
+        policy_params: Any, optimizer_state: Any, key: jax.Array, way: jax.Array, done: jax.Array
     ) -> tuple[Any, Any, jax.Array]:
         keys = jax.random.split(key, settings.flights)
         gradients, is_complete = jax.vmap(jax.grad(compute_cost, has_aux=True), (None, 0, None))(
-            policy_params, keys, done
+            policy_params, keys, way
         )
         num_complete = is_complete.sum()
         gradient = jax.tree.map(
@@ -189,23 +199,38 @@ def polish(
         )
         gradient = projection_l2_ball(gradient, scale=settings.largest_gradient)
         change, optimizer_state = optimizer.update(gradient, optimizer_state)
+        change = jax.tree.map(lambda leaf: -learning_rate(done) * leaf, change)
         return optax.apply_updates(policy_params, change), optimizer_state, num_complete
 
     policy_params = jax.tree.map(
         jnp.array, policy.params
     )  # the caller's stay, though updates donate
     optimizer_state = optimizer.init(policy_params)
-    keys = jax.random.split(jax.random.key(seed), settings.updates)
-    for done, key in enumerate(keys, start=1):
-        share = jnp.float32((done - 1) / settings.updates)
+    most_updates = settings.updates + (settings.way_updates if settings.way_steps else 0)
+    keys = iter(jax.random.split(jax.random.key(seed), most_updates))
+    step = on_way = done = 0
+    while done < settings.updates:
+        is_there = step == settings.way_steps
+        if not is_there and on_way == settings.way_updates:
+            raise LostError(
+                f"policy: followed {step / settings.way_steps:.0%} of the way to other models in "
+                f"{on_way} updates, expected all of it"
+            )
+        way = step / settings.way_steps if settings.way_steps else 1.0
         policy_params, optimizer_state, num_complete = update(
-            policy_params, optimizer_state, key, share
+            policy_params, optimizer_state, next(keys), jnp.float32(way), jnp.int32(done)
         )
-        if int(num_complete) == 0:
+        if is_there:
+            done += 1
+        else:
+            on_way += 1
+            follows = int(num_complete) >= FOLLOWED * settings.flights
+            step = step + 1 if follows else max(step - 1, 0)
+        if is_there and int(num_complete) == 0:
             raise LostError(
                 f"policy: found none of {settings.flights} flights that passed {last_gate} gates "
                 f"within {settings.laps * settings.slowest_lap_s:g} s, expected one that already "
                 "races"
             )
-        report(done, settings.updates)
+        report(on_way + done, settings.updates + on_way + settings.way_steps - step)
     return policy_params

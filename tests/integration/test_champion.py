@@ -11,7 +11,7 @@ from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint_env import draw_plants, plant_env, simulated_env
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.networks import Policy
-from baselines.purejaxrl_ppo.polish import Settings, decay_gradient, polish
+from baselines.purejaxrl_ppo.polish import LostError, Settings, decay_gradient, polish
 from benchmarks.champion import CHAMPION, FOLDER, MODEL
 from flytrack_env import blackbox, load_model, make
 from flytrack_env.model_file import model_from_json
@@ -118,6 +118,26 @@ def test_a_policy_that_does_not_race_is_refused():
         ValueError, match=r"found none of 8 flights that passed 8 gates within 4\.6 s"
     ):
         polish(simulated_env(champion), Policy(champion.network, lost), 0, SHORT)
+
+
+def test_models_move_as_far_as_the_policy_follows():
+    """With three times the mass nobody takes off, so that models go back and forth before that."""
+    champion = load_checkpoint(CHAMPION)
+    env, reports = simulated_env(champion), []
+    model = env.default_params.model
+    heavier = SHORT._replace(updates=1, way_steps=10, way_updates=12)
+    with pytest.raises(LostError, match=r"followed \d+% of the way to other models in 12 updates"):
+        polish(
+            env,
+            champion.policy,
+            0,
+            heavier,
+            lambda key, way: model._replace(m=model.m * (1.0 + 2.0 * way)),
+            lambda *counts: reports.append(counts),
+        )
+    to_do = [total - done for done, total in reports]
+    changes = np.diff([11, *to_do])
+    assert set(changes) == {-1, 1} and min(to_do) > 1, to_do
 
 
 def test_a_decayed_state_is_the_same_with_less_gradient():
