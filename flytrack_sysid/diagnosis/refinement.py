@@ -6,10 +6,11 @@ therefore
 
 1. starts free flights of 0.1 to 2 s from measured states (multiple shooting),
 2. fits all parameters to the flights on the training rows,
-3. removes effects that make no flight better that was not fitted, or any horizon worse: flights of
-   held-out rows, and to first order those of each block of training rows without this block,
+3. removes effects that make no flight better that was not fitted, or any horizon worse than the
+   base that is fitted to the same flights: flights of held-out rows, and to first order those of
+   each block of training rows without this block,
 4. holds parameters at nominal that an effect does not need,
-5. keeps all effects and their values of single steps where the fit alone makes a horizon worse.
+5. keeps the values of single steps where those of flights predict a held-out horizon worse.
 
 Flights without position and velocity show no force: the thrust map of single steps stands, since
 rates alone show only its ratio to inertia.
@@ -244,13 +245,12 @@ class _Refinement(NamedTuple):
         base = target.fitted(self.base, self.indices(problem, ()), MAX_ROUNDS).vector
         flight_test = self.flight_test.seeing(fit.vector)
         refined = unrefined._replace(fit=fit, base=base, problem=problem, flight_test=flight_test)
-        if not stuck and flight_test.prefers(extended, fit.vector):
-            # The fit is to blame for a worse horizon. So effects are compared with a base that was
-            # fitted to the same flights; if all are needed, the values of single steps stand.
-            remaining = self._eliminate(refined, fit, flight_test.with_base(base), target)
-            if remaining.fit is not None and remaining.kept == candidates:
-                return remaining._replace(fit=remaining.fit._replace(vector=extended))
-        return self._eliminate(refined, fit, flight_test, target)
+        # What a fit to flights makes worse, it makes worse without the effects, too.
+        refined = self._eliminate(refined, fit, flight_test.with_base(base), target)
+        last, is_whole = refined.fit, refined.kept == candidates
+        if last is not None and is_whole and flight_test.prefers(extended, last.vector):
+            return refined._replace(fit=last._replace(vector=extended))
+        return refined
 
     def _eliminate(
         self, refined: Refined, fit: Fit, flight_test: FlightTest, target: Target
