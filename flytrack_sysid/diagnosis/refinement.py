@@ -6,11 +6,12 @@ therefore
 
 1. starts free flights of 0.1 to 2 s from measured states (multiple shooting),
 2. fits all parameters to the flights on the training rows,
-3. removes effects that make no flight better that was not fitted, or any horizon worse than the
-   base that is fitted to the same flights: flights of held-out rows, and to first order those of
-   each block of training rows without this block,
+3. removes effects that make no flight better that was not fitted, or any horizon worse: flights of
+   held-out rows, and to first order those of each block of training rows without this block,
 4. holds parameters at nominal that an effect does not need,
-5. keeps the values of single steps where those of flights predict a held-out horizon worse.
+5. where effects were removed, compares them with a base that is fitted to the same flights instead,
+   and keeps what predicts held-out flights better. If all effects stay, they keep the values
+   of single steps where those of flights predict a horizon worse.
 
 Flights without position and velocity show no force: the thrust map of single steps stands, since
 rates alone show only its ratio to inertia.
@@ -245,12 +246,25 @@ class _Refinement(NamedTuple):
         base = target.fitted(self.base, self.indices(problem, ()), MAX_ROUNDS).vector
         flight_test = self.flight_test.seeing(fit.vector)
         refined = unrefined._replace(fit=fit, base=base, problem=problem, flight_test=flight_test)
-        # What a fit to flights makes worse, it makes worse without the effects, too.
-        refined = self._eliminate(refined, fit, flight_test.with_base(base), target)
-        last, is_whole = refined.fit, refined.kept == candidates
-        if last is not None and is_whole and flight_test.prefers(extended, last.vector):
-            return refined._replace(fit=last._replace(vector=extended))
-        return refined
+        remaining = self._eliminate(refined, fit, flight_test, target)
+        if not remaining.removed:
+            return remaining
+        # A fit to flights may make a horizon worse with the effects and without them.
+        beside = self._eliminate(refined, fit, flight_test.with_base(base), target)
+        if (
+            beside.fit is not None
+            and beside.kept == candidates
+            and flight_test.prefers(extended, beside.fit.vector)
+        ):
+            beside = beside._replace(fit=beside.fit._replace(vector=extended))
+        losses = flight_test.losses(self._vector_of(remaining), self._vector_of(beside))
+        worth = np.sqrt(losses[0].sum() / losses[1].sum()) - 1.0
+        is_better = worth >= WORTHWHILE and sureness(losses[0] - losses[1]) >= LIKELY
+        return beside if is_better else remaining
+
+    def _vector_of(self, refined: Refined) -> np.ndarray:
+        """Return the model that a refinement leaves; without effects, the base of single steps."""
+        return self.base if refined.fit is None else refined.fit.vector
 
     def _eliminate(
         self, refined: Refined, fit: Fit, flight_test: FlightTest, target: Target
