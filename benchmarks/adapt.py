@@ -66,7 +66,7 @@ CONFIGURATIONS = (*SETUPS, "P and D term", "a weak motor", "drag", "mass", "bent
 NUM_PLANTS, NUM_UNCHANGED = 8, 20
 LIMIT, NETWORK = "limit", "residual network"
 ENTRIES = ("nothing", *POLICIES, NETWORK, "refitted base", "adapted", LIMIT)
-LIMIT_SETTINGS = Settings().polishing._replace(updates=300, offset_limit=0.95)
+LIMIT_SETTINGS = Settings().polishing._replace(updates=300, way_steps=0, offset_limit=0.95)
 # XLA does not compile the gradient of parts of 1 ms within eight minutes.
 WITH_LIMIT = ("handout", "semi_implicit")
 STARTS, START_SEED = 256, 7
@@ -317,6 +317,13 @@ def crafts_table(lines: list[Line]) -> str:
     return report.table(header, rows)
 
 
+def describe_not_flown(lines: list[Line]) -> str:
+    """Return which configurations of firmware have no line."""
+    flown = {one["hidden"] for one in lines}
+    missing = [name for name in CONFIGURATIONS if name not in flown]
+    return f"Not flown at this commit: {', '.join(missing)}." if missing else ""
+
+
 def write_page(lines: list[Line]) -> None:
     """Write the page of lines."""
     failed = sum("error" in one for one in lines)
@@ -360,6 +367,7 @@ def write_page(lines: list[Line]) -> None:
         logs=logs_table(of_all_logs),
         sizes=crafts_table(of_kind[SIZE]),
         firmware=crafts_table(of_kind[FIRMWARE]),
+        firmware_not_run=describe_not_flown(of_kind[FIRMWARE]),
         unchanged=text,
         commits=", ".join(f"{kind} {commit}" for kind, commit in commits.items()),
         machine=lines[-1]["machine"],
