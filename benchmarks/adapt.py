@@ -66,7 +66,7 @@ CONFIGURATIONS = (*SETUPS, "P and D term", "a weak motor", "drag", "mass", "bent
 NUM_PLANTS, NUM_UNCHANGED = 8, 20
 LIMIT, NETWORK = "limit", "residual network"
 ENTRIES = ("nothing", *POLICIES, NETWORK, "refitted base", "adapted", LIMIT)
-LIMIT_SETTINGS = Settings().polishing._replace(updates=300, way_steps=0, offset_limit=0.95)
+LIMIT_SETTINGS = Settings().polishing._replace(updates=300, curriculum_steps=0, offset_limit=0.95)
 # XLA does not compile the gradient of parts of 1 ms within eight minutes.
 WITH_LIMIT = ("handout", "semi_implicit")
 STARTS, START_SEED = 256, 7

@@ -60,7 +60,7 @@ class Settings(NamedTuple):
     flights: int = 256
     polishing: Polishing = Polishing(
         updates=100,
-        way_steps=100,
+        curriculum_steps=100,
         flights=16,
         laps=2,
         slowest_lap_s=5.5,

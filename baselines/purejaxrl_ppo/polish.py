@@ -30,7 +30,8 @@ from flytrack_env.tracks import cross_gate
 
 # offset beyond the limit up to which the penalty is quadratic, linear from there
 QUADRATIC_OFFSET = 0.1
-FOLLOWED = 0.5  # share of an update's flights that finish, after which models move on
+# Share of an update's flights that finish, after which models move on. No other was tried.
+FOLLOWED = 0.5
 
 
 class LostError(ValueError):
@@ -42,8 +43,8 @@ class Settings(NamedTuple):
 
     Attributes:
         updates: of the policy on the models that it is meant for.
-        way_steps: in which models move there before that; 0 if they do not move.
-        way_updates: at most, for these steps.
+        curriculum_steps: in which models move to these before; 0 if they do not move.
+        curriculum_updates: most updates for these steps.
         learning_rate: on the way; after it, it falls to 0 as a cosine.
         flights: of one update, from noisy start poses.
         laps: of a flight.
@@ -57,8 +58,8 @@ class Settings(NamedTuple):
     """
 
     updates: int = 1500
-    way_steps: int = 0
-    way_updates: int = 400
+    curriculum_steps: int = 0
+    curriculum_updates: int = 400
     learning_rate: float = 1e-3
     flights: int = 32
     laps: int = 3
@@ -206,17 +207,19 @@ def polish(
         jnp.array, policy.params
     )  # the caller's stay, though updates donate
     optimizer_state = optimizer.init(policy_params)
-    most_updates = settings.updates + (settings.way_updates if settings.way_steps else 0)
+    most_updates = settings.updates + (
+        settings.curriculum_updates if settings.curriculum_steps else 0
+    )
     keys = iter(jax.random.split(jax.random.key(seed), most_updates))
     step = on_way = done = 0
     while done < settings.updates:
-        is_there = step == settings.way_steps
-        if not is_there and on_way == settings.way_updates:
+        is_there = step == settings.curriculum_steps
+        if not is_there and on_way == settings.curriculum_updates:
             raise LostError(
-                f"policy: followed {step / settings.way_steps:.0%} of the way to other models in "
-                f"{on_way} updates, expected all of it"
+                f"policy: followed {step / settings.curriculum_steps:.0%} of the way to other "
+                f"models in {on_way} updates, expected all of it"
             )
-        way = step / settings.way_steps if settings.way_steps else 1.0
+        way = step / settings.curriculum_steps if settings.curriculum_steps else 1.0
         policy_params, optimizer_state, num_complete = update(
             policy_params, optimizer_state, next(keys), jnp.float32(way), jnp.int32(done)
         )
@@ -232,5 +235,5 @@ def polish(
                 f"within {settings.laps * settings.slowest_lap_s:g} s, expected one that already "
                 "races"
             )
-        report(on_way + done, settings.updates + on_way + settings.way_steps - step)
+        report(on_way + done, settings.updates + on_way + settings.curriculum_steps - step)
     return policy_params

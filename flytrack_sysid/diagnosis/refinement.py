@@ -250,20 +250,22 @@ class _Refinement(NamedTuple):
         if not remaining.removed:
             return remaining
         # A fit to flights may make a horizon worse with the effects and without them.
-        beside = self._eliminate(refined, fit, flight_test.with_base(base), target)
+        alternative = self._eliminate(refined, fit, flight_test.with_base(base), target)
         if (
-            beside.fit is not None
-            and beside.kept == candidates
-            and flight_test.prefers(extended, beside.fit.vector)
+            alternative.fit is not None
+            and alternative.kept == candidates
+            and flight_test.prefers(extended, alternative.fit.vector)
         ):
-            beside = beside._replace(fit=beside.fit._replace(vector=extended))
-        losses = flight_test.losses(self._vector_of(remaining), self._vector_of(beside))
+            alternative = alternative._replace(fit=alternative.fit._replace(vector=extended))
+        losses = flight_test.losses(
+            self._final_parameters(remaining), self._final_parameters(alternative)
+        )
         worth = np.sqrt(losses[0].sum() / losses[1].sum()) - 1.0
         is_better = worth >= WORTHWHILE and sureness(losses[0] - losses[1]) >= LIKELY
-        return beside if is_better else remaining
+        return alternative if is_better else remaining
 
-    def _vector_of(self, refined: Refined) -> np.ndarray:
-        """Return the model that a refinement leaves; without effects, the base of single steps."""
+    def _final_parameters(self, refined: Refined) -> np.ndarray:
+        """Return the parameters that a refinement leaves; those of the base if it fits none."""
         return self.base if refined.fit is None else refined.fit.vector
 
     def _eliminate(

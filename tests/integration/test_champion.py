@@ -125,7 +125,7 @@ def test_models_move_as_far_as_the_policy_follows():
     champion = load_checkpoint(CHAMPION)
     env, reports = simulated_env(champion), []
     model = env.default_params.model
-    heavier = SHORT._replace(updates=1, way_steps=10, way_updates=12)
+    heavier = SHORT._replace(updates=1, curriculum_steps=10, curriculum_updates=12)
     with pytest.raises(LostError, match=r"followed \d+% of the way to other models in 12 updates"):
         polish(
             env,
