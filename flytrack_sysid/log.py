@@ -3,7 +3,7 @@
 docs/identification.md lists columns, units and frames: position ``p``, velocity ``v``, acceleration
 ``a`` (0 in hover), world; specific force ``f``, angular velocity ``w``, body; orientation ``q``,
 (w, x, y, z), body to world; command ``u`` and applied action ``uprev`` in [-1, 1]; battery
-``v_bat``, V.
+``v_bat``, V; and ``sticks``, what a controller was asked for, in logs whose commands are motors.
 
 Row k holds what was measured at t_k and the command held from t_k to t_k+1. As in the handout's
 state, ``a`` and ``f`` of row k are those of the step that led to t_k, with the attitude before it.
@@ -43,6 +43,7 @@ CHANNELS: dict[str, tuple[str, ...]] = {
     "w": tuple(f"w_{axis}" for axis in _XYZ),
     "uprev": tuple(f"uprev_{stick}" for stick in _STICKS),
     "v_bat": ("v_bat",),
+    "sticks": tuple(f"sticks_{stick}" for stick in _STICKS),
 }
 REQUIRED = ("t", *CHANNELS["u"])
 MEASURED, OF_MOTORS, STATED_VOLTAGES = "measured", "motors", ("v_bat_low", "v_bat_high")

@@ -109,7 +109,8 @@ def describe(log: FlightLog) -> str:
     """Return a few lines on a log: origin, duration, sample interval, gaps, channels, ranges."""
     is_inside = ~log.is_start()[1:]
     steps = np.diff(log.time)
-    absent = [name for name in CHANNELS if name not in log]
+    kinds = CHANNELS if log.has_motors else CHANNELS.keys() - {"sticks"}  # "u" holds them
+    absent = [name for name in CHANNELS if name in kinds and name not in log]
     lines = [
         f"{log.source}: {len(log)} rows, {log.is_start().sum()} segments, "
         f"{steps[is_inside].sum():.2f} s",

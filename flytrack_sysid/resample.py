@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 SLOW_STEP_S = 0.025  # 40 Hz: the lags of a rate loop are 10 to 50 ms
 MAX_BRIDGE_STEPS = 3.0  # of a channel's usual step: longer gaps are not interpolated
 SETPOINTS = ("attitude_command", "torque_command", "reference_rates", "thrust_command")
-HELD = ("u", *SETPOINTS, "own_attitude", "motors")
+HELD = ("u", "sticks", *SETPOINTS, "own_attitude", "motors")
 
 
 class Samples(NamedTuple):

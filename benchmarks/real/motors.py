@@ -2,17 +2,20 @@
 
 The first half of each flight is learnt from, the second is predicted, beside a linear ARX of the
 same motors and rates. Then the parameters of two flights of one craft, and the rotor drag of a
-simulated flight of others (PX4 in Gazebo), whose truth is known. Last, two flights of NanoBench are
-diagnosed twice, from motors and from sticks, and two others are predicted. Flights come from
+simulated flight of others (PX4 in Gazebo), whose truth is known. Two flights of NanoBench are
+diagnosed twice, from motors and from sticks, and two others are predicted. Last, loops between the
+sticks and motors of Betaflight are compared with the settings in its logs. Flights come from
 ``benchmarks.real.crazyflie.DATA``.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import orangebox
 import tyro
 
 from benchmarks import report
@@ -26,7 +29,10 @@ from benchmarks.real.black_boxes import (
 from benchmarks.real.crafts import MAPPINGS, nanobench_flights
 from benchmarks.real.crazyflie import DATA, MAX_WINDOWS
 from benchmarks.real.section import diagnose_log
-from flytrack_sysid import FitError, fit, import_log
+from flytrack_env import ModelParameters
+from flytrack_sysid import FitError, FlightLog, fit, import_log
+from flytrack_sysid.diagnosis.controller import AXES, examine_controller, identify_loops
+from flytrack_sysid.diagnosis.result import Loop
 from flytrack_sysid.fit import Fit
 from flytrack_sysid.importing.importer import Imported
 from flytrack_sysid.inference.chunks import at_usual_rate
@@ -37,12 +43,16 @@ from flytrack_sysid.inference.free_flight import (
     make_windows,
 )
 from flytrack_sysid.inference.torque import MotorRecord, torque_correlations
+from flytrack_sysid.split import held_out_rows
 
 HORIZON = HORIZONS_S.index(0.25)
 RATES = QUANTITIES.index("rates")
 SPACING_S = 0.1
 ROTOR_DRAG = 0.0378  # s/m, of the Gazebo flight: its data's README
 LAGS = {"motors.up_s": 0.02, "motors.down_s": 0.03}
+PARTS = {"Betaflight 6S": 1, "Gecko": 6}  # of a log: a flight of less than 20 s has no parts
+PID_SCALES = (0.032029, 0.244381, 0.000529)  # of P, I and D: Betaflight's pid.h
+DSHOT_LOW = 48  # a motor that is off
 PHOENIX = "crazyflie_rate_flights/seed00048_log1.csv.gz"
 NANOBENCH_LEARNT = ("B8_star_fast_rep1", "B9_trefoil_fast_rep14")
 NANOBENCH_HELD = ("B7_oval_fast_rep1", "B10_lissajous_fast_rep1")
@@ -165,13 +175,87 @@ def torques() -> dict[str, list[float]]:
     }
 
 
-def main(out: Path | None = None, only: Literal["all", "nanobench", "torque"] = "all") -> None:
+def controllers() -> dict[str, Any]:
+    """Return the loops between sticks and motors of two crafts, and what their logs state.
+
+    Betaflight's gains are whole numbers times a scale (its ``pid.h``), per thousandth of the range
+    between idle and full.
+    """
+    result: dict[str, Any] = {}
+    for name, num_parts in PARTS.items():
+        craft = CRAFTS[name]
+        flight = read(craft)
+        log, model = flight.log, flight.nominal_model()
+        settings = orangebox.Parser.load(str(DATA / craft.files[0])).headers
+        low, high = settings["motorOutput"]
+        idle = (high - low) / (high - DSHOT_LOW)
+        stated = {}
+        for axis, full_stick in zip(AXES, model.max_rate, strict=True):
+            gain, integral, derivative = (
+                scale * setting
+                for scale, setting in zip(PID_SCALES, settings[f"{axis}PID"], strict=True)
+            )
+            stated[axis] = {
+                "full_stick": float(full_stick),
+                "gain": 10.0 * gain * idle,
+                "integral": integral / gain,
+                "derivative": derivative / gain,
+            }
+        edges = np.linspace(0, len(log), num_parts + 1).astype(int)
+        parts = [log.select(slice(*pair)) for pair in itertools.pairwise(edges)]
+        loops, *of_parts = (
+            identify_loops(part, model, held_out_rows(part)) for part in (log, *parts)
+        )
+        sticks = log["sticks"]
+        spoiled = {
+            "sticks times 1.5": 1.5 * sticks,
+            "roll and pitch exchanged": sticks[:, [1, 0, 2, 3]],
+        }
+        result[name] = {
+            "stated": stated,
+            "faults": {
+                change: _faults(replace(log, channels={**log.channels, "sticks": values}), model)
+                for change, values in {"none": sticks, **spoiled}.items()
+            },
+            "found": _values(loops),
+            "parts": [_values(loops_of_part) for loops_of_part in of_parts],
+        }
+    return result
+
+
+def _faults(log: FlightLog, model: ModelParameters) -> tuple[str, ...]:
+    controller = examine_controller(log, model, held_out_rows(log))
+    return () if controller is None else controller.faults
+
+
+def _values(loops: Sequence[Loop]) -> dict[str, dict[str, Any]]:
+    """Return the values of loops with half of their intervals, by axis."""
+    return {
+        loop.axis: {
+            "explained": loop.explained,
+            **{
+                name: [getattr(loop, name).value, getattr(loop, name).half_width]
+                for name in ("full_stick", "gain", "integral", "derivative", "feedforward")
+            },
+            "delays_s": [loop.stick_delay_s, loop.gyro_delay_s],
+        }
+        for loop in loops
+    }
+
+
+PARTIAL = {"nanobench": nanobench, "torque": torques, "controller": controllers}
+
+
+def main(
+    out: Path | None = None,
+    only: Literal["all", "nanobench", "torque", "controller"] = "all",
+) -> None:
     """Measure and print; out: a file of JSON values."""
     results: dict[str, Any] = {"commit": report.commit_of_checkout()}
     if only != "all":
-        results[only] = nanobench() if only == "nanobench" else torques()
+        results[only] = PARTIAL[only]()
         for name, value in results[only].items():
-            print(name, value if only == "torque" or name == "ratios" else "")
+            print(name, value if only != "nanobench" or name == "ratios" else "")
         if out is not None:
             report.write_json(out, results)
         return

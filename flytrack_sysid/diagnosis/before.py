@@ -18,6 +18,7 @@ from scipy import signal
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.effects import BY_NAME, acts
 from flytrack_env.motion import Motion
+from flytrack_sysid.diagnosis.controller import changes, examine_controller
 from flytrack_sysid.diagnosis.diagnose import (
     Logs,
     Report,
@@ -178,7 +179,8 @@ def diagnose_change(
         parts = calm(split(after, model, held_out, motion))
         model = nominal_parameters() if model is None else model
         later = Estimate.of(parts)
-        earlier = Estimate.of(calm(split(before, model, None, parts.motion_estimate.motion)))
+        parts_before = calm(split(before, model, None, parts.motion_estimate.motion))
+        earlier = Estimate.of(parts_before)
         equivalents: dict[str, tuple[str, ...]] = {}
         report(1, 3)
         while len(later.model.candidates) < MAX_EFFECTS:
@@ -202,6 +204,12 @@ def diagnose_change(
     causes = tuple(
         replace(one, equivalent=(drifts | equivalents).get(one.effect, ())) for one in causes
     )
+    controller = diagnosis.controller
+    if controller is not None:
+        controller_before = examine_controller(
+            parts_before.logged, model, parts_before.logged_held_out
+        )
+        controller = replace(controller, faults=tuple(changes(controller, controller_before)))
     is_of_thrust = any(base_fields(one.effect) == THRUST_COEFFS for one in causes)
     unchanged = {one.effect for one in named} - {one.effect for one in causes}
     return replace(
@@ -209,6 +217,7 @@ def diagnose_change(
         nominal=model._replace(motion=diagnosis.extended.motion),
         verdict=classify(causes, diagnosis.unexplained),
         causes=causes,
+        controller=controller,
         warnings=(
             *diagnosis.warnings,
             *(f"{name}: as in the log before, so no change" for name in sorted(unchanged)),

@@ -16,6 +16,7 @@ from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis import craft, summary
 from flytrack_sysid.diagnosis.beyond import Learned, with_and_without, with_learned
+from flytrack_sysid.diagnosis.controller import controller_notes, examine_controller
 from flytrack_sysid.diagnosis.families import with_families
 from flytrack_sysid.diagnosis.first_look import FirstLook
 from flytrack_sysid.diagnosis.late_poses import with_late_poses
@@ -88,6 +89,7 @@ class Split(NamedTuple):
 
     Attributes:
         logged: the log as it was; it may have more rows.
+        logged_held_out: its held-out rows, bool.
         motion_estimate: the motion, and how late poses were.
         log: with all channels on one clock.
         held_out: rows of ``log``, (num_rows,) bool.
@@ -98,6 +100,7 @@ class Split(NamedTuple):
     """
 
     logged: FlightLog
+    logged_held_out: np.ndarray
     motion_estimate: MotionEstimate
     log: FlightLog
     held_out: np.ndarray
@@ -203,13 +206,15 @@ def split(
         raise DiagnosisError(
             f"held_out: found {mask.dtype} of shape {mask.shape}, expected bool of ({len(log)},)"
         )
-    logged, (log, is_kept, notes) = log, on_one_clock(log)
+    logged, logged_held_out = log, mask
+    log, is_kept, notes = on_one_clock(log.without("sticks"))  # nothing below reads them
     warnings, mask = [*warnings, *notes], mask[is_kept]
     warnings += motion_notes(log, model, motion, "chosen by likelihood")
     motion = required_motion(log, motion)
     model = nominal_parameters() if model is None else model
     check_commands(log, model)
     warnings += torque_notes(log, model) + voltage_notes(log, model.battery)
+    warnings += controller_notes(logged)
     log = with_voltage(log, model)
     model = model._replace(battery=battery_of_craft(log, model.battery))
     reductions: list[Callable[[FlightLog], tuple[FlightLog, np.ndarray, list[str]]]] = [
@@ -236,7 +241,17 @@ def split(
         build_problem(thinned(chunks), corrected, log, model, motion_estimate.late_s)
         for chunks in (train_chunks, test_chunks)
     )
-    return Split(logged, motion_estimate, corrected, mask, train, test, as_logged, tuple(warnings))
+    return Split(
+        logged,
+        logged_held_out,
+        motion_estimate,
+        corrected,
+        mask,
+        train,
+        test,
+        as_logged,
+        tuple(warnings),
+    )
 
 
 class VettedModel(NamedTuple):
@@ -462,6 +477,7 @@ def summarize(vetted: VettedModel, parts: Split) -> Diagnosis:
             *notes_on(named, vetted, parts, flying),
         ),
         prediction=prediction,
+        controller=examine_controller(parts.logged, problem.like, parts.logged_held_out),
         changed=summary.changed_parameters(linearization, extended, vetted.refined),
         half_response_s={}
         if parts.log.has_motors

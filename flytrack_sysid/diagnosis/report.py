@@ -29,6 +29,7 @@ from flytrack_sysid.diagnosis.result import (
     Diagnosis,
     Estimated,
     HalfResponse,
+    Loop,
     Unexplained,
 )
 from flytrack_sysid.diagnosis.traces import Traces, traces
@@ -414,6 +415,61 @@ def _lift_text(diagnosis: Diagnosis) -> list[str]:
     ]
 
 
+def _loop_row(loop: Loop) -> list[str]:
+    """Return the cells of a controller's loop."""
+    shares = (
+        (loop.integral, 1.0, "1/s"),
+        (loop.derivative, 1e3, "ms"),
+        (loop.feedforward, 1e3, "ms"),
+    )
+    return [
+        loop.axis,
+        "-" if np.isnan(loop.explained) else f"{loop.explained:.0%}",
+        f"{loop.full_stick.value:.0f} ± {loop.full_stick.half_width:.0f} deg/s",
+        f"{loop.gain.value:.3g} ± {loop.gain.half_width:.2g}",
+        *(
+            f"{factor * value.value:.3g} ± {factor * value.half_width:.2g} {unit}"
+            for value, factor, unit in shares
+        ),
+        f"{1e3 * loop.stick_delay_s:.0f}, {1e3 * loop.gyro_delay_s:.0f} ms",
+    ]
+
+
+LOOP_COLUMNS = ["controller", "explained", "full stick", "P", "I/P", "D/P", "F/P", "delays"]
+
+
+def describe_side(diagnosis: Diagnosis) -> str:
+    """Return a sentence on which side of the motors is wrong; empty without a controller."""
+    if diagnosis.controller is None:
+        return ""
+    wrong = [
+        *(["the body"] if diagnosis.verdict != CONSISTENT else []),
+        *(["the controller"] if diagnosis.controller.faults else []),
+    ]
+    text = "Which side of the motors is wrong: " + (" and ".join(wrong) or "neither") + "."
+    return " ".join([text, *(f"{fault}." for fault in diagnosis.controller.faults)])
+
+
+def _controller_parts(diagnosis: Diagnosis) -> list[Part]:
+    """Return the loops of a controller, and which side is wrong; nothing without a controller."""
+    if diagnosis.controller is None:
+        return []
+    caption = (
+        "From sticks and gyro to motors. Explained: of the held-out motors' variance by a linear "
+        "loop. P: per cent of the motors' range per 100 deg/s. Delays: of sticks and gyro."
+    )
+    rows = [_loop_row(loop) for loop in diagnosis.controller.loops]
+    return [Text(describe_side(diagnosis)), Table(LOOP_COLUMNS, rows, caption)]
+
+
+def _controller_text(diagnosis: Diagnosis) -> list[str]:
+    """Return the same as lines of text."""
+    if diagnosis.controller is None:
+        return []
+    rows = [tuple(_loop_row(loop)) for loop in diagnosis.controller.loops]
+    return [*text_table([tuple(LOOP_COLUMNS), *rows]), describe_side(diagnosis)]
+
+
 def _limits_part(diagnosis: Diagnosis) -> Part:
     if not diagnosis.not_identifiable:
         return Text(
@@ -540,9 +596,11 @@ def html_of(diagnosis: Diagnosis, log: FlightLog) -> str:
     if diagnosis.warnings:
         introduction.append(Bullets(diagnosis.warnings))
     evidence = _evidence_parts(diagnosis, model_traces, float(log.time[0]))
+    controller = _controller_parts(diagnosis)
     sections = [
         Section("Errors before and after", [*_errors_picture(diagnosis), _errors_table(diagnosis)]),
         *([Section("The evidence, cause by cause", evidence)] if evidence else []),
+        *([Section("The controller", controller)] if controller else []),
         Section("What this log could not show, and what to fly", [_limits_part(diagnosis)]),
         Section(
             "What remains unexplained",
@@ -603,7 +661,7 @@ def text_of(diagnosis: Diagnosis) -> str:
     if answers:
         times = ", ".join(f"{stick} {_half_response(response)}" for stick, response in answers)
         lines.append(f"time from a stick to half of the response, ms: {times}")
-    lines += _lift_text(diagnosis)
+    lines += _lift_text(diagnosis) + _controller_text(diagnosis)
     if diagnosis.unexplained.depends_on:
         lines.append(f"unexplained, depends on: {', '.join(diagnosis.unexplained.depends_on)}")
     if diagnosis.learned is not None:

@@ -231,6 +231,46 @@ class Lift:
 
 
 @dataclass(frozen=True)
+class Loop:
+    """The loop of rates of one axis: ``flytrack_sysid.diagnosis.controller`` has its law.
+
+    Attributes:
+        axis: its name.
+        explained: share of the held-out variance of the motors' share; NaN without such rows.
+        full_stick: rate that full stick asks for, deg/s.
+        gain: P, in hundredths of the motors' range per 100 deg/s.
+        integral: I over P, 1/s.
+        derivative: D over P, s.
+        feedforward: F over P and the rate of full stick, s.
+        stick_delay_s: from the sticks to the motors.
+        gyro_delay_s: from the gyro to the motors.
+    """
+
+    axis: str
+    explained: float
+    full_stick: Estimated
+    gain: Estimated
+    integral: Estimated
+    derivative: Estimated
+    feedforward: Estimated
+    stick_delay_s: float
+    gyro_delay_s: float
+
+
+@dataclass(frozen=True)
+class Controller:
+    """What a log shows of a controller.
+
+    Attributes:
+        loops: of the axes that the log shows.
+        faults: what is wrong with them, a sentence each.
+    """
+
+    loops: tuple[Loop, ...]
+    faults: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Outliers:
     """The number of outliers in a channel, and the number of rows."""
 
@@ -269,6 +309,7 @@ class Diagnosis:
         outliers: by channel, if any.
         learned: a law for what is unexplained, part of the extended model.
         joint: how uncertain the extended model's parameters are together.
+        controller: between sticks and motors, if the log has both.
     """
 
     verdict: str
@@ -294,6 +335,7 @@ class Diagnosis:
     outliers: Mapping[str, Outliers] = field(default_factory=dict)
     learned: Learned | None = None
     joint: Joint = field(default_factory=Joint)
+    controller: Controller | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of diagnosis.json, with the names of its schema and six digits."""
@@ -323,6 +365,7 @@ class Diagnosis:
             "changed": _plain(self.changed),
             "half_response_s": _plain(self.half_response_s),
             "lift": _plain(self.lift),
+            "controller": None if self.controller is None else _plain(self.controller),
             "noise": self.noise,
             "outliers": _plain(self.outliers),
             "data": {"file": self.source, "sha256": self.sha256, "voltages": self.voltages},

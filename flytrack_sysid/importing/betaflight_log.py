@@ -127,11 +127,11 @@ def _read_log(
         craft = craft._replace(max_rate_deg_s=headers.full_stick_deg_s())
     full = np.array([*(craft.max_rate_deg_s or ()), FULL_THROTTLE])
     channels = _channels(table, headers)
-    clipped: list[str] = []
+    sticks, clipped = _commands(table, headers, full)
     if of_motors:
-        channels["u"] = _motors_as_commands(source, table, headers)
+        channels |= {"u": _motors_as_commands(source, table, headers), "sticks": sticks}
     else:
-        channels["u"], clipped = _commands(table, headers, full)
+        channels["u"] = sticks
     if mapping.rules.motors_as_thrust:
         channels["u"][:, 3] = _thrust_of_motors(table, headers)
         clipped.append("thrust command: the mean of the motors")

@@ -100,6 +100,30 @@ def read_commands(
     return np.clip(commands, -1.0, 1.0), notes
 
 
+def read_sticks(
+    source: str,
+    time: np.ndarray,
+    channels: Channels[str, np.ndarray],
+    rules: CommandRules,
+    max_rate_deg_s: tuple[float, ...] | None,
+) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """Return what a controller was asked for beside motors that are the commands, and notes.
+
+    Arguments are those of ``read_commands``. The sticks, (num_rows, 4) in [-1, 1], are None where
+    a log does not hold them.
+    """
+    if channels.keys().isdisjoint({"u", "attitude_command", "torque_command"}):
+        return None, ()
+    of_sticks = rules._replace(motors_as_command=False)
+    without_motors = {name: values for name, values in channels.items() if name != "motors"}
+    try:
+        if max_rate_deg_s is None:
+            raise LogError(f"{source}: craft.max_rate_deg_s: missing in the mapping")
+        return read_commands(source, time, without_motors, of_sticks, max_rate_deg_s)
+    except LogError as error:
+        return None, (f"the controller's sticks are left out: {error}",)
+
+
 def commands_of_motors(source: str, motors: np.ndarray | None) -> np.ndarray:
     """Return the outputs of four motors, 0 to 1, as commands, (num_rows, 4) in [-1, 1].
 

@@ -116,13 +116,17 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
             f"{path}: message RATE: missing or without {', '.join(FIELDS['RATE'])}; found {listed}"
         )
     craft, of_motors = mapping.craft, mapping.rules.motors_as_command
-    if craft.max_rate_deg_s is None and not of_motors:
-        craft = craft._replace(
-            max_rate_deg_s=_full_stick_deg_s(path, parameters, chosen["RATE"], remarks)
-        )
+    if craft.max_rate_deg_s is None:
+        try:
+            full_deg_s = _full_stick_deg_s(path, parameters, chosen["RATE"], remarks)
+            craft = craft._replace(max_rate_deg_s=full_deg_s)
+        except LogError:
+            if not of_motors:  # which need no full stick
+                raise
     channels = _channels(chosen, parameters, craft.max_rate_deg_s, remarks)
     if of_motors:
-        channels = [channel for channel in channels if channel.name not in ("u", "motors")]
+        unused = ("motors",) if craft.max_rate_deg_s else ("u", "motors")
+        channels = [channel for channel in channels if channel.name not in unused]
         channels.append(_motors_as_commands(path, chosen, parameters, craft.motors))
     topics = [
         Table(

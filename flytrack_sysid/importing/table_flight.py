@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from flytrack_env.messages import quote_name
-from flytrack_sysid.importing.commands import read_commands
+from flytrack_sysid.importing.commands import read_commands, read_sticks
 from flytrack_sysid.importing.file_kinds import EMPTY, GZIP, UNKNOWN, check_kind
 from flytrack_sysid.importing.flight import ImportedFlight, list_names, log_of_channels
 from flytrack_sysid.importing.mapping import Channel, CsvFile, Mapping
@@ -205,9 +205,14 @@ def _flight(
     mapping: Mapping,
 ) -> ImportedFlight:
     """Return the flight of converted channels; steps above ``max_gap_s`` begin a new segment."""
-    commands, notes = read_commands(
-        table.source, time, values, mapping.rules, mapping.craft.max_rate_deg_s
-    )
+    described = table.source, time, values, mapping.rules, mapping.craft.max_rate_deg_s
+    commands, notes = read_commands(*described)
+    channels = {**values, "u": commands}
     segment, of_motors = number_segments(time, max_gap_s), mapping.rules.motors_as_command
-    log = log_of_channels(table, time, segment, {**values, "u": commands}, of_motors)
+    if of_motors:
+        sticks, stick_notes = read_sticks(*described)
+        notes += stick_notes
+        if sticks is not None:
+            channels["sticks"] = sticks
+    log = log_of_channels(table, time, segment, channels, of_motors)
     return ImportedFlight(log, mapping.craft, notes)

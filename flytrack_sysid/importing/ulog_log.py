@@ -16,6 +16,7 @@ from flytrack_env.motors import NAMES
 from flytrack_sysid.importing.commands import check_motors_of_autopilot, commands_of_motors
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import (
+    Craft,
     ImportedFlight,
     log_of_channels,
     not_a_quadcopter,
@@ -96,7 +97,6 @@ SOURCES: dict[str, tuple[Source, ...]] = {
     "landed": (("vehicle_land_detected", ("landed",)),),
     "motors": (_indexed("actuator_motors", "control", 4),),
 }
-REQUIRED = ("w", "u", "q", "motors")
 # Rotors of PX4's quadcopter X, in our order, where CA_ROTORn_PX and _PY do not say it.
 ROTORS_OF_X = (3, 0, 1, 2)
 QUADRANTS = ((-1, 1), (1, 1), (-1, -1), (1, -1))  # ahead, right: of the motors in our order
@@ -116,18 +116,19 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
         raise LogError(f"{mapping.source}: motors.as_thrust: not read of PX4 logs, expected false")
     of_motors, craft = mapping.rules.motors_as_command, mapping.craft
     samples, clocks, parameters, remarks = _decode(path, of_motors)
+    converted = {"q": _attitude(path, samples["q"])}
     if of_motors:
-        commands = _motors_as_commands(path, samples["motors"], parameters, craft.motors)
-        remarks.append(saturation(commands.values.max(axis=1) >= 1.0))
-    else:
-        if craft.max_rate_deg_s is None:
-            craft = craft._replace(max_rate_deg_s=_full_stick_deg_s(path, parameters))
-        full_stick = np.array(craft.max_rate_deg_s)
-        values = _commands(samples["u"].values, full_stick * PER_DEGREE)
-        _check_full_stick(path, values, full_stick)
-        commands = samples["u"]._replace(values=values)
+        converted["u"] = _motors_as_commands(path, samples["motors"], parameters, craft.motors)
+        remarks.append(saturation(converted["u"].values.max(axis=1) >= 1.0))
+    if "u" in samples:
+        try:
+            craft, sticks = _sticks(path, samples["u"], parameters, craft)
+            converted["sticks" if of_motors else "u"] = sticks
+        except LogError as error:
+            if not of_motors:
+                raise
+            remarks.append(f"the controller's sticks are left out: {error}")
     base = samples["w"].times
-    converted = {"u": commands, "q": _attitude(path, samples["q"])}
     for name in ("w", "f", "p", "v"):
         if name in samples:
             converted[name] = samples[name]._replace(values=vector_from(samples[name].values, True))
@@ -204,7 +205,7 @@ def _decode(
 
     Args:
         path: of the log.
-        of_motors: read the motors' controls, in place of rate setpoints.
+        of_motors: read the motors' controls; rate setpoints may be missing then.
 
     Returns:
         samples: by channel, on one time line.
@@ -213,8 +214,8 @@ def _decode(
         remarks: what is wrong with the log.
     """
     read_log_file(path, MAX_BYTES, FIRST_BYTES, "a PX4 log (ULog)", is_whole=False)
-    unused = "u" if of_motors else "motors"
-    used = {channel: sources for channel, sources in SOURCES.items() if channel != unused}
+    used = {name: sources for name, sources in SOURCES.items() if of_motors or name != "motors"}
+    required = ("w", "q", "motors") if of_motors else ("w", "q", "u")
     fields: dict[str, list[str]] = {}
     for topic, names in (source for sources in used.values() for source in sources):
         fields[topic] = [*fields.get(topic, TIMES), *names]
@@ -238,7 +239,7 @@ def _decode(
                 samples[channel], clocks[channel], faults = best
                 remarks += [text for text in faults if text not in remarks]  # channels share topics
                 break
-        if channel not in samples and channel in REQUIRED:
+        if channel not in samples and channel in required:
             wanted = " or ".join(f"{topic} ({', '.join(names)})" for topic, names in sources)
             available = ", ".join(sorted(topics)) or "none of the topics that are read"
             raise LogError(f"{path}: topic {wanted}: missing or empty; found {available}")
@@ -319,6 +320,18 @@ def _commands(setpoints: np.ndarray, full_stick: np.ndarray) -> np.ndarray:
     """
     rates = vector_from(setpoints[:, :3], True) / full_stick
     return np.column_stack([rates, 2.0 * np.abs(setpoints[:, 3]) - 1.0])
+
+
+def _sticks(
+    path: Path, setpoints: Samples, parameters: dict[str, float], craft: Craft
+) -> tuple[Craft, Samples]:
+    """Return the craft with its rates at full stick, and the commands of rate setpoints."""
+    if craft.max_rate_deg_s is None:
+        craft = craft._replace(max_rate_deg_s=_full_stick_deg_s(path, parameters))
+    full_stick = np.array(craft.max_rate_deg_s)
+    values = _commands(setpoints.values, full_stick * PER_DEGREE)
+    _check_full_stick(path, values, full_stick)
+    return craft, setpoints._replace(values=values)
 
 
 def _check_full_stick(path: Path, commands: np.ndarray, full_stick: np.ndarray) -> None:
