@@ -139,8 +139,10 @@ def raced(policy: Checkpoint, plant: Plant) -> Line:
     return {"success": outcome.success, "flying_lap_s": rounded(outcome.flying_lap_s)}
 
 
-def format_lap(entry: Line) -> str:
-    """Return who finishes, and the flying lap."""
+def format_lap(entry: Line | None) -> str:
+    """Return who finishes, and the flying lap; a dash if nothing was flown."""
+    if entry is None:
+        return "-"
     lap_s = entry["flying_lap_s"]
     return f"{entry['success']:.1%}, " + ("-" if lap_s is None else f"{lap_s:.3f} s")
 
@@ -159,13 +161,12 @@ def figures(plants: list[Line], unchanged: list[Line]) -> list[report.Figure]:
         )
         for name in flown_entries(plants)
     ]
-    over_limit = [
-        one["entries"]["adapted"]["flying_lap_s"] / one["entries"][LIMIT]["flying_lap_s"]
+    laps_s = [
+        [one["entries"][name]["flying_lap_s"] for name in ("adapted", LIMIT)]
         for one in plants
         if LIMIT in one["entries"]
-        and one["entries"]["adapted"]["flying_lap_s"]
-        and one["entries"][LIMIT]["flying_lap_s"]
     ]
+    over_limit = [adapted_s / limit_s for adapted_s, limit_s in laps_s if adapted_s and limit_s]
     inside = [is_as_expected(one) for one in plants if has_expectation(one)]
     against = [
         report.Figure(
@@ -194,9 +195,7 @@ def figures(plants: list[Line], unchanged: list[Line]) -> list[report.Figure]:
         report.Figure(
             "flying lap, adapted over limit, median (all)",
             "1.05",
-            f"{np.median(over_limit):.3f} ({min(over_limit):.3f} to {max(over_limit):.3f})"
-            if over_limit
-            else "-",
+            report.median_and_spread(over_limit, ".3f"),
             len(over_limit),
         ),
         count_true("mean flying lap within what was expected of a flight", "", inside),
@@ -208,7 +207,7 @@ def figures(plants: list[Line], unchanged: list[Line]) -> list[report.Figure]:
         report.Figure(
             "CPU s from log to policy, median (all)",
             "60",
-            f"{np.median(cpu_s):.0f} ({report.spread(cpu_s)})",
+            report.median_and_spread(cpu_s, ",.0f"),
             len(plants),
         ),
         count_true(
@@ -251,12 +250,12 @@ def plants_table(plants: list[Line]) -> str:
     rows = []
     for one in sorted(plants, key=lambda line: (line["number"], line["motion"])):
         entries = one["entries"]
-        cells = [format_lap(entries[name]) if name in entries else "-" for name in names]
+        laps = [format_lap(entries.get(name)) for name in names]
         expected = one.get("expected_lap_s")
-        cells += ["{:.3f} to {:.3f} s".format(*expected) if expected else "-"]
+        expected_text = "{:.3f} to {:.3f} s".format(*expected) if expected else "-"
         named = ", ".join(one.get("named", ())) or one.get("refused", "nothing")
         head = [str(one["number"]), one["motion"], one.get("motion_found", "-"), one["flights"]]
-        rows.append([*head, one["hidden"], named, *cells])
+        rows.append([*head, one["hidden"], named, *laps, expected_text])
     header = ["plant", "motion", "found", "flights", "hidden", "named", *names, "expected"]
     return report.table(header, rows)
 
@@ -264,10 +263,9 @@ def plants_table(plants: list[Line]) -> str:
 def entries_of_rivals(lines: list[Line], plant: Line) -> dict[str, Line]:
     """Return the races of the rivals on a plant."""
     entries: dict[str, Line] = {}
-    for one in lines:
-        is_rival = one["kind"] in (RIVALS, RESIDUAL)
-        if is_rival and (one["number"], one["motion"]) == (plant["number"], plant["motion"]):
-            entries |= one["entries"]
+    for kind in (RIVALS, RESIDUAL):
+        for line in report.select(lines, kind=kind, number=plant["number"], motion=plant["motion"]):
+            entries |= line["entries"]
     return entries
 
 
@@ -275,7 +273,7 @@ def logs_table(plants: list[Line]) -> str:
     """Return a row for each length of the log and each seed."""
     rows = []
     for seconds, seed in sorted({(one["seconds"], one["seed"]) for one in plants}):
-        alike = [one for one in plants if (one["seconds"], one["seed"]) == (seconds, seed)]
+        alike = report.select(plants, seconds=seconds, seed=seed)
         flown = [one for one in alike if "is_new" in one]
         finish = sum(one["entries"]["adapted"]["success"] >= 0.99 for one in flown)
         inside = [is_as_expected(one) for one in flown if has_expectation(one)]
@@ -309,9 +307,7 @@ def crafts_table(lines: list[Line]) -> str:
         simulated_s = one.get("simulated_lap_s")
         gap = f"{flown_s / simulated_s - 1.0:+.2%}" if flown_s and simulated_s else "-"
         verdict = one.get("refused") or one["verdict"]
-        laps = [
-            format_lap(entries[name]) if name in entries else "-" for name in ("nothing", "adapted")
-        ]
+        laps = [format_lap(entries.get(name)) for name in ("nothing", "adapted")]
         rows.append([one["hidden"], verdict, named, *laps, gap, str(one.get("cpu_s", "-"))])
     header = "craft | verdict | named | nothing | adapted | gap to its simulator | CPU s"
     return report.table(header, rows)
@@ -324,19 +320,16 @@ def describe_not_flown(lines: list[Line]) -> str:
     return f"Not flown at this commit: {', '.join(missing)}." if missing else ""
 
 
-def write_page(lines: list[Line]) -> None:
+def write_page(all_lines: list[Line]) -> None:
     """Write the page of lines."""
-    failed = sum("error" in one for one in lines)
-    lines = [one for one in lines if "error" not in one]
-    of_all_logs = [one for one in lines if one["kind"] == PLANT]
-    lines = [one for one in lines if (one["seconds"], one["seed"]) == (SECONDS, SEED)]
-    of_kind = {kind: [one for one in lines if one["kind"] == kind] for kind in (SIZE, FIRMWARE)}
+    of_all_logs = report.good_lines(all_lines)
+    lines = report.select(of_all_logs, seconds=SECONDS, seed=SEED)
+    firmware = report.select(lines, kind=FIRMWARE)
     plants = [
         {**one, "entries": one["entries"] | entries_of_rivals(lines, one)}
-        for one in lines
-        if one["kind"] == PLANT
+        for one in report.select(lines, kind=PLANT)
     ]
-    unchanged = [one for one in lines if one["kind"] == UNCHANGED]
+    unchanged = report.select(lines, kind=UNCHANGED)
     whole = [one for one in plants if "is_new" in one]
     judged = [one for one in unchanged if "is_new" in one]
     deviations = [
@@ -362,12 +355,13 @@ def write_page(lines: list[Line]) -> None:
         limit_offset=LIMIT_SETTINGS.offset_limit,
         figures=report.figures_table(figures(whole, judged)),
         not_run=f"{len(plants)} of {planned} pairs of plant and motion were flown, "
-        f"{len(plants) - len(whole)} of them refused as a log. Errors: {failed}.",
+        f"{len(plants) - len(whole)} of them refused as a log. "
+        f"Errors: {len(all_lines) - len(of_all_logs)}.",
         plants=plants_table(plants),
-        logs=logs_table(of_all_logs),
-        sizes=crafts_table(of_kind[SIZE]),
-        firmware=crafts_table(of_kind[FIRMWARE]),
-        firmware_not_run=describe_not_flown(of_kind[FIRMWARE]),
+        logs=logs_table(report.select(of_all_logs, kind=PLANT)),
+        sizes=crafts_table(report.select(lines, kind=SIZE)),
+        firmware=crafts_table(firmware),
+        firmware_not_run=describe_not_flown(firmware),
         unchanged=text,
         commits=", ".join(f"{kind} {commit}" for kind, commit in commits.items()),
         machine=lines[-1]["machine"],

@@ -113,7 +113,7 @@ def figures(lines: Sequence[Line]) -> list[report.Figure]:
     laws = [line for line in lines if line["row"] in RIGHT]
     unexplained = [line for line in laws if line["unexplained"]]
     learned = [line for line in laws if line["law"]]
-    loads = [line for line in lines if line["row"] == LOAD]
+    loads = report.select(lines, row=LOAD)
     # A thermal is elsewhere on every flight, so that a new one says nothing of it.
     on_new_flights = [line for line in laws if "removed" in line and line["row"] != "position"]
     removed_percent = [100.0 * line["removed"][0] for line in on_new_flights]
@@ -129,7 +129,7 @@ def figures(lines: Sequence[Line]) -> list[report.Figure]:
         ("law of another variable", "at most 2 %", [not line["is_variable"] for line in learned]),
     ]
     for row in ("clean", "listed"):
-        controls = [line for line in lines if line["row"] == row]
+        controls = report.select(lines, row=row)
         shares.append((f"law, {row}", "at most 1 %", flags(controls, "law")))
     if loads:
         is_unexplained = ["unexplained" in line["verdict"] for line in loads]
@@ -150,7 +150,7 @@ def kinds_table(lines: Sequence[Line]) -> str:
     """Return, by kind of law, the numbers of plants, of right forms and of laws learnt."""
     rows = []
     for kind in RIGHT:
-        plants = [line for line in lines if line["row"] == kind]
+        plants = report.select(lines, row=kind)
         num_right = sum(line.get("is_form", False) for line in plants)
         rows.append((kind, len(plants), num_right, sum(bool(line["law"]) for line in plants)))
     return report.table("kind | plants | form right | any law learnt", rows)
@@ -189,7 +189,7 @@ def write_page() -> None:
     last = {tuple(line[name] for name in Trial._fields): line for line in report.lines_in(LINES)}
     lines = [*last.values()]
     sources = sorted({f"seed {line['seed']} at commit {line['commit']}" for line in lines})
-    good = [line for line in lines if "error" not in line]
+    good = report.good_lines(lines)
     report.fill_page(
         LINES.with_suffix(".md"),
         "beyond",

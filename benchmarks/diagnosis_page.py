@@ -15,8 +15,10 @@ from benchmarks.report import (
     Line,
     figures_table,
     fill_page,
+    good_lines,
     lines_of_commit,
     list_commits,
+    select,
     share_figure,
     table,
 )
@@ -100,7 +102,7 @@ def is_time_told(line: Line) -> bool:
 
 def figures(lines: list[Line]) -> list[Figure]:
     """Return the figures of plants that move in one way."""
-    by_row = {row: [line for line in lines if line["row"] == row] for row in ROWS}
+    by_row = {row: select(lines, row=row) for row in ROWS}
     singles = [(line, *case) for line in by_row["one"] for case in line.get("known", {}).items()]
     shown = [(line, effect) for line, effect, size in singles if size[0] > SHOWN]
     invisible = [line for line, _, size in singles if size[0] < HIDDEN]
@@ -175,8 +177,8 @@ def figures(lines: list[Line]) -> list[Figure]:
 
 def figures_of_motions(lines: list[Line]) -> str:
     """Return the figures of the usual rate: of all motions together, and of each."""
-    of_all = figures([line for line in lines if line["rate"] == USUAL_RATE])
-    by_motion = [figures(flown(lines, motion, USUAL_RATE)) for motion in MOTIONS]
+    of_all = figures(select(lines, rate=USUAL_RATE))
+    by_motion = [figures(select(lines, rate=USUAL_RATE, motion=motion)) for motion in MOTIONS]
     rows = [
         [*figure, *(of_motion.measured.split(" (")[0] for of_motion in of_motions)]
         for figure, *of_motions in zip(of_all, *by_motion, strict=True)
@@ -191,18 +193,14 @@ def figures_of_rates(lines: list[Line]) -> str:
     for rate, motion in sorted({(line["rate"], line["motion"]) for line in lines}):
         if rate == USUAL_RATE:
             continue
-        plants = flown(lines, motion, rate)
-        is_named = [bool(line["causes"]) for line in plants if line["row"] == "clean"]
-        singles = [line for line in plants if line["row"] == "one"]
+        clean, singles = (
+            select(lines, motion=motion, rate=rate, row=row) for row in ("clean", "one")
+        )
+        is_named = [bool(line["causes"]) for line in clean]
         name = f"{rate} Hz, {motion}"
         rows.append(share_figure(f"{name}: any name on clean plants", "at most 2 %", is_named))
         rows.append(share_figure(f"{name}: exact single", "95 %", exact_sets(singles)))
     return figures_table(rows) if rows else "Not measured at this commit."
-
-
-def flown(lines: list[Line], motion: str, rate: int) -> list[Line]:
-    """Return the lines of a motion and rate."""
-    return [line for line in lines if (line["motion"], line["rate"]) == (motion, rate)]
 
 
 def count_names(pairs: Iterable[tuple[str, str]]) -> str:
@@ -236,12 +234,11 @@ def misses(lines: list[Line]) -> str:
 def main() -> None:
     """Write the page."""
     every_line = lines_of_commit(LINES, code=CODE)
-    lines = [line for line in every_line if "error" not in line]
+    lines = good_lines(every_line)
     rows = Counter(line["row"] for line in lines)
     singles = [
         (line["effects"][0], " + ".join(sorted(names_in(line))) or "none")
-        for line in lines
-        if line["row"] == "one"
+        for line in select(lines, row="one")
     ]
     outside = []
     for line in lines:

@@ -297,7 +297,7 @@ def kinds_table(singles: list[Line]) -> str:
     """Return how each kind of change is named."""
     rows = []
     for kind, about in KINDS.items():
-        lines = [line for line in singles if line["kinds"] == [kind]]
+        lines = report.select(singles, kinds=[kind])
         named = sorted({" + ".join(line["found"]) or "nothing" for line in lines})
         sizes = report.spread([100.0 * line["apart"] for line in lines], ".1f") if lines else ""
         is_right = report.share([line["is_in_class"] for line in lines])
@@ -309,12 +309,11 @@ def kinds_table(singles: list[Line]) -> str:
 
 def tables(lines: list[Line]) -> str:
     """Return the results as tables in Markdown."""
-    by_row = {row: [line for line in lines if line["row"] == row] for row in ROWS}
+    by_row = {row: report.select(lines, row=row) for row in ROWS}
     champions = [
         f"The shipped champion, blind: {line['success']:.1%} of {line['episodes']} starts finish "
         f"3 laps; {line['gates']:.1f} of 24 gates in the mean."
-        for line in lines
-        if line["row"] == "champion"
+        for line in report.select(lines, row="champion")
     ]
     parts = [report.figures_table(figures(by_row)), kinds_table(by_row["single"]), *champions]
     return "\n\n".join(parts)
@@ -355,8 +354,7 @@ def write_tables(seed: int) -> None:
     """Write the tables of the last commit's lines into the page."""
     lines = report.lines_of_commit(LINES)
     record = report.provenance("scipy") | {"commit": lines[-1]["commit"]}
-    is_crash = [isinstance(line.get("error"), str) for line in lines]  # else ratios of errors
-    results = tables([line for line, crashed in zip(lines, is_crash, strict=True) if not crashed])
+    results = tables(report.good_lines(lines))
     before, _, after = PAGE.read_text(encoding="utf-8").partition(MARKS[0])
     after = after.partition(MARKS[1])[2]
     text = f"{results}\n\nSeed {seed}. {report.provenance_line(record)}"

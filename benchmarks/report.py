@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from datetime import date
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from statistics import median
 from typing import Annotated, Any, NamedTuple, TypeVar
 
 import tyro
@@ -181,6 +182,11 @@ def spread(values: Sequence[float], digits: str = ",.0f") -> str:
     return f"{min(values):{digits}} to {max(values):{digits}}"
 
 
+def median_and_spread(values: Sequence[float], digits: str) -> str:
+    """Return the median with the lowest and the highest value as text; "none" of no values."""
+    return f"{median(values):{digits}} ({spread(values, digits)})" if values else "none"
+
+
 def list_settings(values: dict[str, float]) -> str:
     """Return settings as a list in a sentence."""
     return ", ".join(f"{name} {value:g}" for name, value in values.items())
@@ -239,6 +245,17 @@ def lines_in(path: Path) -> list[Line]:
     return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
 
 
+def select(lines: Iterable[Line], **fields: Any) -> list[Line]:
+    """Return the lines whose fields have these values."""
+    return [line for line in lines if fields.items() <= line.items()]
+
+
+def good_lines(lines: Iterable[Line]) -> list[Line]:
+    """Return the lines of trials that did not crash."""
+    # A measured field may have that name, too: ratios of errors.
+    return [line for line in lines if not isinstance(line.get("error"), str)]
+
+
 def record_trials(
     path: Path,
     trials: Iterable[Any],
@@ -273,8 +290,7 @@ def record_trials(
     done = lines_of_commit(path, stamp["commit"], code)
 
     def is_done(trial: Any) -> bool:
-        fields = json.loads(json.dumps(trial._asdict()))
-        return any(fields.items() <= line.items() for line in done)
+        return bool(select(done, **json.loads(json.dumps(trial._asdict()))))
 
     remaining = {_job_name(trial): trial for trial in trials if not is_done(trial)}
     arguments = {name: (measure, trial, programs_kept) for name, trial in remaining.items()}

@@ -42,6 +42,7 @@ from benchmarks.report import (
     lines_in,
     progress,
     provenance,
+    select,
     spread,
     write_page,
 )
@@ -409,7 +410,7 @@ def on_paper() -> dict[str, float]:
 
 def last_of(part: str) -> dict[str, Any] | None:
     """Return the last record of a part; None if there is none."""
-    records = [line for line in lines_in(LINES) if line["part"] == part]
+    records = select(lines_in(LINES), part=part)
     return records[-1] if records else None
 
 

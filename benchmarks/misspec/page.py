@@ -95,7 +95,7 @@ def missed(lines: dict[str, Line]) -> dict[str, Line]:
 
 def visibility(suite: LogSuite, log_id: str) -> str:
     """Return what a log could show of each hidden effect: lambda, and beside its closest rival."""
-    stored = [line for line in report.lines_in(MISSES) if line["id"] == log_id]
+    stored = report.select(report.lines_in(MISSES), id=log_id)
     if not stored:
         plant = suite.plant(log_id)
         if not plant.truth.effects or plant.truth.onset_s is not None:

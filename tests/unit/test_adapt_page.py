@@ -62,7 +62,7 @@ def test_lines_that_lack_something(written):
     )
     assert "99 % of starts finish: residual network |  | 1 of 1 |" in page
     assert "a hover" in page and "100.0%, 4.000 s" in page
-    assert "| flying lap, adapted over limit, median (all) | 1.05 | - | 0 |" in page
+    assert "| flying lap, adapted over limit, median (all) | 1.05 | none | 0 |" in page
 
 
 def test_firmware_and_other_lengths_have_tables_of_their_own(written):
