@@ -19,7 +19,6 @@ from unittest.mock import patch
 
 from benchmarks import hidden
 from benchmarks.diagnosis import ROWS, Trial, make_log
-from benchmarks.real.crazyflie import DATA
 from benchmarks.report import (
     RESULTS,
     Line,
@@ -29,6 +28,7 @@ from benchmarks.report import (
     fill_page,
     lines_in,
     progress,
+    select,
     table,
 )
 from benchmarks.seams.measured import measured_flights
@@ -141,7 +141,7 @@ def flown(trial: Trial) -> tuple[list[str], FlightLog, ModelParameters]:
 def measured() -> dict[str, Imported]:
     """Return measured flights that have a nominal model, by name, at most two of a folder."""
     chosen: dict[str, Imported] = {}
-    for name, flight in measured_flights(DATA):
+    for name, flight in measured_flights().items():
         others = [one for one in chosen if one.partition("/")[0] == name.partition("/")[0]]
         duration_s = flight.log.time[-1] - flight.log.time[0]
         is_known = None not in (
@@ -207,7 +207,7 @@ def trial_key(line: Line) -> tuple[Any, ...]:
 def measure(trials: list[Trial], rules: Iterable[str]) -> None:
     """Append the missing lines: first with all rules, then without one rule at a time."""
     lines, commit = lines_in(LINES), {"commit": commit_of_checkout()}
-    counted = {trial_key(line): line for line in lines if not line["without"]}
+    counted = {trial_key(line): line for line in select(lines, without="")}
     for trial in progress([one for one in trials if tuple(one) not in counted], "plants"):
         counted[tuple(trial)] = {**trial._asdict(), **commit, "without": "", **census(trial)}
         append_line(LINES, counted[tuple(trial)])
@@ -224,7 +224,7 @@ def measure(trials: list[Trial], rules: Iterable[str]) -> None:
 def write_page() -> None:
     """Write docs/results/ablation.md from the lines."""
     lines = lines_in(LINES)
-    flights = [line for line in lines if line["row"] == MEASURED]
+    flights = select(lines, row=MEASURED)
     plants = [line for line in lines if line["row"] != MEASURED]
     rules = count_by_rule(plants)
     fill_page(
@@ -248,16 +248,16 @@ def write_page() -> None:
 
 def count_whole(lines: list[Line]) -> int:
     """Return the number of plants or flights that were diagnosed with all rules."""
-    return sum(not line["without"] for line in lines)
+    return len(select(lines, without=""))
 
 
 def count_by_rule(lines: list[Line]) -> list[list[Any]]:
     """Return for each rule how often it fires, and what differs without it."""
-    counted = {trial_key(line): line for line in lines if not line["without"]}
+    counted = {trial_key(line): line for line in select(lines, without="")}
     rows = []
     for rule in RULES:
         fired = [plant for plant, line in counted.items() if rule.name in line["fired"]]
-        removed = [line for line in lines if line["without"] == rule.name]
+        removed = select(lines, without=rule.name)
         pairs = [(line, counted[trial_key(line)]) for line in removed]
         changed = [(line, whole) for line, whole in pairs if line["outcome"] != whole["outcome"]]
         gains = [

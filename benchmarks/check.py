@@ -17,7 +17,6 @@ from zlib import crc32
 import numpy as np
 from scipy.stats import binomtest
 
-from benchmarks.real.crazyflie import DATA
 from benchmarks.report import (
     IN_THIS_PROCESS,
     RESULTS,
@@ -25,8 +24,10 @@ from benchmarks.report import (
     Line,
     command,
     fill_page,
+    good_lines,
     lines_of_commit,
     record_trials,
+    select,
     table,
 )
 from benchmarks.seams.faults import FAULTS, UNITS, Change, Truth, draw_pair, inject, is_shown
@@ -37,7 +38,7 @@ from benchmarks.seams.simulators import SIMULATORS
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_sysid.check import check_log, check_plant
 from flytrack_sysid.check.fix import fix_mapping
-from flytrack_sysid.log import FlightLog
+from flytrack_sysid.log import FlightLog, median_step
 
 LINES = RESULTS / "check.jsonl"
 Part = Literal["clean", "faults", "fixes", "pairs", "simulators", "measured"]
@@ -84,16 +85,10 @@ def cached_flight(seed: int, number: int) -> Flight:
     return make_flight(100_000 * seed + number)
 
 
-@lru_cache(1)
-def measured_logs() -> dict[str, FlightLog]:
-    """Return the measured flights by name; empty if there are none."""
-    return {name: one.log for name, one in measured_flights(DATA)}
-
-
 def measure(trial: Trial) -> Line:
     """Check a log or a plant and compare what is found with the truth."""
     if trial.part == "measured":
-        log = measured_logs()[trial.name]
+        log = measured_flights()[trial.name].log
         return {"truth": [], "shown": True, **compare(check_log(log), ())}
     if trial.part == "simulators":
         simulator = next(one for one in SIMULATORS if one.name == trial.name)
@@ -102,7 +97,7 @@ def measure(trial: Trial) -> Line:
         return {"truth": sorted(simulator.expected), **result}
     flight = cached_flight(trial.seed, trial.number)
     rng = np.random.default_rng([trial.seed, trial.number, crc32(trial.name.encode())])
-    dt, name, truth = float(np.median(np.diff(flight.log.time))), trial.name, Truth()
+    dt, name, truth = median_step(flight.log), trial.name, Truth()
     if trial.part in ("faults", "fixes"):
         truth = FAULTS[name](rng, dt)
     elif trial.part == "pairs":
@@ -202,13 +197,11 @@ def plan_trials(parts: Iterable[Part], logs: int, seed: int, model: bool) -> lis
     if "simulators" in parts:
         trials += [Trial("simulators", simulator.name, 0, seed, False) for simulator in SIMULATORS]
     if "measured" in parts:
-        trials += [Trial("measured", name, 0, seed, False) for name in measured_logs()]
+        trials += [Trial("measured", name, 0, seed, False) for name in measured_flights()]
     return trials
 
 
-def count_outcomes(
-    name: str, lines: list[Line], kinds: Sequence[str] = OUTCOMES, wrong: str = "false"
-) -> list[Any]:
+def count_outcomes(name: str, lines: list[Line], kinds: Sequence[str], wrong: str) -> list[Any]:
     """Return a row of the page: how often each outcome was, of the faults that motion shows.
 
     Args:
@@ -223,14 +216,23 @@ def count_outcomes(
     return [name, count.total(), *counts, f"{hidden.count(wrong)} of {len(hidden)}"]
 
 
-def split_rows(rows: list[list[Any]]) -> tuple[list[list[Any]], list[str]]:
-    """Return the rows in which a log was not right or no log shows the fault, and the other names.
+def outcome_columns(first: str, kinds: Sequence[str], wrong: str) -> list[str]:
+    """Return the names of the columns of ``count_outcomes``."""
+    return [first, "shown", *kinds, f"{wrong} where not shown"]
 
-    A row: name, how many logs show the fault, how many of these are right, and the wrong ones.
+
+def faults_table(
+    lines: list[Line], names: Iterable[str], kinds: Sequence[str], wrong: str
+) -> tuple[str, int]:
+    """Return a table of faults, and the number of those that it leaves out.
+
+    It leaves out faults that logs show and that are right on each of these logs.
     """
-    is_perfect = [0 < row[1] == row[2] for row in rows]
-    imperfect = [row for row, perfect in zip(rows, is_perfect, strict=True) if not perfect]
-    return imperfect, [row[0] for row, perfect in zip(rows, is_perfect, strict=True) if perfect]
+    rows = [count_outcomes(name, select(lines, name=name), kinds, wrong) for name in names]
+    imperfect = [row for row in rows if row[1] == 0 or row[1] != row[2]]
+    of_all = count_outcomes("all", lines, kinds, wrong)
+    columns = outcome_columns("fault", kinds, wrong)
+    return table(columns, [*imperfect, of_all]), len(rows) - len(imperfect)
 
 
 def describe(changes: Iterable[Iterable[Any]]) -> str:
@@ -241,46 +243,38 @@ def describe(changes: Iterable[Iterable[Any]]) -> str:
 def write_page() -> None:
     """Write docs/results/check.md from the lines of the last commit."""
     lines = lines_of_commit(LINES)
-    done = [line for line in lines if "error" not in line]
-    by_part = {part: [line for line in done if line["part"] == part] for part in PARTS}
+    done = good_lines(lines)
+    by_part = {part: select(done, part=part) for part in PARTS}
     clean = []
     for kind in [*sorted({line["kind"] for line in by_part["clean"]}), "all"]:
-        flown = [line for line in by_part["clean"] if kind in (line["kind"], "all")]
+        flown = by_part["clean"] if kind == "all" else select(by_part["clean"], kind=kind)
         wrong = [line for line in flown if line["contradicted"] or line["alternatives"]]
-        pairs = Counter(
+        changes = Counter(
             f"{channel} {kind}"
             for line in wrong
             for channel, kind, _ in (line["alternatives"] or [[]])[0]
         )
-        named = ", ".join(f"{name} ({count})" for name, count in pairs.most_common())
+        named = ", ".join(f"{name} ({count})" for name, count in changes.most_common())
         bound = ""
         if flown:  # one-sided, by Clopper and Pearson
             interval = binomtest(len(wrong), len(flown), alternative="less").proportion_ci(0.95)
             bound = f"{100.0 * interval.high:.1f} %"
         clean.append([kind, len(flown), len(wrong), bound, named])
-    faults = [
-        count_outcomes(name, [line for line in by_part["faults"] if name in (line["name"], "all")])
-        for name in [*FAULTS, "all"]
-    ]
-    imperfect, exact = split_rows(faults[:-1])
-    two = [
-        count_outcomes(name, [line for line in by_part["pairs"] if is_on_one(line) in kinds])
+    faults, num_exact = faults_table(by_part["faults"], FAULTS, OUTCOMES, "false")
+    fixes, num_equal = faults_table(by_part["fixes"], FIXABLE, FIXED, "wrong")
+    pairs = [
+        count_outcomes(
+            name,
+            [line for line in by_part["pairs"] if is_on_one(line) in kinds],
+            OUTCOMES,
+            "false",
+        )
         for name, kinds in (
             ("on one channel", {True}),
             ("on two channels", {False}),
             ("all", {True, False}),
         )
     ]
-    fixes = [
-        count_outcomes(
-            name,
-            [line for line in by_part["fixes"] if name in (line["name"], "all")],
-            FIXED,
-            "wrong",
-        )
-        for name in [*FIXABLE, "all"]
-    ]
-    unequal, equal = split_rows(fixes[:-1])
     folders = Counter(dataset_name(line) for line in by_part["measured"])
     contradicted = Counter(
         dataset_name(line) for line in by_part["measured"] if line["outcome"] != "exact"
@@ -293,7 +287,6 @@ def write_page() -> None:
         ]
         for line in by_part["simulators"]
     ]
-    columns = "shown | exact | partial | unexplained | false | missed | false where not shown"
     fill_page(
         RESULTS / "check.md",
         "check",
@@ -302,18 +295,15 @@ def write_page() -> None:
             [[folder, count, contradicted[folder]] for folder, count in folders.items()],
         ),
         clean=table("flight | logs | contradicted | 95 % upper bound | what", clean),
-        faults=table(f"fault | {columns}", [*imperfect, faults[-1]]),
-        fixes=table(
-            "fault | shown | equal | ambiguous | left | wrong | missed | wrong where not shown",
-            [*unequal, fixes[-1]],
-        ),
-        num_exact=len(exact),
-        num_equal=len(equal),
-        pairs=table(f"two faults | {columns}", two),
+        faults=faults,
+        fixes=fixes,
+        num_exact=num_exact,
+        num_equal=num_equal,
+        pairs=table(outcome_columns("two faults", OUTCOMES, "false"), pairs),
         simulators=table("simulator | expected | outcome", simulators),
         errors=len(lines) - len(done),
         commit=lines[-1]["commit"],
-        seconds=", ".join(f"{one:.1f}" for one in cpu_seconds()),
+        seconds=", ".join(f"{seconds:.1f}" for seconds in cpu_seconds()),
         seeds=", ".join(sorted({str(line["seed"]) for line in lines})),
         model="with" if any(line["model"] for line in lines) else "without",
     )

@@ -11,7 +11,6 @@ resumes there; ``--page`` writes docs/results/repeatability.md from them.
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import cache
 from itertools import combinations
 from time import process_time
 from typing import Any, NamedTuple
@@ -24,7 +23,6 @@ from scipy.spatial.transform import Rotation
 from benchmarks import hidden
 from benchmarks.diagnosis import AMPLITUDES, SECONDS, model_of
 from benchmarks.hidden.oracle import known
-from benchmarks.real.crazyflie import DATA
 from benchmarks.report import (
     IN_THIS_PROCESS,
     RESULTS,
@@ -32,8 +30,10 @@ from benchmarks.report import (
     Line,
     command,
     fill_page,
+    good_lines,
     lines_of_commit,
     record_trials,
+    select,
     table,
 )
 from benchmarks.seams.measured import measured_flights
@@ -41,6 +41,7 @@ from flytrack_env.dynamics import ModelParameters
 from flytrack_env.motion import Motion
 from flytrack_sysid import Diagnosis, FlightLog, Imported, diagnose, diagnose_change
 from flytrack_sysid.inference.parameters import STICKS
+from flytrack_sysid.log import median_step
 from flytrack_sysid.split import held_out_rows
 
 LINES, CHANGE_LINES = RESULTS / "repeatability.jsonl", RESULTS / "changes.jsonl"
@@ -101,17 +102,11 @@ class Flight(NamedTuple):
     effect: str
 
 
-@cache
-def imported() -> dict[str, Imported]:
-    """Return the measured flights, by name."""
-    return dict(measured_flights(DATA)) if DATA.is_dir() else {}
-
-
 def flights() -> dict[str, Imported]:
     """Return the measured flights that are long enough, by name."""
     return {
         name: flight
-        for name, flight in imported().items()
+        for name, flight in measured_flights().items()
         if flight.log.time[-1] - flight.log.time[0] > SHORTEST_S
     }
 
@@ -157,7 +152,7 @@ def trials(plants: int) -> list[Trial]:
 
 def measure_change(trial: ChangeTrial) -> Line:
     """Compare two flights: what changed, and by how much the thrust did without the simulator."""
-    before, after = (imported()[name] for name in trial)
+    before, after = (measured_flights()[name] for name in trial)
     diagnosis = diagnose_change(after.log, before.log, before.nominal_model())
     return {
         "verdict": diagnosis.verdict,
@@ -205,34 +200,35 @@ def measure(trial: Trial) -> Line:
     }
 
 
-def is_same_class(one: Line, other: Line) -> bool:
+def named_classes(line: Line) -> set[str]:
+    """Return the causes of a line with their equivalents."""
+    return {*line["causes"]}.union(*line["causes"].values())
+
+
+def is_same_class(first: Line, second: Line) -> bool:
     """Return whether each cause of either is a cause, or of the class of one, of the other."""
-
-    def covers(some: Line, names: Iterable[str]) -> bool:
-        known = {name for cause, alike in some["causes"].items() for name in (cause, *alike)}
-        return set(names) <= known
-
-    return covers(one, other["causes"]) and covers(other, one["causes"])
+    is_first_covered = first["causes"].keys() <= named_classes(second)
+    return is_first_covered and second["causes"].keys() <= named_classes(first)
 
 
-def agree(one: Line, other: Line) -> bool:
+def agree(first: Line, second: Line) -> bool:
     """Return whether neither names what the other neither names nor leaves open."""
 
-    def leaves_open(some: Line) -> set[str]:
-        alike = (name for equivalents in some["causes"].values() for name in equivalents)
-        return {*some["causes"], *alike, *some["unsettled"]}
+    def leaves_open(line: Line) -> set[str]:
+        return named_classes(line).union(line["unsettled"])
 
-    return set(one["causes"]) <= leaves_open(other) and set(other["causes"]) <= leaves_open(one)
+    is_first_open = first["causes"].keys() <= leaves_open(second)
+    return is_first_open and second["causes"].keys() <= leaves_open(first)
 
 
-def overlaps(one: list[float], other: list[float]) -> bool:
+def overlaps(first: list[float], second: list[float]) -> bool:
     """Return whether two intervals overlap; each is a value, its lowest and its highest."""
-    return one[1] <= other[2] and other[1] <= one[2]
+    return first[1] <= second[2] and second[1] <= first[2]
 
 
 def pairs_of(lines: Sequence[Line]) -> list[tuple[Line, Line]]:
     """Return pairs of flights of one craft."""
-    return [(one, other) for one, other in combinations(lines, 2) if one["craft"] == other["craft"]]
+    return [pair for pair in combinations(lines, 2) if pair[0]["craft"] == pair[1]["craft"]]
 
 
 def compare_values(pairs: Iterable[tuple[Line, Line]]) -> list[tuple[str, bool]]:
@@ -249,16 +245,15 @@ def compare_values(pairs: Iterable[tuple[Line, Line]]) -> list[tuple[str, bool]]
 def compare(lines: Sequence[Line]) -> list[Any]:
     """Return a row of the page: how alike the flights of a craft are."""
     pairs = pairs_of(lines)
-    values = [is_alike for _, is_alike in compare_values(pairs)]
-    same = [set(one["causes"]) == set(other["causes"]) for one, other in pairs]
-    same_class = [is_same_class(one, other) for one, other in pairs]
-    no_contradiction = [agree(one, other) for one, other in pairs]
+    flags = [
+        [first["causes"].keys() == second["causes"].keys() for first, second in pairs],
+        [is_same_class(*pair) for pair in pairs],
+        [agree(*pair) for pair in pairs],
+        [is_alike for _, is_alike in compare_values(pairs)],
+    ]
     return [
         len(lines),
-        f"{sum(same)} of {len(pairs)}",
-        f"{sum(same_class)} of {len(pairs)}",
-        f"{sum(no_contradiction)} of {len(pairs)}",
-        f"{sum(values)} of {len(values)}",
+        *(f"{sum(are_alike)} of {len(are_alike)}" for are_alike in flags),
         *(half_responses(lines, stick) for stick in STICKS),
     ]
 
@@ -269,19 +264,18 @@ def half_responses(lines: Sequence[Line], stick: str) -> str:
     intervals = [line["half_responses_s"][stick] for line in known]
     if not intervals:
         return "none"
-    half_ms = 1e3 * float(np.median([0.5 * (one[2] - one[1]) for one in intervals]))
-    pairs = pairs_of(known)
-    alike = sum(
-        overlaps(one["half_responses_s"][stick], other["half_responses_s"][stick])
-        for one, other in pairs
-    )
-    return f"± {half_ms:.1f}; {alike} of {len(pairs)}"
+    half_ms = 1e3 * float(np.median([0.5 * (high - low) for _, low, high in intervals]))
+    are_alike = [
+        overlaps(*(line["half_responses_s"][stick] for line in pair)) for pair in pairs_of(known)
+    ]
+    return f"± {half_ms:.1f}; {sum(are_alike)} of {len(are_alike)}"
 
 
 def felt_along_z(log: FlightLog) -> np.ndarray:
     """Return the specific force along the body's z axis by differences of the velocity, m/s^2."""
-    step_s = float(np.median(np.diff(log.time)))
-    acceleration = savgol_filter(log["v"], SMOOTHED_ROWS, 2, deriv=1, delta=step_s, axis=0)
+    acceleration = savgol_filter(
+        log["v"], SMOOTHED_ROWS, 2, deriv=1, delta=median_step(log), axis=0
+    )
     felt = acceleration + np.array([0.0, 0.0, GRAVITY])
     up = Rotation.from_quat(log["q"], scalar_first=True).apply([0.0, 0.0, 1.0])
     return np.sum(felt * up, axis=1)
@@ -298,9 +292,9 @@ def hover_without_model(log: FlightLog) -> float:
     The acceleration along the body's z axis, by differences of the velocity, is fitted by a
     parabola of the stick after a lag and a delay, the best of a grid.
     """
-    step_s, thrust, fits = float(np.median(np.diff(log.time))), felt_along_z(log), []
+    thrust, fits = felt_along_z(log), []
     for lag_s in LAGS_S:
-        decay = np.exp(-step_s / lag_s)
+        decay = np.exp(-median_step(log) / lag_s)
         stick = lfilter([0.0, 1.0 - decay], [1.0, -decay], log["u"][:, 3])
         for delay in DELAYS:
             fitted = np.polynomial.Polynomial.fit(stick[: len(stick) - delay], thrust[delay:], 2)
@@ -336,8 +330,7 @@ def list_changes(lines: Sequence[Line]) -> str:
 
 def is_in_class(line: Line) -> bool:
     """Return whether the effect that a log shows is a cause, an equivalent or negligible."""
-    alike = (name for equivalents in line["causes"].values() for name in equivalents)
-    return line["effect"] in {*line["causes"], *alike, *line["negligible"]}
+    return line["effect"] in named_classes(line).union(line["negligible"])
 
 
 def is_coefficient(name: str) -> bool:
@@ -347,9 +340,9 @@ def is_coefficient(name: str) -> bool:
 
 def write_page() -> None:
     """Write docs/results/repeatability.md from the lines of the last commit."""
-    lines = [line for line in lines_of_commit(LINES) if "error" not in line]
+    lines = good_lines(lines_of_commit(LINES))
     changes = lines_of_commit(CHANGE_LINES)
-    by_craft = {craft: [line for line in lines if line["craft"] == craft] for craft in CRAFT}
+    by_craft = {craft: select(lines, craft=craft) for craft in CRAFT}
     apart = Counter(
         name
         for craft in CRAFT
@@ -404,7 +397,7 @@ def main(
     if page:
         write_page()
     elif changes:
-        pairs = [ChangeTrial(*pair) for pair in CHANGES if imported().keys() >= {*pair}]
+        pairs = [ChangeTrial(*pair) for pair in CHANGES if measured_flights().keys() >= {*pair}]
         record_trials(CHANGE_LINES, pairs, measure_change, jobs=jobs)
     else:
         record_trials(LINES, trials(plants), measure, jobs=jobs)

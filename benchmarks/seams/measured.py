@@ -2,9 +2,10 @@
 
 import re
 import tempfile
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
+from benchmarks.real.crazyflie import DATA
 from flytrack_sysid import Imported, import_log
 
 # Folder, files, format, and a mapping: of a name, of the folder, or none.
@@ -21,22 +22,24 @@ ARPL = {"log15": (14.0, 52.0), "log16": (16.0, 31.0)}  # s in the air
 NEWER_LEE = 180  # from this log on the thrust has another name
 
 
-def measured_flights(data: Path) -> Iterator[tuple[str, Imported]]:
-    """Yield the name and the import of each flight below a folder."""
-    for folder, files, form, mapping in SETS:
-        for path in sorted((data / folder).glob(files)):
-            own = data / folder / (mapping or "")
-            where = own if own.is_file() else mapping
-            yield f"{folder}/{path.name}", import_log(path, form, where)
+@cache
+def measured_flights() -> dict[str, Imported]:
+    """Return the measured flights by folder and file; none if there are no data."""
+    flights: dict[str, Imported] = {}
+    for folder, files, log_format, mapping in SETS:
+        for path in sorted((DATA / folder).glob(files)):
+            mapping_of_folder = DATA / folder / (mapping or "")
+            source = mapping_of_folder if mapping_of_folder.is_file() else mapping
+            flights[f"{folder}/{path.name}"] = import_log(path, log_format, source)
     with tempfile.TemporaryDirectory() as temporary:
         changed = Path(temporary) / "map.toml"
         for name, (start, end) in ARPL.items():
             rows = f"[rows]\nfrom_s = {start}\nto_s = {end}\n"
             changed.write_text(f'extends = "crazyflie_motors"\n{rows}')
-            path = data / "cf_arpl_motors" / name
+            path = DATA / "cf_arpl_motors" / name
             if path.exists():
-                yield f"cf_arpl_motors/{name}", import_log(path, "usd", changed)
-        for path in sorted(data.glob("cf_lee_*/log*")):
+                flights[f"cf_arpl_motors/{name}"] = import_log(path, "usd", changed)
+        for path in sorted(DATA.glob("cf_lee_*/log*")):
             number = int(path.name.removeprefix("log"))
             stated = path.with_name(f"info{number}.yaml").read_text()
             mass = float(re.findall(r"^mass:\s*(\S+)", stated, re.MULTILINE)[0])
@@ -45,4 +48,5 @@ def measured_flights(data: Path) -> Iterator[tuple[str, Imported]]:
                 f'extends = "crazyflie_lee"\n[thrust_command]\ncolumn = "ctrlLee.{thrust}"\n'
                 f"[craft]\nmass_kg = {mass}\n"
             )
-            yield f"{path.parent.name}/{path.name}", import_log(path, "usd", changed)
+            flights[f"{path.parent.name}/{path.name}"] = import_log(path, "usd", changed)
+    return flights
