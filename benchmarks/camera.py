@@ -181,9 +181,9 @@ def frames_contestant(name: str) -> Contestant:
 def speed_figures(repeats: int) -> list[report.Figure]:
     """Return the costs of steps with corners, and how many masks are drawn and flown a second."""
     drawn, flown = "masks drawn", "masks, vmap(step)"
-    entries = [jax_contestant(PLAIN, "FlyTrack-v0", 1024, 200, is_batch=False)]
-    entries += [jax_contestant(env_id, env_id, 1024, 200, is_batch=False) for env_id in COSTS]
-    entries += [frames_contestant(drawn), jax_contestant(flown, MASK, 1024, 20, is_batch=False)]
+    entries = [jax_contestant(PLAIN, "FlyTrack-v0")]
+    entries += [jax_contestant(env_id, env_id) for env_id in COSTS]
+    entries += [frames_contestant(drawn), jax_contestant(flown, MASK, length=20)]
     rates = measure(entries, repeats)
     figures = []
     for env_id in COSTS:
@@ -192,7 +192,7 @@ def speed_figures(repeats: int) -> list[report.Figure]:
             report.Figure(
                 f"cost of {env_id} vmap(step), 1,024, over the plain step",
                 "at most 1.6" if env_id == CORNERS else "",
-                f"{statistics.median(costs):.2f} ({report.spread(costs, '.2f')})",
+                report.median_and_spread(costs, ".2f"),
                 repeats,
             )
         )

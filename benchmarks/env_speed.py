@@ -47,9 +47,9 @@ class Contestant(NamedTuple):
 def jax_contestant(
     name: str,
     env_id: str,
-    num_envs: int,
-    length: int,
-    is_batch: bool,
+    num_envs: int = 1024,
+    length: int = 200,
+    is_batch: bool = False,
     model: Any = None,
     unroll: int = 1,
 ) -> Contestant:
@@ -165,16 +165,13 @@ def gymnasium_contestant(
 def contestants() -> list[Contestant]:
     """Return all contestants, l2f only where it is installed."""
     entries = [
-        jax_contestant(PENDULUM, "Pendulum-v1", 1024, 200, is_batch=False),
-        jax_contestant(PLAIN, "FlyTrack-v0", 1024, 200, is_batch=False),
-        jax_contestant(BATCH, "FlyTrack-v0", 4096, 200, is_batch=True),
-        jax_contestant(SMALL_BATCH, "FlyTrack-v0", 1024, 200, is_batch=True),
+        jax_contestant(PENDULUM, "Pendulum-v1"),
+        jax_contestant(PLAIN, "FlyTrack-v0"),
+        jax_contestant(BATCH, "FlyTrack-v0", 4096, is_batch=True),
+        jax_contestant(SMALL_BATCH, "FlyTrack-v0", is_batch=True),
         jax_contestant("FlyTrack step_batch, 65,536", "FlyTrack-v0", 65536, 10, is_batch=True),
-        jax_contestant(DUEL, "FlyTrackDuel-v0", 1024, 200, is_batch=True),
-        *(
-            jax_contestant(name, env_id, 1024, 200, is_batch=False)
-            for name, env_id in VARIANTS.items()
-        ),
+        jax_contestant(DUEL, "FlyTrackDuel-v0", is_batch=True),
+        *(jax_contestant(name, env_id) for name, env_id in VARIANTS.items()),
         gymnasium_contestant(1024, 200),
         gymnasium_contestant(1024, 200, "NextStep"),
         gymnasium_contestant(1, 2000),
@@ -215,9 +212,9 @@ def effect_costs(repeats: int) -> str:
 
     Both are timed in turns. Those that cost little share a sentence.
     """
-    plain, rows = jax_contestant(PLAIN, "FlyTrack-v0", 1024, 200, is_batch=False), []
+    plain, rows = jax_contestant(PLAIN, "FlyTrack-v0"), []
     for name, model in report.progress(with_effects().items(), "model"):
-        entry = jax_contestant(name, "FlyTrack-v0", 1024, 200, is_batch=False, model=model)
+        entry = jax_contestant(name, "FlyTrack-v0", model=model)
         costs = ratios(measure([plain, entry], repeats, warm_up=1), PLAIN, name)
         figure = cost_figure(name, statistics.median(costs), repeats)
         rows.append([*figure, report.spread(costs, ".2f")])

@@ -116,8 +116,12 @@ def scan_contestant(
     def fly(state: Any, actions: jax.Array) -> Any:
         return jax.lax.scan(lambda state, action: (step(state, action), None), state, actions)[0]
 
-    amount = LENGTH * actions.shape[1] / 1e6
-    return Contestant(name, amount, lambda: jax.block_until_ready(fly(state, actions)))
+    return waiting_contestant(name, LENGTH * actions.shape[1] / 1e6, partial(fly, state, actions))
+
+
+def waiting_contestant(name: str, amount: float, run: Callable[[], Any]) -> Contestant:
+    """Return a contestant that waits for what a function returns."""
+    return Contestant(name, amount, lambda: jax.block_until_ready(run()))
 
 
 def crazyflow_contestant(num_envs: int) -> Contestant:
@@ -188,7 +192,7 @@ def contestant(name: str, power: int, unroll: int = 1) -> Contestant:
         return mjx_contestant(2**power)
     if name == CRAZYFLOW:
         return crazyflow_contestant(2**power)
-    return jax_contestant(name, name, 2**power, LENGTH, is_batch=False, unroll=unroll)
+    return jax_contestant(name, name, 2**power, LENGTH, unroll=unroll)
 
 
 def environments(powers: dict[str, tuple[int, ...]]) -> str:
@@ -238,11 +242,6 @@ def single_steps() -> str:
     )
 
 
-def run_and_wait(run: Callable[[], Any]) -> None:
-    """Call a function and wait for what it returns."""
-    jax.block_until_ready(run())
-
-
 def trainings(recipes: dict[str, Config]) -> str:
     """Return a table of training steps a second by recipe and number of seeds side by side."""
     rows = []
@@ -251,8 +250,9 @@ def trainings(recipes: dict[str, Config]) -> str:
         trainer = Trainer(config)
         runners = [trainer.start(jax.random.key(seed)) for seed in range(number)]
         together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *runners)
-        update = partial(jax.jit(jax.vmap(trainer.update)), together)
-        entry = Contestant("", number * config.batch_size, partial(run_and_wait, update))
+        update = jax.jit(jax.vmap(trainer.update))
+        amount = number * config.batch_size
+        entry = waiting_contestant("", amount, partial(update, together))
         sizes = f"{config.num_envs} x {config.num_steps}, {config.num_minibatches} minibatches"
         rows.append([recipe, sizes, number, f"{rate_of(entry):.3g}"])
     header = "recipe (`--device`) | an update | seeds side by side | steps/s, all together"

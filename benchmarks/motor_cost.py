@@ -1,13 +1,7 @@
 """What a step from motors costs over one from sticks: ``python -m benchmarks.motor_cost``."""
 
-import statistics
-
-import tyro
-
 from benchmarks import report
 from benchmarks.env_speed import PLAIN, jax_contestant, measure, ratios
-
-BATCH, STEPS = 1024, 200
 
 
 def main(repeats: int = 7) -> None:
@@ -17,16 +11,16 @@ def main(repeats: int = 7) -> None:
 
     continuous = nominal_parameters()._replace(motion=Motion.CONTINUOUS)
     entries = [
-        jax_contestant(PLAIN, "FlyTrack-v0", BATCH, STEPS, is_batch=False),
-        jax_contestant("continuous", "FlyTrack-v0", BATCH, STEPS, is_batch=False, model=continuous),
-        jax_contestant("motors", "FlyTrackMotors-v0", BATCH, STEPS, is_batch=False),
+        jax_contestant(PLAIN, "FlyTrack-v0"),
+        jax_contestant("continuous", "FlyTrack-v0", model=continuous),
+        jax_contestant("motors", "FlyTrackMotors-v0"),
     ]
     rates = measure(entries, repeats, warm_up=1)
     for name in (PLAIN, "continuous"):
         costs = ratios(rates, name, "motors")
-        print(f"motors over {name}: {statistics.median(costs):.2f} ({report.spread(costs, '.2f')})")
+        print(f"motors over {name}: {report.median_and_spread(costs, '.2f')}")
     print(f"{repeats} rounds, {core}. {report.provenance_line(report.provenance())}")
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    report.command(main)

@@ -2,16 +2,16 @@
 
 ``python -m benchmarks.motors --count 20`` flies crafts of ``benchmarks.motor_craft`` with one thing
 wrong each, or nothing, diagnoses each from its nominal model, and appends a line per craft to
-docs/results/motors.jsonl; lines that are there are not computed again. It ends with a table of all.
+docs/results/motors.jsonl; a later run of the same commit resumes there. It ends with a table of the
+last commit's lines.
 """
 
 import time
 from collections.abc import Callable
-from pathlib import Path
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import tyro
 from scipy.spatial.transform import Rotation
 
 from benchmarks import report
@@ -22,6 +22,7 @@ from flytrack_env.effects import Motors
 from flytrack_sysid import diagnose
 from flytrack_sysid.log import FlightLog
 
+LINES = report.RESULTS / "motors.jsonl"
 DURATION_S, DT = 60.0, 0.01
 VOLTS = (23.0, 25.0)  # stated; thrust does not depend on it here
 # Standard deviations of the sensors: attitude rad, position m, velocity m/s, gyro rad/s,
@@ -144,76 +145,68 @@ FAULTS: dict[str, tuple[Callable[[Crafts], Crafts], set[str]]] = {
 }
 
 
-class Case(NamedTuple):
-    """A craft of a seed: what is wrong, its model before that, and its log."""
+class Trial(NamedTuple):
+    """What is wrong with a craft of a seed."""
 
     fault: str
-    model: ModelParameters
-    log: FlightLog
+    seed: int
 
 
-def cases(seed: int) -> list[Case]:
-    """Return a craft of each fault; all of them fly at once."""
+@lru_cache(1)
+def fly_crafts(seed: int) -> dict[str, tuple[FlightLog, ModelParameters]]:
+    """Return by fault the log of a craft, and its model before that; all crafts fly at once."""
     rng = np.random.default_rng(seed)
     drawn = [draw(rng) for _ in FAULTS]
     changed = [change(craft) for craft, (change, _) in zip(drawn, FAULTS.values(), strict=True)]
     together = Crafts(*map(np.concatenate, zip(*changed, strict=True)))
     flight = fly(together, Pilot(rng, len(changed), DURATION_S, REACH), DURATION_S)
-    return [
-        Case(fault, nominal_model(craft), log_of_flight(flight, index, rng, 1.0))
-        for index, (fault, craft) in enumerate(zip(FAULTS, drawn, strict=True))
-    ]
-
-
-def examined(case: Case) -> dict[str, Any]:
-    """Return what a diagnosis says of a craft."""
-    began = time.process_time()
-    found = diagnose(case.log, case.model)
-    named: set[str] = set()
-    for cause in found.causes:
-        named |= set(cause.parameters) if cause.effect == "motors" else {cause.effect}
-    expected = FAULTS[case.fault][1]
     return {
-        "fault": case.fault,
+        fault: (log_of_flight(flight, index, rng, 1.0), nominal_model(craft))
+        for index, (fault, craft) in enumerate(zip(FAULTS, drawn, strict=True))
+    }
+
+
+def measure(trial: Trial) -> report.Line:
+    """Return what a diagnosis names of a craft."""
+    flight = fly_crafts(trial.seed)[trial.fault]
+    began_s = time.process_time()
+    diagnosis = diagnose(*flight)
+    named: set[str] = set()
+    for cause in diagnosis.causes:
+        named |= set(cause.parameters) if cause.effect == "motors" else {cause.effect}
+    expected = FAULTS[trial.fault][1]
+    return {
         "named": sorted(named),
         "parameters": {
             cause.effect: {
                 name: [value.value, *value.ci95] for name, value in cause.parameters.items()
             }
-            for cause in found.causes
+            for cause in diagnosis.causes
         },
         "is_exact": bool(named) and named <= expected if expected else not named,
-        "flagged": found.unexplained.flagged,
-        "cpu_s": time.process_time() - began,
+        "flagged": diagnosis.unexplained.flagged,
+        "cpu_s": time.process_time() - began_s,
     }
 
 
-def table_of(lines: list[dict[str, Any]]) -> str:
-    """Return how many crafts of each fault were named exactly."""
+def summarize(lines: list[report.Line]) -> str:
+    """Return a table of how many crafts of each fault were named exactly."""
     rows = []
     for fault in FAULTS:
-        found = [line for line in lines if line["fault"] == fault]
-        exact = sum(line["is_exact"] for line in found)
-        others = sorted({", ".join(line["named"]) for line in found if not line["is_exact"]})
-        rows.append([fault, f"{exact} of {len(found)}", "; ".join(others)])
+        of_fault = report.select(lines, fault=fault)
+        others = [line for line in of_fault if not line["is_exact"]]
+        names = sorted({", ".join(line["named"]) for line in others})
+        exact = f"{len(of_fault) - len(others)} of {len(of_fault)}"
+        rows.append([fault, exact, "; ".join(names)])
     return report.table("fault | exact | named otherwise", rows)
 
 
-def main(count: int = 20, out: Path = Path("docs/results/motors.jsonl")) -> None:
-    """Diagnose ``count`` crafts of each fault; those that the file has are left out."""
-    commit = report.commit_of_checkout()
-    known = {(line["fault"], line["seed"]) for line in report.lines_in(out)}
-    for seed in range(count):
-        if all((fault, seed) in known for fault in FAULTS):
-            continue
-        for case in cases(seed):
-            if (case.fault, seed) in known:
-                continue
-            result = {"seed": seed, "commit": commit, **examined(case)}
-            report.append_line(out, result)
-            print(seed, case.fault, result["named"], f"{result['cpu_s']:.0f} CPU s", flush=True)
-    print(table_of(report.lines_in(out)))
+def main(count: int = 20) -> None:
+    """Diagnose ``count`` crafts of each fault; those that this commit has are left out."""
+    trials = [Trial(fault, seed) for seed in range(count) for fault in FAULTS]
+    report.record_trials(LINES, trials, measure)
+    print(summarize(report.good_lines(report.lines_of_commit(LINES))))
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    report.command(main)

@@ -313,7 +313,7 @@ def summarize_result(result: Line) -> str:
         result: what was measured of a trial; an error, or anything without a truth, as well.
     """
     parts = []
-    for key in ("truth", "verdict", "causes", "law", "error"):
+    for key in ("truth", "verdict", "causes", "named", "law", "error"):
         value = result.get(key)
         if isinstance(value, list):
             names = (item["effect"] if isinstance(item, dict) else str(item) for item in value)
