@@ -9,7 +9,7 @@ docs/results/ablation.md from them.
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache, wraps
 from itertools import product
@@ -106,13 +106,11 @@ def replaced(rule: Rule, function: Callable[..., Any]) -> Iterator[None]:
     """Have the package call another function in place of a rule's, wherever it is imported."""
     original = getattr(rule.module, rule.name)
     loaded = [module for name, module in sys.modules.items() if name.startswith(PACKAGE)]
-    places = [
-        place for place in (rule.module, *loaded) if getattr(place, rule.name, None) is original
-    ]
-    listed = tuple(function if one is original else one for one in vetoes.VETOES)
+    listed = tuple(function if veto is original else veto for veto in vetoes.VETOES)
     with ExitStack() as stack:
-        for place in places:
-            stack.enter_context(patch.object(place, rule.name, function))
+        for module in loaded:
+            if getattr(module, rule.name, None) is original:
+                stack.enter_context(patch.object(module, rule.name, function))
         stack.enter_context(patch.object(vetoes, "VETOES", listed))
         yield
 
@@ -121,9 +119,9 @@ def outcome(diagnosis: Diagnosis) -> Line:
     """Return what is compared: verdict, causes with their equivalents, and what is unexplained."""
     return {
         "verdict": diagnosis.verdict,
-        "causes": {one.effect: sorted(one.equivalent) for one in diagnosis.causes},
-        "negligible": sorted(one.effect for one in diagnosis.negligible),
-        "beyond": sorted(one.effect for one in diagnosis.beyond),
+        "causes": {cause.effect: sorted(cause.equivalent) for cause in diagnosis.causes},
+        "negligible": sorted(cause.effect for cause in diagnosis.negligible),
+        "beyond": sorted(cause.effect for cause in diagnosis.beyond),
         "unexplained": sorted(diagnosis.unexplained.shares),
     }
 
@@ -190,13 +188,9 @@ def score(line: Line, truth: list[str]) -> int:
     A cause with a true effect among its equivalents is true.
     """
     causes = line["outcome"]["causes"]
-    false = [name for name, equivalent in causes.items() if {name, *equivalent}.isdisjoint(truth)]
-    found = [
-        name
-        for name in truth
-        if any(name in (cause, *equivalent) for cause, equivalent in causes.items())
-    ]
-    return len(found) - len(false)
+    classes = [{name, *equivalent} for name, equivalent in causes.items()]
+    num_false = sum(names.isdisjoint(truth) for names in classes)
+    return len(set().union(*classes).intersection(truth)) - num_false
 
 
 def trial_key(line: Line) -> tuple[Any, ...]:
@@ -204,7 +198,7 @@ def trial_key(line: Line) -> tuple[Any, ...]:
     return tuple(line[field] for field in Trial._fields)
 
 
-def measure(trials: list[Trial], rules: Iterable[str]) -> None:
+def measure(trials: list[Trial]) -> None:
     """Append the missing lines: first with all rules, then without one rule at a time."""
     lines, commit = lines_in(LINES), {"commit": commit_of_checkout()}
     counted = {trial_key(line): line for line in select(lines, without="")}
@@ -214,7 +208,7 @@ def measure(trials: list[Trial], rules: Iterable[str]) -> None:
     done = {(trial_key(line), line["without"]) for line in lines}
     missing = [
         (trial, name)
-        for trial, name in product(trials, rules)
+        for trial, name in product(trials, BY_NAME)
         if name in counted[tuple(trial)]["fired"] and (tuple(trial), name) not in done
     ]
     for trial, name in progress(missing, "plants without a rule"):
@@ -272,8 +266,6 @@ def count_by_rule(lines: list[Line]) -> list[list[Any]]:
 def main(
     plants: int = 10,
     rows: str = ",".join(ROWS),
-    motion: str = ",".join(hidden.MOTIONS),
-    rules: str = ",".join(BY_NAME),
     page: bool = False,
 ) -> None:
     """Diagnose plants with all rules, and without one rule at a time.
@@ -281,18 +273,16 @@ def main(
     Args:
         plants: of each row and motion, up to this number.
         rows: kinds of plants, or "measured" for measured flights.
-        motion: how they move.
-        rules: disabled one at a time.
         page: write the page from the lines instead.
     """
     if page:
         write_page()
         return
     if rows == MEASURED:
-        measure([Trial(MEASURED, 0, SEED, name) for name in measured()], rules.split(","))
+        measure([Trial(MEASURED, 0, SEED, name) for name in measured()])
         return
-    every = product(range(plants), rows.split(","), motion.split(","))
-    measure([Trial(row, number, SEED, moved) for number, row, moved in every], rules.split(","))
+    every = product(range(plants), rows.split(","), hidden.MOTIONS)
+    measure([Trial(row, number, SEED, motion) for number, row, motion in every])
 
 
 if __name__ == "__main__":

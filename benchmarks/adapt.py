@@ -153,44 +153,41 @@ def figures(plants: list[Line], unchanged: list[Line]) -> list[report.Figure]:
     def count_true(name: str, target: str, flags: list[bool]) -> report.Figure:
         return report.Figure(name, target, f"{sum(flags)} of {len(flags)}", len(flags))
 
-    lines = [
-        count_true(
-            f"hidden plants on which 99 % of starts finish: {name}",
-            "all" if name == "adapted" else "",
-            [one["entries"][name]["success"] >= 0.99 for one in plants if name in one["entries"]],
+    finishes, against = [], []
+    for name in flown_entries(plants):
+        flown = [line for line in plants if name in line["entries"]]
+        finishes.append(
+            count_true(
+                f"hidden plants on which 99 % of starts finish: {name}",
+                "all" if name == "adapted" else "",
+                does_finish(flown, name),
+            )
         )
-        for name in flown_entries(plants)
-    ]
+        if name != "adapted":
+            ratio = "races finished a second over those of the adapted policy, interquartile mean"
+            target = "below 1" if name in (*POLICIES, NETWORK) else ""
+            ratios = [speed_ratio(line, name) for line in flown]
+            against.append(report.Figure(f"{ratio}: {name}", target, *describe_ratios(ratios)))
     laps_s = [
-        [one["entries"][name]["flying_lap_s"] for name in ("adapted", LIMIT)]
-        for one in plants
-        if LIMIT in one["entries"]
+        [line["entries"][name]["flying_lap_s"] for name in ("adapted", LIMIT)]
+        for line in plants
+        if LIMIT in line["entries"]
     ]
     over_limit = [adapted_s / limit_s for adapted_s, limit_s in laps_s if adapted_s and limit_s]
-    inside = [is_as_expected(one) for one in plants if has_expectation(one)]
-    against = [
-        report.Figure(
-            f"races finished a second over those of the adapted policy, interquartile mean: {name}",
-            "below 1" if name in (*POLICIES, NETWORK) else "",
-            *describe_ratios([speed_ratio(one, name) for one in plants if name in one["entries"]]),
-        )
-        for name in flown_entries(plants)
-        if name != "adapted"
-    ]
-    cpu_s = [one["cpu_s"] for one in plants]
+    cpu_s = [line["cpu_s"] for line in plants]
     # A law of the policy's model that is not in the plant is a difference, and is to be named. So
     # is a scale of the thrust: the thrust map of each plant differs from the model's.
     known = {*load_checkpoint(POLICY).meta["model"]["effects"], "thrust_scale"}
     invented = [
         any(
-            name in BY_NAME and name not in known and f"{name}(" not in one["hidden"]
-            for name in one["named"]
+            name in BY_NAME and name not in known and f"{name}(" not in line["hidden"]
+            for name in line["named"]
         )
-        for one in plants
+        for line in plants
     ]
-    kept = [one["is_new"] is False and one["verdict"] == "consistent" for one in unchanged]
+    kept = [line["is_new"] is False and line["verdict"] == "consistent" for line in unchanged]
     return [
-        *lines,
+        *finishes,
         *against,
         report.Figure(
             "flying lap, adapted over limit, median (all)",
@@ -198,7 +195,9 @@ def figures(plants: list[Line], unchanged: list[Line]) -> list[report.Figure]:
             report.median_and_spread(over_limit, ".3f"),
             len(over_limit),
         ),
-        count_true("mean flying lap within what was expected of a flight", "", inside),
+        count_true(
+            "mean flying lap within what was expected of a flight", "", are_as_expected(plants)
+        ),
         count_true(
             "hidden plants with a named effect that neither they nor the policy's model have",
             "none",
@@ -218,14 +217,14 @@ def figures(plants: list[Line], unchanged: list[Line]) -> list[report.Figure]:
 
 def flown_entries(plants: list[Line]) -> list[str]:
     """Return the entries that flew any of some plants."""
-    return [name for name in ENTRIES if any(name in one["entries"] for one in plants)]
+    return [name for name in ENTRIES if any(name in line["entries"] for line in plants)]
 
 
-def speed_ratio(one: Line, name: str) -> float:
+def speed_ratio(line: Line, name: str) -> float:
     """Return how often an entry finishes in a time, over how often the adapted policy does."""
     rates = [
         entry["success"] / entry["flying_lap_s"] if entry["flying_lap_s"] else 0.0
-        for entry in (one["entries"][name], one["entries"]["adapted"])
+        for entry in (line["entries"][name], line["entries"]["adapted"])
     ]
     return rates[0] / rates[1] if rates[1] else np.inf
 
@@ -248,14 +247,14 @@ def plants_table(plants: list[Line]) -> str:
     """Return a row for each hidden plant."""
     names = flown_entries(plants)
     rows = []
-    for one in sorted(plants, key=lambda line: (line["number"], line["motion"])):
-        entries = one["entries"]
+    for line in sorted(plants, key=lambda line: (line["number"], line["motion"])):
+        entries = line["entries"]
         laps = [format_lap(entries.get(name)) for name in names]
-        expected = one.get("expected_lap_s")
+        expected = line.get("expected_lap_s")
         expected_text = "{:.3f} to {:.3f} s".format(*expected) if expected else "-"
-        named = ", ".join(one.get("named", ())) or one.get("refused", "nothing")
-        head = [str(one["number"]), one["motion"], one.get("motion_found", "-"), one["flights"]]
-        rows.append([*head, one["hidden"], named, *laps, expected_text])
+        named = ", ".join(line.get("named", ())) or line.get("refused", "nothing")
+        head = [str(line["number"]), line["motion"], line.get("motion_found", "-"), line["flights"]]
+        rows.append([*head, line["hidden"], named, *laps, expected_text])
     header = ["plant", "motion", "found", "flights", "hidden", "named", *names, "expected"]
     return report.table(header, rows)
 
@@ -272,14 +271,14 @@ def entries_of_rivals(lines: list[Line], plant: Line) -> dict[str, Line]:
 def logs_table(plants: list[Line]) -> str:
     """Return a row for each length of the log and each seed."""
     rows = []
-    for seconds, seed in sorted({(one["seconds"], one["seed"]) for one in plants}):
+    for seconds, seed in sorted({(line["seconds"], line["seed"]) for line in plants}):
         alike = report.select(plants, seconds=seconds, seed=seed)
-        flown = [one for one in alike if "is_new" in one]
-        finish = sum(one["entries"]["adapted"]["success"] >= 0.99 for one in flown)
-        inside = [is_as_expected(one) for one in flown if has_expectation(one)]
-        cpu_s = f"{np.median([one['cpu_s'] for one in flown]):.0f}" if flown else "-"
+        flown = [line for line in alike if "is_new" in line]
+        num_finish = sum(does_finish(flown, "adapted"))
+        inside = are_as_expected(flown)
+        cpu_s = f"{np.median([line['cpu_s'] for line in flown]):.0f}" if flown else "-"
         refused = f"{len(alike) - len(flown)}"
-        shares = f"{finish} of {len(alike)}", f"{sum(inside)} of {len(inside)}"
+        shares = f"{num_finish} of {len(alike)}", f"{sum(inside)} of {len(inside)}"
         rows.append([f"{seconds:g}", str(seed), *shares, refused, cpu_s, alike[0]["commit"]])
     header = (
         "seconds | seed | 99 % finish, adapted | lap as expected | refused | CPU s, median | commit"
@@ -287,35 +286,39 @@ def logs_table(plants: list[Line]) -> str:
     return report.table(header, rows)
 
 
-def has_expectation(one: Line) -> bool:
-    """Return whether a lap was expected and flown."""
-    return bool(one["expected_lap_s"] and one["entries"]["adapted"]["flying_lap_s"])
+def does_finish(plants: list[Line], name: str) -> list[bool]:
+    """Return for each plant whether 99 % of an entry's starts finish."""
+    return [line["entries"][name]["success"] >= 0.99 for line in plants]
 
 
-def is_as_expected(one: Line) -> bool:
-    """Return whether the mean flying lap lies within what was expected of a flight."""
-    low, high = one["expected_lap_s"]
-    return bool(low <= one["entries"]["adapted"]["flying_lap_s"] <= high)
+def are_as_expected(plants: list[Line]) -> list[bool]:
+    """Return whether the mean flying lap is as expected, for plants of which both are known."""
+    flags = []
+    for line in plants:
+        expected_s, lap_s = line["expected_lap_s"], line["entries"]["adapted"]["flying_lap_s"]
+        if expected_s and lap_s:
+            flags.append(expected_s[0] <= lap_s <= expected_s[1])
+    return flags
 
 
 def crafts_table(lines: list[Line]) -> str:
     """Return a row for each craft that the policy was not made for."""
     rows = []
-    for one in sorted(lines, key=lambda line: line["number"]):
-        entries, named = one["entries"], ", ".join(one.get("named", ())) or "nothing"
+    for line in sorted(lines, key=lambda line: line["number"]):
+        entries, named = line["entries"], ", ".join(line.get("named", ())) or "nothing"
         flown_s = entries.get("adapted", {}).get("flying_lap_s")
-        simulated_s = one.get("simulated_lap_s")
+        simulated_s = line.get("simulated_lap_s")
         gap = f"{flown_s / simulated_s - 1.0:+.2%}" if flown_s and simulated_s else "-"
-        verdict = one.get("refused") or one["verdict"]
+        verdict = line.get("refused") or line["verdict"]
         laps = [format_lap(entries.get(name)) for name in ("nothing", "adapted")]
-        rows.append([one["hidden"], verdict, named, *laps, gap, str(one.get("cpu_s", "-"))])
+        rows.append([line["hidden"], verdict, named, *laps, gap, str(line.get("cpu_s", "-"))])
     header = "craft | verdict | named | nothing | adapted | gap to its simulator | CPU s"
     return report.table(header, rows)
 
 
 def describe_not_flown(lines: list[Line]) -> str:
     """Return which configurations of firmware have no line."""
-    flown = {one["hidden"] for one in lines}
+    flown = {line["hidden"] for line in lines}
     missing = [name for name in CONFIGURATIONS if name not in flown]
     return f"Not flown at this commit: {', '.join(missing)}." if missing else ""
 
@@ -326,16 +329,16 @@ def write_page(all_lines: list[Line]) -> None:
     lines = report.select(of_all_logs, seconds=SECONDS, seed=SEED)
     firmware = report.select(lines, kind=FIRMWARE)
     plants = [
-        {**one, "entries": one["entries"] | entries_of_rivals(lines, one)}
-        for one in report.select(lines, kind=PLANT)
+        {**line, "entries": line["entries"] | entries_of_rivals(lines, line)}
+        for line in report.select(lines, kind=PLANT)
     ]
     unchanged = report.select(lines, kind=UNCHANGED)
-    whole = [one for one in plants if "is_new" in one]
-    judged = [one for one in unchanged if "is_new" in one]
+    whole = [line for line in plants if "is_new" in line]
+    judged = [line for line in unchanged if "is_new" in line]
     deviations = [
-        f"{one['motion']} {one['number']}: {', '.join(one['named']) or one['verdict']}"
-        for one in judged
-        if one["verdict"] != "consistent"
+        f"{line['motion']} {line['number']}: {', '.join(line['named']) or line['verdict']}"
+        for line in judged
+        if line["verdict"] != "consistent"
     ]
     refused = len(unchanged) - len(judged)
     text = f"{len(judged)} of {NUM_UNCHANGED} were flown"

@@ -185,18 +185,18 @@ def is_verified(reference: Reference, flown: Replay) -> bool:
 
 
 class Flown(NamedTuple):
-    """A reference, the plant that flew its commands, and the replay."""
+    """A reference, and its replays in its own model and, if that is of it, on the black box."""
 
     reference: Reference
-    flown_by: str
     replay: Replay
+    on_black_box: Replay | None
 
 
 def verified(folder: Path, tracks: list[Track]) -> tuple[list[Flown], bool]:
     """Return a folder's references with their replays, and whether those in their model are right.
 
-    References of the model ``black_box`` are flown on the shipped black box as well. tracks: where
-    references may be of tracks that are not shipped.
+    Args:
+        tracks: where references may be of tracks that are not shipped.
 
     Raises:
         files.ReferenceFileError, TrackError: a file that cannot be used, or no references.
@@ -210,11 +210,11 @@ def verified(folder: Path, tracks: list[Track]) -> tuple[list[Flown], bool]:
     flights, is_good = [], True
     for reference in references:
         track = by_name.get(reference.track) or flytrack_env.load_track(reference.track)
-        flights.append(Flown(reference, "simulator", replay(reference, track)))
+        has_box = reference.model_name == BLACK_BOX
+        on_black_box = replay(reference, track, plant) if has_box else None
+        flights.append(Flown(reference, replay(reference, track), on_black_box))
         is_good &= is_verified(reference, flights[-1].replay)
         is_good &= files.track_digest(track) == reference.track_sha256
-        if reference.model_name == BLACK_BOX:
-            flights.append(Flown(reference, "black box", replay(reference, track, plant)))
     return flights, is_good
 
 
@@ -235,43 +235,33 @@ def write_pictures(page: Path, references: list[Reference], tracks: list[Track])
         write_atomically(page.with_name(f"{page.stem}_{track.name}.png"), picture)
 
 
-def _names(reference: Reference) -> tuple[str, str, str]:
-    return reference.track, reference.model_name, TITLES[reference.kind]
-
-
-def _format_gates(flown: Flown) -> str:
-    replay = flown.replay
-    gates = f"{replay.gates_passed} of {len(flown.reference.gate_times_s)}"
-    return ", ".join([gates, *replay.ended_by])
-
-
-def _row(flown: Flown, on_black_box: Flown | None) -> tuple[Any, ...]:
+def _row(flown: Flown) -> list[str]:
     """Return a reference, its replay in the simulator, and the one on the black box if any."""
-    reference, replay = flown.reference, flown.replay
+    reference, replay, on_black_box = flown
     times_s = [seconds for seconds in reference.found["coarse_times_s"] if seconds is not None]
     num_agree = sum(seconds <= min(times_s) * (1.0 + AGREE_SHARE) for seconds in times_s)
     speeds = np.linalg.norm(reference.states[:, layout.VELOCITY], axis=1)
-    return (
-        *_names(reference),
+    gates = "-"
+    if on_black_box is not None:
+        passed = f"{on_black_box.gates_passed} of {len(reference.gate_times_s)}"
+        gates = ", ".join([passed, *on_black_box.ended_by])
+    return [
+        reference.track,
+        reference.model_name,
+        TITLES[reference.kind],
         f"{reference.time_s:.4f}",
         f"{reference.found['free_time_s']:.4f}",
         f"{num_agree} of {len(reference.found['coarse_times_s'])}",
         f"{speeds.max():.1f}",
         f"{MILLI * (replay.time_s - reference.time_s):+.3f}",
         f"{MILLI * replay.drift_m:.2f}",
-        "-" if on_black_box is None else _format_gates(on_black_box),
-    )
+        gates,
+    ]
 
 
-def write_page(path: Path | None, flights: list[Flown]) -> list[Reference]:
-    """Print, and write unless the path is None, the tables of references and their replays.
-
-    Returns the references.
-    """
-    replays = [one for one in flights if one.flown_by == "simulator"]
-    references = [one.reference for one in replays]
-    on_black_box = {_names(one.reference): one for one in flights if one.flown_by == "black box"}
-    rows = [_row(one, on_black_box.get(_names(one.reference))) for one in replays]
+def write_page(path: Path | None, flights: list[Flown]) -> None:
+    """Print, and write unless the path is None, the tables of references and their replays."""
+    references = [flown.reference for flown in flights]
     commands = sorted({reference.found["command"].strip("`") for reference in references})
     tracks = sorted({reference.track for reference in references})
     pictures = [f"![{name}]({path.stem}_{name}.png)\n\n" for name in tracks if path is not None]
@@ -282,10 +272,9 @@ def write_page(path: Path | None, flights: list[Flown]) -> list[Reference]:
         commands="\n".join(f"- `{line}`" for line in commands),
         agree=AGREE_SHARE,
         conditions="\n".join(f"- {line}" for line in conditions),
-        flights=report.table(HEADER, rows),
+        flights=report.table(HEADER, map(_row, flights)),
         pictures="".join(pictures),
     )
-    return references
 
 
 def main(
@@ -315,9 +304,9 @@ def main(
             cpu_s = reference.found["cpu_s"]
             print(f"{track.name} {kind}: {reference.time_s:.4f} s, {cpu_s} CPU s", flush=True)
     flights, is_good = verified(out, courses)
-    references = write_page(page, flights)
+    write_page(page, flights)
     if page is not None:
-        write_pictures(page, references, courses)
+        write_pictures(page, [flown.reference for flown in flights], courses)
     raise SystemExit(0 if is_good else 1)
 
 

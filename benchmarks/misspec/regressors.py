@@ -21,18 +21,18 @@ class Feature(NamedTuple):
     Attributes:
         name: ``effect.parameter``.
         neutral: the parameter's value at which it does nothing.
-        force_b: m/s^2, (n, 3); felt by the accelerometer, too.
-        rates_b: rad/s, (n, 3); read by the gyro, too.
+        force_b: m/s^2, (n, 3) or (3,); felt by the accelerometer, too.
+        rates_b: rad/s, the same; read by the gyro, too.
         accelerometer: what only the accelerometer has.
         gyro: what only the gyro has.
     """
 
     name: str
     neutral: float = 0.0
-    force_b: np.ndarray | None = None
-    rates_b: np.ndarray | None = None
-    accelerometer: np.ndarray | None = None
-    gyro: np.ndarray | None = None
+    force_b: np.ndarray = np.zeros(3)
+    rates_b: np.ndarray = np.zeros(3)
+    accelerometer: np.ndarray = np.zeros(3)
+    gyro: np.ndarray = np.zeros(3)
 
 
 def along(axis: int, values: np.ndarray) -> np.ndarray:
@@ -111,22 +111,20 @@ def sensing(state: State) -> list[Feature]:
     return features
 
 
-def column(found: Replay, feature: Feature, scales: np.ndarray) -> np.ndarray:
+def column(replay: Replay, feature: Feature, scales: np.ndarray) -> np.ndarray:
     """Return a feature's column over all measurements, each over its noise."""
-    nothing = np.zeros_like(found.gyro)
-    force = nothing if feature.force_b is None else feature.force_b
-    rates = nothing if feature.rates_b is None else feature.rates_b
-    gyro = rates + (nothing if feature.gyro is None else feature.gyro)
-    felt = force + (nothing if feature.accelerometer is None else feature.accelerometer)
-    return _over_noise([gyro, felt, found.turned(rates), found.pushed(force)], scales)
+    nothing = np.zeros_like(replay.gyro)
+    force, rates = nothing + feature.force_b, nothing + feature.rates_b
+    gyro, felt = rates + feature.gyro, force + feature.accelerometer
+    return _over_noise([gyro, felt, replay.turned(rates), replay.pushed(force)], scales)
 
 
-def targets(found: Replay) -> tuple[np.ndarray, np.ndarray]:
+def targets(replay: Replay) -> tuple[np.ndarray, np.ndarray]:
     """Return all measurements over their noise, and the noise by channel and axis, (4, 3).
 
     The noise is the median absolute deviation of differences between neighbours.
     """
-    parts = [found.gyro, found.force, found.turning, found.pushing]
+    parts = [replay.gyro, replay.force, replay.turning, replay.pushing]
     scales = np.array(
         [1.4826 / np.sqrt(2.0) * np.median(np.abs(np.diff(part, axis=0)), axis=0) for part in parts]
     )

@@ -163,8 +163,8 @@ def sparse(log: FlightLog, model: ModelParameters) -> Answer:
         force_b, rates_b = np.zeros((2, len(state.thrust), 3))
         for feature in moving(state, full_rates):
             weight = weights.get(feature.name, 0.0)
-            force_b += 0.0 if feature.force_b is None else weight * feature.force_b
-            rates_b += 0.0 if feature.rates_b is None else weight * feature.rates_b
+            force_b += weight * feature.force_b
+            rates_b += weight * feature.rates_b
         return force_b, rates_b
 
     return Answer(names, values=values, predict=lambda flights: fly(model, flights, beyond))

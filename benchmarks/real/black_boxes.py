@@ -29,7 +29,7 @@ from flytrack_sysid.diagnosis.flight_errors import FlightErrors
 from flytrack_sysid.inference.free_flight import HORIZONS_S, Windows
 from flytrack_sysid.inference.one_step import columns, predict
 from flytrack_sysid.inference.record import fill_gaps
-from flytrack_sysid.log import FlightLog, usual_step
+from flytrack_sysid.log import FlightLog, median_step
 from flytrack_sysid.split import held_out_rows
 
 LONG_S, PAST_RATES_S = 0.3, 0.05  # of commands, of rates
@@ -69,7 +69,7 @@ def base_steps(model: ModelParameters, log: FlightLog) -> np.ndarray:
 
 def rows_of(log: FlightLog, model: ModelParameters) -> Rows:
     """Return the rows of a log without gaps."""
-    step_s, is_start = float(np.median(usual_step(log))), log.is_start()
+    step_s, is_start = median_step(log), log.is_start()
     num_commands, num_rates = _past(step_s)
     age = np.arange(len(log)) - np.maximum.accumulate(np.where(is_start, np.arange(len(log)), 0))
     has_next = np.append(~is_start[1:], False)

@@ -37,7 +37,7 @@ from flytrack_sysid.inference.free_flight import (
     evaluate_windows,
     make_windows,
 )
-from flytrack_sysid.log import usual_step
+from flytrack_sysid.log import median_step
 
 BETAFLIGHT = "betaflight_acro_log"
 # Every third policy, by its number, is for judging.
@@ -95,7 +95,7 @@ def best_linear(log: FlightLog, held_out: np.ndarray) -> float:
 
     No linear model of whatever order that is driven by the setpoints can do better but by chance.
     """
-    step_s = float(np.median(usual_step(log)))
+    step_s = median_step(log)
     back, ahead = round(BEFORE_S / step_s), round(AFTER_S / step_s)
     rows = np.arange(back, len(log) - ahead)
     setpoints = log["u"][rows[:, None] + np.arange(-back, ahead + 1), :3].reshape(len(rows), -1)

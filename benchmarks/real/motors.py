@@ -16,7 +16,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import orangebox
-import tyro
 
 from benchmarks import report
 from benchmarks.real.black_boxes import (
@@ -33,7 +32,7 @@ from flytrack_env import ModelParameters
 from flytrack_sysid import FitError, FlightLog, fit, import_log
 from flytrack_sysid.diagnosis.controller import AXES, examine_controller, identify_loops
 from flytrack_sysid.diagnosis.result import Loop
-from flytrack_sysid.fit import Fit
+from flytrack_sysid.fit import Interval
 from flytrack_sysid.importing.importer import Imported
 from flytrack_sysid.inference.chunks import at_usual_rate
 from flytrack_sysid.inference.free_flight import (
@@ -43,6 +42,7 @@ from flytrack_sysid.inference.free_flight import (
     make_windows,
 )
 from flytrack_sysid.inference.torque import MotorRecord, torque_correlations
+from flytrack_sysid.log import median_step
 from flytrack_sysid.split import held_out_rows
 
 HORIZON = HORIZONS_S.index(0.25)
@@ -68,10 +68,14 @@ class Craft(NamedTuple):
     fixed: Mapping[str, float] = {}
 
 
+ARPL = {
+    name: Craft((f"cf_arpl_motors/{name}",), "usd", f"arpl_motors_{name}")
+    for name in ("log15", "log16")
+}
 CRAFTS = {
     "Betaflight 6S": Craft(("betaflight_acro_log/shortLog.BFL",), "betaflight", "acro_motors"),
     "Gecko": Craft(("bf_gecko/btfl_002.bbl",), "betaflight", "gecko_motors", LAGS),
-    "Crazyflie, log15": Craft(("cf_arpl_motors/log15",), "usd", "arpl_motors_log15"),
+    "Crazyflie, log15": ARPL["log15"],
 }
 IRIS = Craft(("eth_quadrotor_model/quadrotor_model.csv",), "csv", "eth_motors")
 
@@ -86,8 +90,9 @@ def predicted(craft: Craft) -> dict[str, float]:
     """Return the errors of the rates after 0.25 s in the second half, rms in rad/s, and sizes."""
     flight = read(craft)
     log = at_usual_rate(flight.log)[0]
-    step_s = float(np.median(np.diff(log.time)))  # even: an ARX has as many rows in any part
-    log = replace(log, time=step_s * np.arange(len(log)), segment=np.zeros(len(log), int))
+    # Even: an ARX has as many rows in any part.
+    even_s = median_step(log) * np.arange(len(log))
+    log = replace(log, time=even_s, segment=np.zeros(len(log), int))
     is_test = np.arange(len(log)) >= len(log) // 2
     train = log.select(~is_test)
     found = fit(train, flight.nominal_model(), craft.fixed, every=0, accept=True)
@@ -106,33 +111,24 @@ def predicted(craft: Craft) -> dict[str, float]:
     return {**result, "ratio": result["motors"] / result["arx"], "windows": int(counts.sum())}
 
 
-def overlap(fits: Sequence[Fit]) -> tuple[list[bool], list[str]]:
-    """Return whether the intervals of two flights overlap, by parameter, and the parameters."""
-    first, second = (one.intervals for one in fits)
-    names = [name for name in first if name in second and name.startswith("motors.")]
-    flags = [
-        first[name].low <= second[name].high and second[name].low <= first[name].high
-        for name in names
-    ]
-    return flags, names
+def fit_craft(craft: Craft, effects: tuple[str, ...] = ()) -> Mapping[str, Interval]:
+    """Return the intervals of a fit to a craft's flight."""
+    flight = read(craft)
+    return fit(flight.log, flight.nominal_model(), effects=effects, accept=True).intervals
 
 
-def two_flights() -> list[Fit]:
-    """Return the fits of two flights of one Crazyflie."""
-    fits = []
-    for name in ("log15", "log16"):
-        craft = Craft((f"cf_arpl_motors/{name}",), "usd", f"arpl_motors_{name}")
-        flight = read(craft)
-        fits.append(fit(flight.log, flight.nominal_model(), accept=True))
-    return fits
-
-
-def rotor_drag() -> Fit:
-    """Return the fit of the flight in Gazebo, with linear and rotor drag."""
-    flight = read(IRIS)
-    return fit(
-        flight.log, flight.nominal_model(), effects=("rotor_drag", "linear_drag"), accept=True
-    )
+def compare_flights() -> dict[str, list[Any]]:
+    """Return by parameter the intervals of two flights of a craft, and whether they overlap."""
+    first, second = map(fit_craft, ARPL.values())
+    return {
+        name: [
+            list(first[name]),
+            list(second[name]),
+            first[name].low <= second[name].high and second[name].low <= first[name].high,
+        ]
+        for name in first
+        if name in second and name.startswith("motors.")
+    }
 
 
 def nanobench() -> dict[str, Any]:
@@ -162,7 +158,7 @@ def torques() -> dict[str, list[float]]:
     phoenix = MAPPINGS / "phoenix_motors.toml"
     flights = {
         **{name: read(craft) for name, craft in CRAFTS.items()},
-        "Crazyflie, log16": read(Craft(("cf_arpl_motors/log16",), "usd", "arpl_motors_log16")),
+        "Crazyflie, log16": read(ARPL["log16"]),
         "Crazyflie, rate policy": import_log(DATA / PHOENIX, "csv", phoenix),
         "Gazebo's iris": read(IRIS),
     }
@@ -265,14 +261,10 @@ def main(
         except FitError as error:
             results[name] = str(error)
         print(name, results[name], flush=True)
-    fits = two_flights()
-    flags, names = overlap(fits)
-    results["two flights"] = {
-        name: [list(one.intervals[name]) for one in fits] + [flag]
-        for name, flag in zip(names, flags, strict=True)
-    }
-    print(f"overlapping: {sum(flags)} of {len(flags)}", results["two flights"], flush=True)
-    drag = rotor_drag().intervals["rotor_drag.h"]
+    flights = results["two flights"] = compare_flights()
+    num_overlapping = sum(overlaps for *_, overlaps in flights.values())
+    print(f"overlapping: {num_overlapping} of {len(flights)}", flights, flush=True)
+    drag = fit_craft(IRIS, ("rotor_drag", "linear_drag"))["rotor_drag.h"]
     results["rotor drag"] = list(drag)
     print("rotor drag", drag, drag.low <= ROTOR_DRAG <= drag.high)
     if out is not None:
@@ -280,4 +272,4 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    report.command(main)

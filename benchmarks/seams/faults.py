@@ -26,6 +26,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from benchmarks.seams.craft import GRAVITY, MOMENT_SIGNS
 from benchmarks.seams.flight import Flight, multiply
@@ -250,8 +251,8 @@ def _late(truth: FlightLog, log: FlightLog, channel: str, delay_s: float) -> np.
 
 def _yaw(log: FlightLog) -> np.ndarray:
     """Return the heading of each row, rad in (-pi, pi]."""
-    w, x, y, z = log["q"].T
-    return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    nose = Rotation.from_quat(log["q"], scalar_first=True).apply([1.0, 0.0, 0.0])
+    return np.arctan2(nose[:, 1], nose[:, 0])
 
 
 def _interpolate_across_wrap(log: FlightLog, source_rows: int) -> np.ndarray:
@@ -265,8 +266,8 @@ def _interpolate_across_wrap(log: FlightLog, source_rows: int) -> np.ndarray:
     jumps = np.abs(np.diff(yaw[sources], append=yaw[sources[-1]])) > np.pi
     is_changed = jumps[rows // source_rows] & (rows % source_rows > 0)
     turn = np.where(is_changed, np.interp(rows, sources, yaw[sources]) - yaw, 0.0)
-    zero = np.zeros_like(turn)
-    return multiply(np.stack([np.cos(turn / 2), zero, zero, np.sin(turn / 2)], 1), log["q"])
+    turns = Rotation.from_euler("z", turn[:, None]).as_quat(scalar_first=True)
+    return multiply(turns, log["q"])
 
 
 # Motion
