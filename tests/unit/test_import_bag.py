@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid import LogError, import_log
@@ -116,12 +117,12 @@ def test_what_was_written_is_read_back(tmp_path, mapping, kind):
     log, time = imported.log, imported.log.time
     assert len(log) >= 990
     assert np.diff(time) == pytest.approx(0.005, abs=1e-6)  # the rates' own rows
-    np.testing.assert_allclose(log["w"][:, 0], 0.5 * np.cos(time), atol=1e-6)
-    np.testing.assert_allclose(log["p"][:, 0], time, atol=1e-6)  # interpolated
+    assert_allclose(log["w"][:, 0], 0.5 * np.cos(time), atol=1e-6)
+    assert_allclose(log["p"][:, 0], time, atol=1e-6)  # interpolated
     attitude = Rotation.from_quat(log["q"], scalar_first=True)
     assert (attitude.inv() * motion(time)).magnitude().max() < 1e-4
     held = np.sin(np.floor(time / 0.02 + 1e-6) * 0.02)
-    np.testing.assert_allclose(log["u"][:, 0], held, atol=1e-6)
+    assert_allclose(log["u"][:, 0], held, atol=1e-6)
     assert log["u"][:, 3] == pytest.approx(0.5)
     is_noted = "times are those of their recording" in " ".join(imported.notes)
     assert is_noted == (kind == "MCAP of JSON")
@@ -147,6 +148,6 @@ def test_topics_of_other_epochs_are_put_together_by_their_recording(tmp_path, ma
     imported = import_log(tmp_path / "flight.mcap", "bag", mapping, align=False)
     position_m = imported.log["p"][:, 0]  # 1 m/s
     assert position_m[0] < 0.0051  # the rounding of 77 s may cost the first row
-    np.testing.assert_allclose(position_m - position_m[0], imported.log.time, atol=1e-5)
+    assert_allclose(position_m - position_m[0], imported.log.time, atol=1e-5)
     note = f"stamps of q are {START_NS * 1e-9 - 77:+.6g} s before those of w"
     assert note in " ".join(imported.notes)

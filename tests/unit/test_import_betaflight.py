@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from flytrack_env.effects import effect_of
 from flytrack_env.state import Action
@@ -49,9 +50,7 @@ def read(tmp_path):
 
     def import_content(*logs, mapping="", **options):
         (tmp_path / "a.bbl").write_bytes(b"".join(logs))
-        mapping = mapping if "[rows]" in mapping else f"[rows]\n{mapping}"
-        mapping = mapping.replace("[rows]", "[rows]\nevery = 1")
-        (tmp_path / "map.toml").write_text(mapping)
+        (tmp_path / "map.toml").write_text(f"[rows]\nevery = 1\n{mapping}")
         return import_log(tmp_path / "a.bbl", "betaflight", tmp_path / "map.toml", **options)
 
     return import_content
@@ -69,7 +68,7 @@ def test_fine_rates_are_scaled(read):
     plain = read(log_with()).log
     fine = read(log_with(frames() * np.where(is_fine, 10, 1), blackbox_high_resolution="1")).log
     for name in plain.channels:
-        np.testing.assert_allclose(fine[name], plain[name], atol=1e-12, err_msg=name)
+        assert_allclose(fine[name], plain[name], atol=1e-12, err_msg=name)
 
 
 def test_logs_of_one_file_become_segments_and_lost_frames_no_rows(read):
@@ -119,7 +118,7 @@ def test_stick_curves_are_the_firmwares(rates_type):
             curve, None, Action(stick, stick, stick, 0.3), None
         )
         expected = [of_firmware(rates_type, stick, *axis) for axis in axes]
-        np.testing.assert_allclose(bent[:3], np.divide(expected, full), atol=1e-6)
+        assert_allclose(bent[:3], np.divide(expected, full), atol=1e-6)
         assert bent.thrust == 0.3
     straight = {"ACTUAL": 62, "BETAFLIGHT": 0, "QUICK": 12}[rates_type]
     assert stick_curve(rates_type, [(62, straight, 0)] * 3) is None
@@ -183,7 +182,7 @@ def test_logged_attitude_is_read(read, truth):
     names = [*NAMES, *(f"imuQuaternion[{axis}]" for axis in range(3))]
     rows = np.column_stack([frames_of(truth), np.round(32767 * quat[:, 1:])])
     imported = read(log_with(rows, names), align=False)
-    np.testing.assert_allclose(imported.log["q"], quat, atol=1e-3)
+    assert_allclose(imported.log["q"], quat, atol=1e-3)
     assert imported.problems == ()
     rows[:, -3:] = 0
     assert "q" not in read(log_with(rows, names)).log
@@ -218,7 +217,7 @@ def test_limited_outputs_of_motors_are_shares_of_the_protocols_range(read, ends,
     motors = 1100 + np.arange(200)[:, None] + np.arange(4)
     log = log_with(np.column_stack([frames(), motors]), names, motorOutput=ends)
     commands = read(log, mapping="[motors]\nas_command = true\n", align=False).log["u"]
-    np.testing.assert_allclose(commands[0], 2.0 * (motors[0] - off) / (full - off) - 1.0)
+    assert_allclose(commands[0], 2.0 * (motors[0] - off) / (full - off) - 1.0)
 
 
 @pytest.mark.parametrize(
@@ -259,7 +258,7 @@ def test_real_log_holds_what_another_decoder_found(tmp_path):
         raw[f"gyroADC[{axis}]"] = np.rad2deg(every_second["w"][:, axis])
         raw[f"accSmooth[{axis}]"] = 2048.0 / GRAVITY * every_second["f"][:, axis]
     for name, values in raw.items():
-        np.testing.assert_allclose(values, decoded[name], atol=1e-6, err_msg=name)
+        assert_allclose(values, decoded[name], atol=1e-6, err_msg=name)
     assert imported.craft.max_rate_deg_s == pytest.approx((1021.6, 1021.6, 772.96))
     for axis in (0, 1):  # the largest setpoint is full stick, in whole numbers
         assert decoded[f"setpoint[{axis}]"].max() == 1022 and log["u"][:, axis].max() == 1.0

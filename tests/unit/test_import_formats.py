@@ -1,11 +1,9 @@
 """What holds for every format: flights come back, whole or cut off, and other files are named."""
 
 import gzip
-import io
 import pickle
 import re
 import tarfile
-import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +20,7 @@ from tests.support.grounded_flights import (
     stands_flies_and_lands,
 )
 from tests.support.tables import table
+from tests.support.written_logs import npy_bytes, npz_bytes
 
 ATTITUDE_AND_PLACE = {"ULog": set("pvq"), "DataFlash": set("pvq")}
 # Whole numbers of 0.001 of the throttle or deg/s, 0.01 V, and 1/2048 g.
@@ -106,22 +105,11 @@ def test_whole_rows_of_a_log_that_is_cut_off_are_used_or_it_is_refused(kind, tmp
 # --- Files of other kinds -------------------------------------------------------------------------
 
 
-def packed(write):
-    content = io.BytesIO()
-    write(content)
-    return content.getvalue()
-
-
-def tar(content):
-    with tarfile.open(fileobj=content, mode="w") as archive:
-        archive.addfile(tarfile.TarInfo("a"), io.BytesIO())
-
-
 OTHERS = {
     "gzip": gzip.compress(b"a,b"),
-    "ZIP": packed(lambda content: zipfile.ZipFile(content, "w").writestr("a", "b")),
-    "NumPy": packed(lambda content: np.save(content, np.zeros(3))),
-    "TAR": packed(tar),
+    "ZIP": npz_bytes({"a": np.zeros(3)}),
+    "NumPy": npy_bytes(np.zeros(3)),
+    "TAR": tarfile.TarInfo("a").tobuf(),
     "pickle": pickle.dumps([1.0]),
     "PDF": b"%PDF-1.7\n%\xe2\xe3",
     "PNG": b"\x89PNG\r\n\x1a\n",

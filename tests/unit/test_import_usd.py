@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid import LogError, import_log
 from tests.support.foreign_logs import flying, usd_log, write_mapping, write_usd
 
-GAINS = {"KR": (0.009, 0.008, 0.007), "Kw": (0.00125, 0.001, 0.0025), "KI": (0.05, 0.04, 0.0)}
+KR, KW, KI = np.array([[0.009, 0.008, 0.007], [0.00125, 0.001, 0.0025], [0.05, 0.04, 0.0]])
 LEE = 'extends = "crazyflie_lee"\n'
 VECTORS = ("rpy", "rpyd", "omega", "omegar", "torque")
 
@@ -37,10 +38,10 @@ def events():
 @pytest.mark.parametrize("version", [1, 2])
 def test_events_of_other_rates_become_one_log(tmp_path, version):
     log = read(tmp_path, usd_log(events(), version)).log
-    np.testing.assert_allclose(log.time, 0.002 * np.arange(400), atol=1e-9)
-    np.testing.assert_allclose(log["w"][:, 0], np.sin(5.0 + log.time), atol=1e-9)
+    assert_allclose(log.time, 0.002 * np.arange(400), atol=1e-9)
+    assert_allclose(log["w"][:, 0], np.sin(5.0 + log.time), atol=1e-9)
     held = -1.0 + 2.0 / 84 * np.arange(80)
-    np.testing.assert_allclose(log["u"][:, 0], np.repeat(held, 5), atol=1e-9)
+    assert_allclose(log["u"][:, 0], np.repeat(held, 5), atol=1e-9)
     assert log["v_bat"][[0, 150, -1], 0] == pytest.approx([39.0, 38.0, 37.0])
 
 
@@ -81,25 +82,25 @@ def lee_log():
     phases = np.array([0.0, 1.0, 2.0])
     angles, wanted = (0.1 * np.sin(scale * time[:, None] + phases) for scale in (2.0, 2.3))
     rates, reference = (np.cos(scale * time[:, None] + phases) for scale in (3.0, 1.7))
-    r, rd = (Rotation.from_euler("ZYX", one[:, ::-1]).as_matrix() for one in (angles, wanted))
-    skew = 0.5 * (np.einsum("nji,njk->nik", rd, r) - np.einsum("nji,njk->nik", r, rd))
+    attitude = Rotation.from_euler("ZYX", angles[:, ::-1])
+    turn = (Rotation.from_euler("ZYX", wanted[:, ::-1]).inv() * attitude).as_matrix()
+    skew = 0.5 * (turn - turn.transpose(0, 2, 1))
     errors = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
-    kr, kw, ki = (np.array(GAINS[name]) for name in ("KR", "Kw", "KI"))
-    asked = reference - kr / kw * errors
-    torque = kw * (asked - rates) - ki * (np.cumsum(errors, axis=0) - 0.5 * errors) * 0.004
+    setpoints = reference - KR / KW * errors
+    torque = KW * (setpoints - rates) - KI * (np.cumsum(errors, axis=0) - 0.5 * errors) * 0.004
     names = [f"ctrlLee.{vector}{axis}" for vector in VECTORS for axis in "xyz"]
-    names += ["ctrlLee.thrustSI"]
+    names.append("ctrlLee.thrustSI")
     names += [f"stateEstimateZ.{axis}" for axis in ("x", "y", "z", "vx", "vy", "vz")]
     thrust_and_place = np.tile([0.35, *[0.0] * 6], (len(time), 1))
     rows = np.column_stack([time, angles, wanted, rates, reference, torque, thrust_and_place])
-    return usd_log({"fixedFrequency": (dict.fromkeys(names, "d"), rows)}), asked
+    return usd_log({"fixedFrequency": (dict.fromkeys(names, "d"), rows)}), setpoints
 
 
 def test_torques_become_the_rates_that_the_controller_tracks(tmp_path):
-    content, asked = lee_log()
+    content, setpoints = lee_log()
     imported = read(tmp_path, content, f"{LEE}[craft]\nmass_kg = 0.032\n")
     commanded = imported.log["u"][:, :3] * np.deg2rad([800.0, 800.0, 400.0])
-    np.testing.assert_allclose(commanded, asked, atol=0.001 * np.abs(asked).max())
+    assert_allclose(commanded, setpoints, atol=0.001 * np.abs(setpoints).max())
     gains = "identified with Kw 0.00125, 0.001, 0.0025 N m s/rad; the law explains 100.0%"
     assert gains in " ".join(imported.notes)
     assert imported.log["u"][:, 3] == pytest.approx(0.0)

@@ -23,7 +23,7 @@ DRAGGED = PLAIN.with_effects(DRAG, effects.YawReaction(0.05))
 LOOP = DRAGGED.with_effects(effects.SecondOrderRates(*[0.02] * 3, *[0.6] * 3))
 FULL = LOOP.with_effects(effects.CommandDelay(0.013))
 # Neutral effects change nothing (tests/contract/test_effects.py), so that all models have these.
-EVERY = FULL.with_effects(
+NEUTRAL = (
     effects.LinearDrag(),
     effects.YawReaction(),
     effects.SecondOrderRates(),
@@ -53,7 +53,7 @@ def flown(model, dt, start=START):
     All flights have one length and the same effects: one program is compiled for a motion.
     """
     commands = np.repeat(held_commands(), round(COMMAND_S / dt), axis=0)
-    full = model._replace(effects=EVERY.effects).with_effects(*model.effects)
+    full = model.with_effects(*NEUTRAL, *model.effects)
     with jax.enable_x64(True):
         rows = np.asarray(fly(unpack(jnp.asarray(start)), padded(commands, LONGEST), full, dt))[
             : len(commands)

@@ -135,12 +135,16 @@ def test_mappings_of_no_quadcopter_or_of_two_are_refused(log, tmp_path, old, new
         import_log(path, "csv", map_file)
 
 
-def test_a_craft_of_motors_names_what_it_lacks():
-    craft = Craft(mass_kg=0.8, motors=model_of(crafts()).effect("motors"))
-    with pytest.raises(LogError, match=r"a: craft\.voltage_v: missing in log and mapping"):
-        craft.nominal_model("a")
-    with pytest.raises(LogError, match=r"a: craft\.max_rate_deg_s: missing in log and mapping"):
-        craft._replace(motors=None).nominal_model("a")
+def test_a_craft_names_what_it_lacks():
+    """Full stick is not needed where motors are commanded."""
+    motors = model_of(crafts()).effect("motors")
+    for craft, missing in (
+        (Craft(mass_kg=0.8, motors=motors), "voltage_v"),
+        (Craft(voltage_v=(14.0, 16.8), motors=motors), "mass_kg"),
+        (Craft(mass_kg=0.8), "max_rate_deg_s"),
+    ):
+        with pytest.raises(LogError, match=rf"a: craft\.{missing}: missing in log and mapping"):
+            craft.nominal_model("a")
 
 
 def test_a_motor_that_stands_still_is_named(log, tmp_path):
@@ -208,18 +212,19 @@ def test_a_log_that_hardly_shows_torque_is_told_and_names_no_motor(log):
     assert "by roll 0.00, pitch 0." in note and "motors.center_y are held" in note
     (note,) = torque_notes(noisy, model)
     assert "hardly shows the motors' torque" in note and "roll 0." in note
-    held = ("radius_x", "center_y", "radius_y", "center_x", "radius_z", "up_s", "down_s")
-    for flown_log, fields in ((log, ()), (noisy, tuple(f"motors.{name}" for name in held))):
+    names = ("radius_x", "center_y", "radius_y", "center_x", "radius_z", "up_s", "down_s")
+    for flown_log, held in ((log, set()), (noisy, {f"motors.{name}" for name in names})):
         scored = np.ones(len(flown_log), bool)
         with jax.enable_x64(True):
             problem = Problem.of(cut_chunks(flown_log, scored, model), model)
             state = SearchState.start(flown_log, problem)
             state, linearization = state.linearized(problem.start)
             base = FittedModel((), problem.start, 0.0, tuple(state.base_indices))
-            found = [one.candidate for one in score_candidates(state, linearization, base)]
+            scores = score_candidates(state, linearization, base)
         _, free, _ = what_is_fitted(flown_log, model, accept=True)
-        assert {*fields} == {*state.held} - {*OF_EITHER} and {*fields}.isdisjoint(free)
-        assert {"motors.radius_x", "motors.center_x"} - {*free} <= {*fields}
-        assert not fields or ("motors.load",) in {one.fields for one in found}
-        for one in found:
-            assert {*one.fields}.isdisjoint(state.held)
+        assert held == {*state.held} - {*OF_EITHER} and held.isdisjoint(free)
+        assert {"motors.radius_x", "motors.center_x"} - {*free} <= held
+        candidates = [score.candidate.fields for score in scores]
+        assert not held or ("motors.load",) in candidates
+        for fields in candidates:
+            assert {*fields}.isdisjoint(state.held)
