@@ -49,11 +49,11 @@ def yaw_of(heading_deg):
     return (math.cos(half), 0.0, 0.0, math.sin(half))
 
 
-def ring(radius=RADIUS, num_gates=NUM_GATES):
+def ring(radius=RADIUS):
     """Return gates on a circle, anticlockwise, gate 0 at (radius, 0); starts are 5 m before it."""
     gates = []
-    for i in range(num_gates):
-        angle = 2.0 * math.pi * i / num_gates
+    for i in range(NUM_GATES):
+        angle = 2.0 * math.pi * i / NUM_GATES
         centre = (radius * math.cos(angle), radius * math.sin(angle), HEIGHT)
         gates.append(tracks.Gate(10 + i, centre, yaw_of(math.degrees(angle) + 90.0), 1.0, 1.5, 2.7))
     wall = radius + 5.0
