@@ -6,41 +6,40 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.seams.craft import GRAVITY
 from benchmarks.seams.faults import FAULTS, Change, draw_pair, inject, is_shown
-from benchmarks.seams.flight import KINDS, Flight, make_flight
-from benchmarks.seams.simulators import SIMULATORS, Simulator
-from flytrack_sysid.log import FlightLog
+from benchmarks.seams.flight import KINDS, make_flight
+from benchmarks.seams.simulators import SIMULATORS
 
 SEED = 2  # at 100 Hz
 
 
 @pytest.fixture(scope="module")
-def flight() -> Flight:
+def flight():
     return make_flight(SEED, seconds=20.0, kind="race")
 
 
-def attitude(log: FlightLog) -> Rotation:
-    return Rotation.from_quat(log["q"][:, [1, 2, 3, 0]])
+def attitude(log):
+    return Rotation.from_quat(log["q"], scalar_first=True)
 
 
-def means(values: np.ndarray) -> np.ndarray:
+def means(values):
     return 0.5 * (values[1:] + values[:-1])
 
 
-def test_rates_integrate_to_attitude(flight: Flight) -> None:
+def test_rates_integrate_to_attitude(flight):
     truth, dt = flight.truth, flight.truth.time[1]
     q = attitude(truth)
     steps = (q[:-1].inv() * q[1:]).as_rotvec()
     assert np.abs(steps - dt * means(truth["w"])).mean() < 1e-4
 
 
-def test_specific_force_integrates_to_velocity(flight: Flight) -> None:
+def test_specific_force_integrates_to_velocity(flight):
     truth, dt = flight.truth, flight.truth.time[1]
     a = attitude(truth).apply(truth["f"]) - [0.0, 0.0, GRAVITY]
     flown = truth["v"][0] + np.cumsum(dt * means(a), axis=0)
     assert np.abs(flown - truth["v"][1:]).max() < 0.1
 
 
-def test_sensors_have_noise_of_stated_size(flight: Flight) -> None:
+def test_sensors_have_noise_of_stated_size(flight):
     for channel, least, most in (
         ("w", 0.009, 0.05),
         ("f", 0.18, 0.85),
@@ -55,20 +54,20 @@ def test_sensors_have_noise_of_stated_size(flight: Flight) -> None:
     assert np.all((noise > 0.19) & (noise < 0.52))
 
 
-def test_seeds_reproduce() -> None:
+def test_seeds_reproduce():
     flights = [make_flight(seed, seconds=2.0) for seed in (5, 5, 6)]
     assert flights[0].log.sha256 == flights[1].log.sha256 != flights[2].log.sha256
     assert flights[0].kind in KINDS
 
 
-def test_hover_shows_little() -> None:
+def test_hover_shows_little():
     hover = make_flight(SEED, seconds=5.0, kind="hover")
     assert not is_shown(hover, frozenset({Change("w", "axes", "x -y z")}))
     assert is_shown(hover, frozenset({Change("v_bat", "scale", 1000.0)}))
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_fault_changes_only_its_channels(flight: Flight, name: str) -> None:
+def test_fault_changes_only_its_channels(flight, name):
     truth = FAULTS[name](np.random.default_rng(1), flight.log.time[1])
     faulty = inject(np.random.default_rng(1), flight, truth)
     named = {change.channel for change in truth}
@@ -83,7 +82,7 @@ def test_fault_changes_only_its_channels(flight: Flight, name: str) -> None:
     assert isinstance(is_shown(flight, truth), bool)
 
 
-def test_pairs_have_two_faults() -> None:
+def test_pairs_have_two_faults():
     rng = np.random.default_rng(1)
     for _ in range(30):
         name, truth = draw_pair(rng, 0.01)
@@ -92,7 +91,7 @@ def test_pairs_have_two_faults() -> None:
 
 
 @pytest.mark.parametrize("simulator", SIMULATORS, ids=lambda simulator: simulator.name)
-def test_simulators_fly_the_same_way(simulator: Simulator) -> None:
+def test_simulators_fly_the_same_way(simulator):
     layout, reference = simulator.layout, SIMULATORS[-1]
     assert reference.expected == frozenset()
     x = layout["x0"]

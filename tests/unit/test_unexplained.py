@@ -9,7 +9,7 @@ from flytrack_sysid.inference.chunks import NUM_AXES
 SHAPE = (6 * 20, 2, NUM_AXES, 2)  # rows, chunks, axes, direct and level
 
 
-def test_a_side_does_not_fit_what_the_other_side_determines() -> None:
+def test_a_side_does_not_fit_what_the_other_side_determines():
     """A thrust that makes a motor imbalance turn the drone does not explain the imbalance."""
     rng = np.random.default_rng(0)
     thrust, imbalance = np.zeros(SHAPE), np.zeros(SHAPE)
@@ -27,7 +27,7 @@ def test_a_side_does_not_fit_what_the_other_side_determines() -> None:
     assert test.noncentrality(columns, np.ones(1)) > 0.99 * information
 
 
-def test_what_wanders_on_one_side_is_told_beside_a_pattern_on_the_other(monkeypatch) -> None:
+def test_what_wanders_on_one_side_is_told_beside_a_pattern_on_the_other(monkeypatch):
     heading = unexplained.Dependence("heading", "force", 90.0, 0.5, np.zeros(0))
     wandering = {"rate": 0.4, "force": 0.3}
     monkeypatch.setattr(unexplained, "find_lines", lambda *_: [])
