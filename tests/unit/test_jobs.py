@@ -30,8 +30,8 @@ def test_a_job_that_crashes_or_raises_costs_itself_only():
 def test_a_job_that_hangs_is_ended_with_what_it_has_started(tmp_path, capfd):
     worker = Worker()
     assert worker.call(end_as, ("a",), 300.0) == Outcome("a")
-    found = worker.call(start_child, (tmp_path / "pid",), 2.0)
-    assert found == Outcome(None, "found no result after 2 s, the limit of a job")
+    outcome = worker.call(start_child, (tmp_path / "pid",), 2.0)
+    assert outcome == Outcome(None, "found no result after 2 s, the limit of a job")
     status = Path("/proc") / (tmp_path / "pid").read_text() / "stat"
     for _ in range(100):  # a killed process is gone, or a zombie
         if not status.exists() or ") Z " in status.read_text():

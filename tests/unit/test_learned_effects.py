@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from flytrack_env import make
 from flytrack_env.effects import LearnedLaw
@@ -44,41 +45,36 @@ def flown(effects, commands, drone=None):
     return np.asarray(flight, float)
 
 
-def acceleration(effect, **state):
-    """Return what effects add to the acceleration of one step, world frame."""
-    drone = drone_with(**state)
-    return (flown((effect,), held(), drone) - flown((), held(), drone))[0, 6:9]
-
-
 @pytest.mark.parametrize(
     ("scale", "spread", "coefficient"), [(1.0, 0.0, -2.0), (1.0, 1.0, -1.9), (0.5, 0.0, -1.0)]
 )
 def test_a_term_along_the_air_brakes_as_its_formula_says(scale, spread, coefficient):
-    found = acceleration(LearnedLaw(scale, spread, Law((DRAG,))), vel_w=(3.0, 0.0, 0.0))
-    np.testing.assert_allclose(found, [coefficient * math.exp(-0.5), 0.0, 0.0], atol=1e-4)
+    drone = drone_with(vel_w=(3.0, 0.0, 0.0))
+    effects = (LearnedLaw(scale, spread, Law((DRAG,))),)
+    acc_w = (flown(effects, held(), drone) - flown((), held(), drone))[0, 6:9]
+    assert_allclose(acc_w, [coefficient * math.exp(-0.5), 0.0, 0.0], atol=1e-4)
 
 
 def test_a_product_turns_the_drone():
     drone = drone_with(vel_w=(3.0, 0.0, 0.0))
     effects = (LearnedLaw(1.0, 0.0, Law((FLAP,))),)
-    plain, law = (flown(own, held(), drone)[0] for own in ((), effects))
+    plain, turned = flown((), held(), drone)[0], flown(effects, held(), drone)[0]
     thrust = plain[8] + NOMINAL.g
-    np.testing.assert_allclose(
-        law[13:16] - plain[13:16], [0.0, 0.01 * thrust * 3.0, 0.0], rtol=1e-4
-    )
+    expected = [0.0, 0.01 * thrust * 3.0, 0.0]
+    assert_allclose(turned[13:16] - plain[13:16], expected, rtol=1e-4)
 
 
 def test_time_since_the_start_acts():
     sticks = held(NUM_STEPS)
     flight = flown((LearnedLaw(1.0, 0.0, Law((WARM,))),), sticks) - flown((), sticks)
     expected = 3.0 * (1.0 - np.exp(-0.01 * np.arange(NUM_STEPS) / 0.05))
-    np.testing.assert_allclose(flight[:, 8], expected, atol=2e-3)
+    assert_allclose(flight[:, 8], expected, atol=2e-3)
 
 
 def test_neutral_and_empty_are_absent():
     plain = flown((), held(2))
     for effect in (LearnedLaw(0.0, 0.0, LAW), LearnedLaw(1.0)):
-        np.testing.assert_array_equal(flown((effect,), held(2)), plain)
+        assert_array_equal(flown((effect,), held(2)), plain)
 
 
 def extended():
@@ -98,14 +94,14 @@ def test_the_environment_flies_it_and_has_gradients():
     drone = drone_at((15.0, 2.0, 1.35), (-4.0, 0.0, 1.0))
     state = env.begin(drone, 0, env.default_params)
 
-    def flown(scale):
+    def speed(scale):
         """Return the speed after a step, and the observation."""
         model = env.default_params.model.with_effects(LearnedLaw(scale, 0.0, LAW))
         params = env.default_params.replace(model=model)
         after, *_ = env.advance(state, Action(0.0, 0.0, 0.0, 0.0), params)
         return env.drone(after).vel_w.norm(), env.observe(None, after, None, params)
 
-    slope, observation = jax.jit(jax.grad(flown, has_aux=True))(1.0)
+    slope, observation = jax.jit(jax.grad(speed, has_aux=True))(1.0)
     assert np.isfinite(observation).all() and np.isfinite(slope) and slope != 0.0
 
 

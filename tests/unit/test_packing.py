@@ -16,29 +16,26 @@ BATCH = {
     "time": np.array([0.25, -np.inf, 1e-40], np.float32),
 }
 WIDE = {**BATCH, "count": np.array([-(2**40), 1, 2]), "far": np.array([[0.1], [1e300], [-0.0]])}
+OVER_BATCHES = pytest.mark.parametrize("batch", [BATCH, WIDE], ids=["32 bits", "64 bits"])
 
 
-def assert_same_bits(found, expected):
-    assert (found.dtype, found.shape) == (expected.dtype, expected.shape)
-    assert found.tobytes() == expected.tobytes()
-
-
-@pytest.mark.parametrize("batch", [BATCH, WIDE], ids=["32 bits", "64 bits"])
+@OVER_BATCHES
 def test_every_bit_comes_back(batch):
     with jax.enable_x64(batch is WIDE):
         packed = jax.jit(pack)(batch)
-        again = jax.jit(lambda packed: from_words(packed.words, packed.layout).unpack())
-        unpacked = again(packed)
+        unpack = jax.jit(lambda packed: from_words(packed.words, packed.layout).unpack())
+        unpacked = jax.tree.map(np.asarray, unpack(packed))
     assert packed.words.dtype == WORD
     for name, leaf in batch.items():
-        assert_same_bits(np.asarray(unpacked[name]), leaf)
+        assert (unpacked[name].dtype, unpacked[name].shape) == (leaf.dtype, leaf.shape)
+        assert unpacked[name].tobytes() == leaf.tobytes()
     for name, leaf in packed.to_host().items():
         expected = batch[name].astype(HOST_DTYPES[batch[name].dtype.kind])
         assert leaf.flags.writeable and leaf.dtype == expected.dtype
         assert_array_equal(leaf, expected)
 
 
-@pytest.mark.parametrize("batch", [BATCH, WIDE], ids=["32 bits", "64 bits"])
+@OVER_BATCHES
 @pytest.mark.parametrize("index", range(3))
 def test_scalars_are_read_as_pythons_own(batch, index):
     scalars = {name: leaf[index : index + 1] for name, leaf in batch.items() if leaf.ndim == 1}

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid.diagnosis import joined
@@ -28,12 +29,12 @@ LOST = [(5,), (5, 6), (4, 6), (1,), (10,), (1, 10), (2, 5, 8)]
 def test_lost_rows_come_back_in_between(lost):
     whole = joined([ramp(), ramp(slope=-0.03)])
     filled = fill_gaps(joined([ramp(*lost), ramp(slope=-0.03)]))
-    np.testing.assert_allclose(filled.log.time, whole.time, atol=1e-12)
-    np.testing.assert_array_equal(filled.log.segment, whole.segment)
-    np.testing.assert_array_equal(np.flatnonzero(filled.source_row < 0), lost)
+    assert_allclose(filled.log.time, whole.time, atol=1e-12)
+    assert_array_equal(filled.log.segment, whole.segment)
+    assert_array_equal(np.flatnonzero(filled.source_row < 0), lost)
     for name in whole.channels:
-        np.testing.assert_allclose(filled.log[name], whole[name], atol=1e-12, err_msg=name)
-    np.testing.assert_allclose(filled.command_doubt, 0.0, atol=1e-12)
+        assert_allclose(filled.log[name], whole[name], atol=1e-12, err_msg=name)
+    assert_allclose(filled.command_doubt, 0.0, atol=1e-12)
     assert np.all(filled.behind[np.array(lost)] < np.array(lost))
 
 
@@ -44,4 +45,4 @@ def test_long_gap_begins_a_new_flight_and_jitter_is_no_gap():
     assert len(fill_gaps(ramp(*range(12, 20), rows=40)).log) == 40
     time = np.arange(40) * 0.01 + np.random.default_rng(0).uniform(-0.002, 0.002, 40)
     jittered = replace(ramp(rows=40), time=time)
-    np.testing.assert_array_equal(fill_gaps(jittered).log.time, time)
+    assert_array_equal(fill_gaps(jittered).log.time, time)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy import signal
 from scipy.optimize import brentq
 
@@ -24,11 +25,11 @@ MODEL = nominal_parameters()._replace(tau=TAU).with_effects(*NEUTRAL)
 
 
 def test_a_first_order_lag_takes_ln_2_of_its_time_constant_and_delays_add():
-    np.testing.assert_allclose(half_response_s(MODEL), TAU * np.log(2.0), atol=1e-5)
+    assert_allclose(half_response_s(MODEL), TAU * np.log(2.0), atol=1e-5)
     late = MODEL.with_effects(
         effects.CommandDelay(0.0137, 0.021, -0.02), effects.ThrustLagAsymmetry(2.0)
     )
-    np.testing.assert_allclose(
+    assert_allclose(
         half_response_s(late), TAU * np.log(2.0) + [0.0137, 0.0137, 0.0347, 0], atol=1e-5
     )
 
@@ -41,7 +42,7 @@ def test_a_second_order_behind_the_lag(lag_s, damping):
     model = MODEL.with_effects(effects.SecondOrderRates(pitch_s=lag_s, pitch_damping=damping))
     found, plain = half_response_s(model), TAU * np.log(2.0)
     assert found[1] == pytest.approx(time[np.argmax(risen >= 0.5)], abs=5e-5)
-    np.testing.assert_allclose(found[[0, 2, 3]], plain[[0, 2, 3]], atol=1e-5)
+    assert_allclose(found[[0, 2, 3]], plain[[0, 2, 3]], atol=1e-5)
 
 
 def test_a_limit_on_acceleration_delays_large_steps_only():
@@ -51,14 +52,14 @@ def test_a_limit_on_acceleration_delays_large_steps_only():
     half = brentq(lambda t: (t - tau * (1.0 - np.exp(-t / tau))) / full_s - 0.5, 0.0, full_s)
     assert full[0] == pytest.approx(half, abs=1e-4)
     assert small[0] == pytest.approx(tau * np.log(2.0), abs=3e-4)
-    np.testing.assert_allclose(full[1:3], small[1:3], atol=1e-5)  # the curve comes before the lag
+    assert_allclose(full[1:3], small[1:3], atol=1e-5)  # the curve comes before the lag
 
 
 def test_what_turns_the_drone_anyway_and_what_its_sensors_read_do_not_matter():
     still = MODEL.with_effects(
         effects.MotorImbalance(0.01, -0.02), effects.GyroScale(1.1, 0.9, 1.0)
     )
-    np.testing.assert_allclose(half_response_s(still), half_response_s(MODEL), atol=1e-7)
+    assert_allclose(half_response_s(still), half_response_s(MODEL), atol=1e-7)
 
 
 def test_a_drone_that_does_not_answer_has_no_time():

@@ -220,7 +220,6 @@ def test_what_the_model_itself_has_is_drawn_around_it():
 
 
 OK = RandomizationParams()
-LATE = CommandDelay(0.1)
 REFUSALS = [
     (
         DomainRandomization,
@@ -234,7 +233,7 @@ REFUSALS = [
     ),
     (
         DomainRandomization,
-        OK._replace(high=(LATE, *OK.high[1:])),
+        OK._replace(high=(CommandDelay(0.1), *OK.high[1:])),
         r"delay_s: found 0\.1, expected 0 to 0",
     ),
     (ActionDelay, CommandDelay(-0.01), r"delay_s: found -0\.01"),
@@ -264,15 +263,12 @@ def test_bad_arguments_are_refused():
 # --- Nothing survives an episode ------------------------------------------------------------------
 
 
-def step(keys, states, actions):
-    """Step a batch in every wrapper."""
-    env = wrapped(*ALL)
-    return steps_of(env)(
-        keys, states, jnp.asarray(actions, jnp.float32), arrays(env.default_params)
-    )
-
-
-POISONS = ("nan", "infinite", "huge", "random")
+POISONS = {
+    "nan": lambda values: np.nan * values,
+    "infinite": lambda values: np.inf * values,
+    "huge": lambda values: 3e38 * np.sign(values),
+    "random": lambda values: values,
+}
 LAST_STEP = wrapped().default_params.max_steps_in_episode - 1
 
 
@@ -286,10 +282,7 @@ def poisoned(states, poison, rng):
             return rng.random(leaf.shape) < 0.5
         if jnp.issubdtype(leaf.dtype, jnp.integer):
             return rng.integers(0, 1000, leaf.shape).astype(leaf.dtype)
-        values = rng.normal(size=leaf.shape)
-        infinite, huge = np.inf * values, 3e38 * np.sign(values)
-        fill = {"nan": np.nan, "infinite": infinite, "huge": huge}
-        return np.broadcast_to(fill.get(poison, values), leaf.shape).astype(leaf.dtype)
+        return POISONS[poison](rng.normal(size=leaf.shape)).astype(leaf.dtype)
 
     return jax.tree_util.tree_map_with_path(anything, states)
 
@@ -302,7 +295,8 @@ def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been():
     assert len(ends) == NUM_ENVS
     states, actions = before_ends(env, params, ends.values(), applied=applied)
     keys = jax.random.split(jax.random.key(7), NUM_ENVS)
-    observation, after, _, terminated, truncated, info = step(keys, states, actions)
+    step = steps_of(env)
+    observation, after, _, terminated, truncated, info = step(keys, states, actions, params)
     assert (terminated | truncated).all()
     chex.assert_trees_all_close((observation, after), resets_of(env)(keys, params), atol=1e-5)
     last = np.asarray(info["final_observation"])
@@ -314,8 +308,8 @@ def test_after_every_kind_of_end_an_episode_begins_as_if_nothing_had_been():
     # Bit for bit the same after another past, in which every number may be anything.
     rng = np.random.default_rng(0)
     for poison in POISONS:
-        poisoned_actions = rng.choice([0.3, 1.0, np.inf, np.nan], (NUM_ENVS, 4))
-        output = step(keys, poisoned(states, poison, rng), poisoned_actions)
+        actions = jnp.float32(rng.choice([0.3, 1.0, np.inf, np.nan], (NUM_ENVS, 4)))
+        output = step(keys, poisoned(states, poison, rng), actions, params)
         assert np.asarray(output[4]).all()
         chex.assert_trees_all_equal(output[:2], (observation, after))
 
