@@ -27,12 +27,17 @@ from tests.support.tables import table
 
 SECONDS = 40.0
 TRUE_DRAG = {"d_x": 0.4, "d_y": 0.4, "d_z": 0.2}
-DRAG = next(one for one in CANDIDATES if one.effect == "linear_drag")
-BIAS = next(one for one in CANDIDATES if one.effect == "accelerometer_bias")
-SCALE = next(one for one in CANDIDATES if one.effect == "rate_scale")
-DELAY = next(one for one in CANDIDATES if one.effect == "command_delay" and len(one.fields) > 2)
+BY_EFFECT = {candidate.effect: candidate for candidate in CANDIDATES}
+DRAG, BIAS = BY_EFFECT["linear_drag"], BY_EFFECT["accelerometer_bias"]
+SCALE, DELAY = BY_EFFECT["rate_scale"], BY_EFFECT["command_delay"]
 CIRCLE_S, RADIUS_M = 4.0, 1.0
 NO_SLOPES = np.zeros((0, 0, 0))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def in_float64():
+    with jax.enable_x64(True):
+        yield
 
 
 def build_problem(truth, log):
@@ -48,8 +53,7 @@ def refined(problem, log, vector, candidates, values, doubted=()):
         vector[problem.names.index(name)] = value
     base = FittedModel((), problem.start, 0.0, ())
     model = base._replace(candidates=candidates, vector=vector)
-    with jax.enable_x64(True):
-        return refine(SearchState(problem), base, model, log, held_out_rows(log), False, doubted)
+    return refine(SearchState(problem), base, model, log, held_out_rows(log), False, doubted)
 
 
 @pytest.fixture(scope="module")
@@ -57,41 +61,33 @@ def dragged():
     """A plant with drag, and a refined model that began with half of it and a bias nobody flew."""
     truth, log = scripted(3, SECONDS, effects={"linear_drag": TRUE_DRAG})
     values = {f"linear_drag.{name}": 0.5 * value for name, value in TRUE_DRAG.items()}
-    with jax.enable_x64(True):
-        problem = build_problem(truth, log)
     values |= {"accelerometer_bias.x": 0.3}
+    problem = build_problem(truth, log)
     return truth, log, problem, refined(problem, log, problem.start, (DRAG, BIAS), values)
 
 
 def test_values_are_refined_by_flights(dragged):
-    *_, problem, found = dragged
-    assert [one.effect for one in found.kept] == [
-        "linear_drag",
-        "accelerometer_bias",
-    ] and not found.removed
-    half_widths = dict(zip(found.fit.indices, found.fit.half_widths, strict=True))
+    *_, problem, refinement = dragged
+    fit, costs = refinement.fit, refinement.removal_costs
+    assert refinement.kept == (DRAG, BIAS) and not refinement.removed
+    half_widths = dict(zip(fit.indices, fit.half_widths, strict=True))
     for name, value in TRUE_DRAG.items():
-        place = problem.names.index(f"linear_drag.{name}")
-        assert abs(found.fit.vector[place] - value) < max(1.5 * half_widths[place], 0.05 * value)
-    assert (
-        found.fit.vector[problem.names.index("accelerometer_bias.x")] == 0.3
-    )  # no flight shows it
-    without = found.vector_without("accelerometer_bias", found.fit)
-    assert without[problem.names.index("accelerometer_bias.x")] == 0.0
-    assert (
-        found.removal_costs["linear_drag"] > 0.1 and "accelerometer_bias" not in found.removal_costs
-    )
-    assert found.flight_test.worst_ratio(found.fit.vector) < 1.0
+        index = problem.names.index(f"linear_drag.{name}")
+        assert abs(fit.vector[index] - value) < max(1.5 * half_widths[index], 0.05 * value)
+    bias = problem.names.index("accelerometer_bias.x")
+    assert fit.vector[bias] == 0.3  # no flight shows it
+    assert refinement.vector_without("accelerometer_bias", fit)[bias] == 0.0
+    assert costs["linear_drag"] > 0.1 and "accelerometer_bias" not in costs
+    assert refinement.flight_test.worst_ratio(fit.vector) < 1.0
 
 
 def test_models_are_compared_with_the_base_that_is_given(dragged):
-    problem, found = dragged[2], dragged[3]
-    right, wrong = found.fit.vector, problem.start
-    with jax.enable_x64(True):
-        flight_test = found.flight_test.with_base(right)
-        assert flight_test.worst_ratio(wrong) > 1.0
-        assert flight_test.prefers(right, wrong) and not flight_test.prefers(wrong, right)
-        assert not flight_test.with_base(wrong).prefers(right, wrong)  # none is worse
+    *_, problem, refinement = dragged
+    right, wrong = refinement.fit.vector, problem.start
+    flight_test = refinement.flight_test.with_base(right)
+    assert flight_test.worst_ratio(wrong) > 1.0
+    assert flight_test.prefers(right, wrong) and not flight_test.prefers(wrong, right)
+    assert not flight_test.with_base(wrong).prefers(right, wrong)  # none is worse
 
 
 @pytest.mark.parametrize(
@@ -103,23 +99,20 @@ def test_models_are_compared_with_the_base_that_is_given(dragged):
 )
 def test_what_flights_do_not_show_is_removed(dragged, candidate, values, doubted):
     _, log, problem, earlier = dragged
-    found = refined(problem, log, earlier.fit.vector, (DRAG, candidate), values, doubted)
-    assert [one.effect for one in found.kept] == ["linear_drag"]
-    assert found.removed == (candidate.effect,)
+    later = refined(problem, log, earlier.fit.vector, (DRAG, candidate), values, doubted)
+    assert later.kept == (DRAG,) and later.removed == (candidate.effect,)
 
 
 def test_a_lag_comes_back_when_the_effect_in_its_place_is_gone(dragged):
-    truth, log = scripted(3, 20.0, motion="fine")
-    with jax.enable_x64(True):
-        problem = build_problem(truth, log)
-        state, (roll,) = SearchState(problem), problem.parameter_indices(["tau_roll"])
-        vector = problem.start.copy()
-        vector[roll] = problem.low[roll]  # where no slope leads back
-        base = state.fitted((), problem.start)
-        selection = Selection(state, base, FittedModel((DRAG, BIAS), vector, 0.0, ()), {})
-        found = reduced(selection, dragged[-1]._replace(kept=(BIAS,), fit=None))
-    assert list(found.model.effects) == ["accelerometer_bias"] == list(found.ablations)
-    assert found.model.vector[roll] == pytest.approx(base.vector[roll], rel=0.01)
+    problem = build_problem(*scripted(3, 20.0, motion="fine"))
+    state, (roll,) = SearchState(problem), problem.parameter_indices(["tau_roll"])
+    vector = problem.start.copy()
+    vector[roll] = problem.low[roll]  # where no slope leads back
+    base = state.fitted((), problem.start)
+    selection = Selection(state, base, FittedModel((DRAG, BIAS), vector, 0.0, ()), {})
+    smaller = reduced(selection, dragged[-1]._replace(kept=(BIAS,), fit=None))
+    assert list(smaller.model.effects) == ["accelerometer_bias"] == list(smaller.ablations)
+    assert smaller.model.vector[roll] == pytest.approx(base.vector[roll], rel=0.01)
 
 
 def test_slopes_of_a_fit_lead_to_nearly_the_same_fit_without_an_effect(dragged):
@@ -129,13 +122,12 @@ def test_slopes_of_a_fit_lead_to_nearly_the_same_fit_without_an_effect(dragged):
     fields = problem.parameter_indices(DRAG.fields)
     remaining = [index for index in fit.indices if index not in fields]
     start = problem.at_start(fit.vector, DRAG.fields)
-    with jax.enable_x64(True):
-        whole = target.fitted(fit.vector, fit.indices, 10)
-        own, shared = (target.fitted(start, remaining, 2, nearby) for nearby in (None, whole))
-        before, of_whole, of_own, of_shared = (
-            target.losses(vector)[0].sum()
-            for vector in (start, whole.vector, own.vector, shared.vector)
-        )
+    whole = target.fitted(fit.vector, fit.indices, 10)
+    own, shared = (target.fitted(start, remaining, 2, nearby) for nearby in (None, whole))
+    before, of_whole, of_own, of_shared = (
+        target.losses(vector)[0].sum()
+        for vector in (start, whole.vector, own.vector, shared.vector)
+    )
     assert of_whole < 0.7 * of_own and of_own < before
     assert of_shared == pytest.approx(of_own, rel=0.02)
     columns = [whole.indices.index(index) for index in remaining]
@@ -151,8 +143,7 @@ def test_what_changes_no_flight_at_a_bound_goes_back(dragged):
     fit = dragged[3].fit._replace(vector=vector)
     is_fitted = np.ones(flight_test.scale.shape, bool)
     target = Target(problem, flight_test.windows, flight_test.scale, is_fitted)
-    with jax.enable_x64(True):
-        moved = [target.nearer_nominal(fit, field).vector for field in fields[1:]]
+    moved = [target.nearer_nominal(fit, field).vector for field in fields[1:]]
     assert -0.02 < moved[0][indices[1]] <= -0.01 and moved[1][indices[2]] == vector[indices[2]]
 
 
@@ -178,22 +169,20 @@ def test_flights_without_velocity_leave_the_thrust_of_single_steps():
     weak = crafts(thrust=[4.8] * 4)
     log = flown(weak, SECONDS).without("p", "v", "q")
     model = motor_model_of(crafts())
-    with jax.enable_x64(True):
-        problem = Problem.of(cut_chunks(log, ~held_out_rows(log), model), model)
-        vector = problem.start.copy()
-        vector[problem.names.index("motors.damping_x")] = 0.5
-        windows = sample_windows(log, held_out_rows(log))
-        damping = Candidate("motors", ("motors.load", "motors.damping_x"))
-        assert acting_effects(problem, vector, [damping], windows) == ("motors",)
-        vector[problem.names.index("motors.load")] = 0.1  # acts on force alone
-        assert acting_effects(problem, vector, [damping], windows) == ()
+    problem = Problem.of(cut_chunks(log, ~held_out_rows(log), model), model)
+    vector = problem.start.copy()
+    vector[problem.names.index("motors.damping_x")] = 0.5
+    windows = sample_windows(log, held_out_rows(log))
+    damping = Candidate("motors", ("motors.load", "motors.damping_x"))
+    assert acting_effects(problem, vector, [damping], windows) == ("motors",)
+    vector[problem.names.index("motors.load")] = 0.1  # acts on force alone
+    assert acting_effects(problem, vector, [damping], windows) == ()
     delay = Candidate("command_delay", ("command_delay.delay_s",))
-    found = refined(problem, log, problem.start, (delay,), {delay.fields[0]: 0.01})
-    thrust, radii = (
-        problem.parameter_indices(names) for names in (THRUST_COEFFS, ("motors.radius_x",))
-    )
-    np.testing.assert_array_equal(found.base[thrust], problem.start[thrust])
-    assert abs(found.base[radii] / problem.start[radii] - np.sqrt(6.0 / 4.8)) < 0.05
+    base = refined(problem, log, problem.start, (delay,), {delay.fields[0]: 0.01}).base
+    thrust = problem.parameter_indices(THRUST_COEFFS)
+    np.testing.assert_array_equal(base[thrust], problem.start[thrust])
+    radius = problem.names.index("motors.radius_x")
+    assert abs(base[radius] / problem.start[radius] - np.sqrt(6.0 / 4.8)) < 0.05
 
 
 @pytest.mark.parametrize("step_s", slow_but([0.01], [0.01, 0.005]))
@@ -201,13 +190,13 @@ def test_a_late_gyro_starts_flights_at_the_rates_of_their_time(step_s):
     """Rates are corrected by a late reading until it arrives, however many steps late."""
     late = {"imu_latency": {"latency_s": 3.7 * step_s}}
     truth, log = scripted(3, SECONDS, effects=late, step_s=step_s)
-    with jax.enable_x64(True):
-        problem, windows = build_problem(truth, log), sample_windows(log, held_out_rows(log))
-        late = problem.start.copy()
-        late[problem.names.index("imu_latency.latency_s")] = 3.7 * step_s
-        base, own = errors_at(problem, np.stack([problem.start, late]), windows).rms()
+    problem, windows = build_problem(truth, log), sample_windows(log, held_out_rows(log))
+    late = problem.start.copy()
+    late[problem.names.index("imu_latency.latency_s")] = 3.7 * step_s
+    base, corrected = errors_at(problem, np.stack([problem.start, late]), windows).rms()
     rates = QUANTITIES.index("rates")
-    assert np.all(own <= 1.05 * base) and np.all(own[:4, rates] < 0.8 * base[:4, rates])
+    assert np.all(corrected <= 1.05 * base)
+    assert np.all(corrected[:4, rates] < 0.8 * base[:4, rates])
 
 
 def circle():
@@ -230,25 +219,19 @@ def circle():
 
 
 def test_a_path_that_is_known_without_commands_is_no_evidence(dragged):
-    truth, log, *_ = dragged
-    with jax.enable_x64(True):
-        for one, is_evidence in ((circle(), False), (log, True)):
-            problem = build_problem(truth, one)
-            parts = (
-                sample_windows(one, rows) for rows in (~held_out_rows(one), held_out_rows(one))
-            )
-            flight_test = FlightTest.of(problem, *parts, problem.start)
-            assert flight_test.is_known[:3].all()
-            assert (
-                flight_test.matters.mean() > 0.5 if is_evidence else not flight_test.matters.any()
-            )
+    truth, commanded, *_ = dragged
+    for log, is_evidence in ((circle(), False), (commanded, True)):
+        problem, test_rows = build_problem(truth, log), held_out_rows(log)
+        windows = sample_windows(log, ~test_rows), sample_windows(log, test_rows)
+        flight_test = FlightTest.of(problem, *windows, problem.start)
+        assert flight_test.is_known[:3].all()
+        assert flight_test.matters.mean() > 0.5 if is_evidence else not flight_test.matters.any()
 
 
 def test_flights_without_evidence_settle_no_doubt(dragged):
-    truth, *_ = dragged
-    with jax.enable_x64(True):
-        problem = build_problem(truth, circle())
+    log = circle()
+    problem = build_problem(dragged[0], log)
     values = {f"linear_drag.{name}": value for name, value in TRUE_DRAG.items()}
-    found = refined(problem, circle(), problem.start, (DRAG,), values, ("linear_drag",))
-    assert found.flight_test.is_known.any() and not found.flight_test.matters.any()
-    assert found.fit is None and found.kept == (DRAG,)
+    refinement = refined(problem, log, problem.start, (DRAG,), values, ("linear_drag",))
+    assert refinement.flight_test.is_known.any() and not refinement.flight_test.matters.any()
+    assert refinement.fit is None and refinement.kept == (DRAG,)
