@@ -19,15 +19,12 @@ from flytrack_env.quaternion import Vec3
 from flytrack_env.state import Action
 from flytrack_sysid.inference.law_table import FRAMES, SIDES, TERMS_OF_SIDE, tabulated
 
-POWERS = [("power", (exponent, 70.0)) for exponent in EXPONENTS]  # no pole
-FACTORS = [
-    *(
-        Factor(quantity, shape, numbers)
-        for quantity in QUANTITIES
-        for shape, numbers in (*POWERS, ("bump", (0.5, 2.0)), ("step", (0.1, 0.7)))
-    ),
+SHAPES_OF_ALL = [("power", (exponent, 70.0)) for exponent in EXPONENTS]  # no pole
+SHAPES_OF_ALL += [("bump", (0.5, 2.0)), ("step", (0.1, 0.7))]
+FACTORS = [Factor(quantity, *shape) for quantity in QUANTITIES for shape in SHAPES_OF_ALL]
+FACTORS += [Factor("heading", "wave", (order, 0.4 * order)) for order in ORDERS]
+FACTORS += [
     Factor("time", "saturation", (3.0,)),
-    *(Factor("heading", "wave", (order, 0.4 * order)) for order in ORDERS),
     Factor("position", "place", (1.0, -2.0, 3.0, 4.0)),
 ]
 
@@ -50,13 +47,13 @@ def draw_moment(rng):
 def draw_law(rng, factors):
     """Return a law with a term for each factor or pair of factors, at random in all else."""
     terms = []
-    for number, own in enumerate(factors):
+    for number, factors_of_term in enumerate(factors):
         coefficients, errors = (tuple(rng.normal(size=3).tolist()) for _ in range(2))
         frame = FRAMES[rng.integers(len(FRAMES))]
         if frame == "air":
             coefficients, errors = (coefficients[0], 0.0, 0.0), (errors[0], 0.0, 0.0)
         acts = SIDES[number // TERMS_OF_SIDE]
-        terms.append(Term(acts, frame, tuple(own), coefficients, errors))
+        terms.append(Term(acts, frame, factors_of_term, coefficients, errors))
     return Law(tuple(terms))
 
 
@@ -77,11 +74,11 @@ def test_a_table_has_the_values_of_its_law_and_one_program_serves_all_laws():
     assert all(factor.quantity in factor.text() for factor in FACTORS)
     with jax.enable_x64(True):
         for first in range(0, len(FACTORS), 2 * TERMS_OF_SIDE):
-            own = FACTORS[first : first + 2 * TERMS_OF_SIDE]
-            pairs = [(one, FACTORS[rng.integers(len(FACTORS))]) for one in own]
+            part = FACTORS[first : first + 2 * TERMS_OF_SIDE]
+            pairs = [(factor, FACTORS[rng.integers(len(FACTORS))]) for factor in part]
             law = draw_law(rng, [pair[: 1 + number % 2] for number, pair in enumerate(pairs)])
             moment, table = draw_moment(rng), tabulated(LearnedLaw(1.0, 0.0, law)).law
-            found, expected = of_table(table, moment, 0.7), vectors_of(law, moment, 0.7)
+            result, expected = of_table(table, moment, 0.7), vectors_of(law, moment, 0.7)
             for acts in SIDES:
-                np.testing.assert_allclose(found[acts], expected[acts], rtol=1e-9, atol=1e-12)
+                np.testing.assert_allclose(result[acts], expected[acts], rtol=1e-9, atol=1e-12)
     assert of_table._cache_size() == 1

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from benchmarks.motor_craft import Pilot, State, advance, fly, hovering, speed_for
@@ -31,25 +32,23 @@ WHOLE = crafts(
 
 
 @pytest.fixture(autouse=True)
-def _float64():
+def in_float64():
     with jax.enable_x64(True):
         yield
 
 
-def _flight(model, start, commands, dt):
-    def one(state, command):
+@quick_jit
+def compiled_flight(model, start, commands, dt):
+    def step(state, command):
         moved = move(*state, unpack_action(command), dt, model)
         return moved[:2], pack(moved.after)
 
-    return jax.lax.scan(one, start, commands)[1]
+    return jax.lax.scan(step, start, commands)[1]
 
 
-_program = quick_jit(_flight)
-
-
-def _flown(model, start, commands, dt=DT):
-    """Return a flight."""
-    return np.asarray(_program(model, start, padded(commands), dt))[: len(commands)]
+def flight_of(model, start, commands, dt=DT):
+    """Return a flight's states, (num_steps, 21)."""
+    return np.asarray(compiled_flight(model, start, padded(commands), dt))[: len(commands)]
 
 
 def begun(model, state):
@@ -76,7 +75,7 @@ def begun(model, state):
 def both(craft, state, commands, dt=DT):
     """Return the states after each command of the NumPy craft, (n, 15 + 3), and of the model."""
     model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model_of(craft))
-    flown = _flown(model, begun(model, state), 2.0 * commands - 1.0, dt)
+    flown = flight_of(model, begun(model, state), 2.0 * commands - 1.0, dt)
     step_s, rows = (1e-4 if len(commands) < 10 else 1e-3), []
     for command in commands:
         for _ in range(round(dt / step_s)):
@@ -103,9 +102,9 @@ def test_a_hover_with_delayed_commands_stays_level():
     model = model.with_effects(effects.CommandDelay(0.02))
     drone, _ = begun(model_of(BALANCED), start)
     memories = effects.start_memories(model.effects, drone)
-    flown = _flown(model, (drone, memories), 2.0 * held(*[HOVER] * 4, steps=20) - 1.0)
-    np.testing.assert_allclose(flown[:, 13:16], 0.0, atol=1e-9)
-    np.testing.assert_allclose(flown[:, 3:6], 0.0, atol=1e-9)
+    flown = flight_of(model, (drone, memories), 2.0 * held(*[HOVER] * 4, steps=20) - 1.0)
+    assert_allclose(flown[:, 13:16], 0.0, atol=1e-9)
+    assert_allclose(flown[:, 3:6], 0.0, atol=1e-9)
     turning = drone._replace(applied=Action(0.2, -0.1, 0.1, 0.4))
     (past, spinning, *_), (stick_past,) = (
         effects.start_memories(of, turning) for of in (model.effects, (effects.CommandDelay(0.02),))
@@ -119,11 +118,11 @@ def test_each_motor_turns_the_craft_as_it_should(motor):
     commands = held(*[HOVER] * 4)
     commands[:, motor] += 0.2
     truth, flown = both(BALANCED, hovering(BALANCED), commands)
-    np.testing.assert_array_equal(
+    assert_array_equal(
         np.sign(flown[-1, 10:]),
         [(-1, -1, 1, 1)[motor], (1, -1, 1, -1)[motor], (1, -1, -1, 1)[motor]],
     )
-    np.testing.assert_allclose(flown, truth, atol=4e-4)
+    assert_allclose(flown, truth, atol=4e-4)
 
 
 def test_rotors_push_yaw_before_their_torque_and_precess():
@@ -131,12 +130,12 @@ def test_rotors_push_yaw_before_their_torque_and_precess():
     commands = held(HOVER + 0.2, HOVER - 0.2, HOVER - 0.2, HOVER + 0.2)
     truth, flown = both(spun, hovering(spun), commands)
     assert flown[-1, 12] > 0.1  # reaction of rotors that spin up, with no torque of the air at all
-    np.testing.assert_allclose(flown, truth, atol=2e-4)
+    assert_allclose(flown, truth, atol=2e-4)
     rolling = hovering(spun)._replace(
         rates=np.array([[5.0, 0.0, 0.0]]), speeds=np.array([[HOVER, 0.0, 0.0, HOVER]])
     )
     truth, flown = both(spun, rolling, held(HOVER, 0.0, 0.0, HOVER))
-    np.testing.assert_allclose(flown, truth, atol=2e-4)
+    assert_allclose(flown, truth, atol=2e-4)
     without = both(crafts(momentum=0.0, yaw_arm=0.0), rolling, held(HOVER, 0.0, 0.0, HOVER))[1]
     assert np.abs(flown - without)[-1, 11] > 0.1  # net momentum turns roll into pitch
 
@@ -147,23 +146,23 @@ def test_a_body_without_torque_keeps_momentum_and_energy():
     truth, flown = both(free, start, held(0, 0, 0, 0, steps=200))
     rates = np.concatenate([[[4.0, 3.0, 2.0]], flown[:, 10:]])
     energy = np.einsum("ni,ij,nj->n", rates, TILTED, rates)
-    np.testing.assert_allclose(energy, energy[0], rtol=1e-5)
+    assert_allclose(energy, energy[0], rtol=1e-5)
     turn = Rotation.from_quat(flown[:, 6:10], scalar_first=True)
     momentum = turn.apply(flown[:, 10:] @ TILTED)
-    np.testing.assert_allclose(momentum, np.tile(TILTED @ [4.0, 3.0, 2.0], (200, 1)), atol=2e-4)
-    np.testing.assert_allclose(flown[-1, 10:], truth[-1, 10:], atol=2e-3)
+    assert_allclose(momentum, np.tile(TILTED @ [4.0, 3.0, 2.0], (200, 1)), atol=2e-4)
+    assert_allclose(flown[-1, 10:], truth[-1, 10:], atol=2e-3)
 
 
 def test_motors_are_slower_down_than_up():
     model = model_of(crafts(up_s=0.02, down_s=0.08))
     start = begun(model, hovering(crafts()))
     up, down = (
-        _flown(model, start, 2.0 * held(*[end] * 4) - 1.0)[-1, 19]
+        flight_of(model, start, 2.0 * held(*[end] * 4) - 1.0)[-1, 19]
         for end in (HOVER + 0.2, HOVER - 0.2)
     )
     base = 2.0 * HOVER - 1.0
-    np.testing.assert_allclose(up - base, 0.4 * (1.0 - np.exp(-0.05 / 0.02)), rtol=1e-6)
-    np.testing.assert_allclose(down - base, -0.4 * (1.0 - np.exp(-0.05 / 0.08)), rtol=1e-6)
+    assert_allclose(up - base, 0.4 * (1.0 - np.exp(-0.05 / 0.02)), rtol=1e-6)
+    assert_allclose(down - base, -0.4 * (1.0 - np.exp(-0.05 / 0.08)), rtol=1e-6)
 
 
 def test_a_flown_minute_part_is_that_of_the_independent_craft_to_second_order():
@@ -180,7 +179,6 @@ def test_a_flown_minute_part_is_that_of_the_independent_craft_to_second_order():
 
 SETTINGS_OF_STICKS = [
     ("rate_scale.roll", effects.RateScale(roll=0.9)),
-    ("rate_expo.pitch", effects.RateExpo(pitch=0.3)),
     ("rate_saturation.yaw", effects.RateSaturation(yaw=0.2)),
     ("thrust_lag_asymmetry.ratio", effects.ThrustLagAsymmetry(1.5)),
     ("second_order_rates.roll_s", effects.SecondOrderRates(0.01)),

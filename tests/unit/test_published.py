@@ -30,16 +30,11 @@ def idsia_columns(log, t):
 
 
 def neurobem_columns(log, t):
-    vectors = {"pos": log["p"], "vel": log["v"], "ang vel": log["w"], "acc": log["f"]}
-    columns = {
-        f"{name} {axis}": values[:, index]
-        for name, values in vectors.items()
-        for index, axis in enumerate("xyz")
-    }
-    columns |= {f"quat {axis}": log["q"][:, index] for index, axis in enumerate("wxyz")}
+    names = [f"{name} {axis}" for name in ("pos", "vel", "ang vel", "acc") for axis in "xyz"]
+    names += ["quat w", "quat x", "quat y", "quat z", "mot 1", "mot 2", "mot 3", "mot 4"]
     speeds = 1500.0 * (log["u"] + 1.0)
-    columns |= {f"mot {motor + 1}": speeds[:, motor] for motor in range(4)}
-    return {"t": t, **columns, "vbat": np.full(len(t), BATTERY)}
+    values = np.column_stack([log["p"], log["v"], log["w"], log["f"], log["q"], speeds])
+    return {"t": t, **dict(zip(names, values.T, strict=True)), "vbat": np.full(len(t), BATTERY)}
 
 
 LAYOUTS = {
@@ -62,22 +57,20 @@ def write(folder, layout, seed, duration_s, noise):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_layout_is_read_as_it_is_documented(layout, tmp_path):
-    path, log = write(tmp_path, layout, 0, 3.0, 0.0)
-    found = import_log(path, "csv", layout)
-    assert found.log.has_motors and not found.problems
-    rows = np.searchsorted(LAYOUTS[layout][1] * np.arange(len(log)), found.log.time + 1e-9) - 1
-    for name in found.log.channels:
-        if name in log:
-            size = max(np.ptp(log[name]), 1.0)
-            np.testing.assert_allclose(
-                np.abs(found.log[name]), np.abs(log[name][rows]), atol=2e-3 * size, err_msg=name
-            )
-    starts = start_rows(found.log)
-    naive, kinematic = (
-        errors_of(found.log, starts, of(found.log, starts)) for of in (held, drifting)
-    )
+    path, truth = write(tmp_path, layout, 0, 3.0, 0.0)
+    imported = import_log(path, "csv", layout)
+    log = imported.log
+    assert log.has_motors and not imported.problems
+    rows = np.searchsorted(LAYOUTS[layout][1] * np.arange(len(truth)), log.time + 1e-9) - 1
+    for name, values in log.channels.items():
+        if name in truth:
+            expected, size = np.abs(truth[name][rows]), max(np.ptp(truth[name]), 1.0)
+            np.testing.assert_allclose(np.abs(values), expected, atol=2e-3 * size, err_msg=name)
+    starts = start_rows(log)
+    naive = errors_of(log, starts, held(log, starts))
+    kinematic = errors_of(log, starts, drifting(log, starts))
     assert kinematic.position < naive.position and kinematic.rates == naive.rates
-    steps = np.linalg.norm(found.log["p"][starts + HORIZON] - found.log["p"][starts], axis=1)
+    steps = np.linalg.norm(log["p"][starts + HORIZON] - log["p"][starts], axis=1)
     assert 0.3 * HORIZON * steps.mean() < naive.position < HORIZON * steps.mean()
 
 
@@ -95,8 +88,8 @@ def test_the_truth_of_a_dry_run_is_found(layout, tmp_path):
     expected = dict(zip(("radius_x", "radius_y", "radius_z"), radii, strict=True))
     expected |= {"up_s": craft.up_s[0], "down_s": craft.down_s[0]}
     for name, value in expected.items():
-        found = result.intervals[f"motors.{name}"]
-        assert found.low < value < found.high, name
+        interval = result.intervals[f"motors.{name}"]
+        assert interval.low < value < interval.high, name
     drag = result.intervals["linear_drag.d_x"]
     assert drag.value == pytest.approx(craft.drag[0, 0] / craft.mass[0], rel=0.02)
     assert np.all(np.array(result.errors["motors"]) < 0.35 * np.array(result.errors["drifting"]))
