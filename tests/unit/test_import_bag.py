@@ -33,7 +33,8 @@ TYPES = get_typestore(Stores.ROS2_HUMBLE)
 
 def made(kind, *values):
     """Return a message, by the short name of its type."""
-    return next(one for name, one in TYPES.types.items() if name.endswith(f"/{kind}"))(*values)
+    (message_type,) = (TYPES.types[name] for name in TYPES.types if name.endswith(f"/{kind}"))
+    return message_type(*values)
 
 
 def motion(time):

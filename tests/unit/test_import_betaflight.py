@@ -25,9 +25,9 @@ STEP_S = 500e-6
 CASES = table("betaflight_headers")
 
 
-def frames(num_rows=200):
+def frames():
     """Return frames of a steady turn, the throttle rising."""
-    return frames_of(flying(num_rows, STEP_S))
+    return frames_of(flying(200, STEP_S))
 
 
 def standing():

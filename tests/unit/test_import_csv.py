@@ -79,13 +79,14 @@ def test_rows_are_chosen_and_files_become_segments(folder, tmp_path):
     rows = "[rows]\nevery = 2\nfrom_s = 0.2\n"
     manifest = '[rows.manifest]\nfile = "list.csv"\nkey = "name"\ncount = "good"\n'
     (tmp_path / "map.toml").write_text(MAPPING + rows + manifest)
-    found = import_log([tmp_path / "one.csv", tmp_path / "two.csv"], "csv", tmp_path / "map.toml")
-    assert_allclose(found.log.time[:40], 0.01 * np.arange(20, 100, 2))
-    assert found.log.segment.tolist() == [0] * 40 + [1] * 20
-    assert [Path(source).name for source in found.sources] == ["one.csv", "two.csv"]
+    arguments = [tmp_path / "one.csv", tmp_path / "two.csv"], "csv", tmp_path / "map.toml"
+    imported = import_log(*arguments)
+    assert_allclose(imported.log.time[:40], 0.01 * np.arange(20, 100, 2))
+    assert imported.log.segment.tolist() == [0] * 40 + [1] * 20
+    assert [Path(source).name for source in imported.sources] == ["one.csv", "two.csv"]
     (tmp_path / "list.csv").write_text("name,good\none.csv,100\n")
     with pytest.raises(LogError, match=r"list\.csv: columns name and good: two\.csv: missing"):
-        import_log([tmp_path / "one.csv", tmp_path / "two.csv"], "csv", tmp_path / "map.toml")
+        import_log(*arguments)
 
 
 @pytest.mark.parametrize(("old", "new", "message"), table("csv_mappings")["refused"])

@@ -153,6 +153,7 @@ def test_slow_topics_and_another_craft_are_noted(topics, read):
     ("mav_type", "message"),
     [
         (1, r"found a log of a plane \(MAV_TYPE\), expected one of a multi"),
+        (10, r"found a log of a rover \(MAV_TYPE\), expected one of a multi"),
         (4, r"full stick is unknown; found a helicopter \(MAV_TYPE 4\), not a quad"),
     ],
 )

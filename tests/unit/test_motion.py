@@ -136,5 +136,5 @@ def test_late_readings_are_those_of_a_moment_within_a_step(late_ms):
     _, gyro, felt = flown(smooth.with_effects(effects.ImuLatency(1e-3 * late_ms)), 1e-2)
     _, true_gyro, true_felt = flown(smooth, 1e-3)
     then = np.arange(3, len(gyro)) * 10 + 9 - late_ms
-    for found, true in ((gyro[3:], true_gyro[then]), (felt[3:], true_felt[then])):
-        assert np.abs(found - true).max() < 0.002 * np.abs(np.diff(true, axis=0)).max()
+    for reading, true in ((gyro[3:], true_gyro[then]), (felt[3:], true_felt[then])):
+        assert np.abs(reading - true).max() < 0.002 * np.abs(np.diff(true, axis=0)).max()

@@ -37,18 +37,18 @@ def log():
 
 
 @pytest.fixture(scope="module")
-def found(log, tmp_path_factory):
+def imported(log, tmp_path_factory):
     """The log as it is imported."""
-    path, map_file = write_csv(tmp_path_factory.mktemp("found"), log)
+    path, map_file = write_csv(tmp_path_factory.mktemp("imported"), log)
     return import_log(path, "csv", map_file)
 
 
-def test_motors_of_a_table_become_commands_of_a_craft(log, found, tmp_path):
-    assert found.log.has_motors and not found.problems
-    np.testing.assert_allclose(found.log["u"], log["u"], atol=1e-9)
-    again = through_file(found.log, tmp_path / "log.npz")
-    assert again.has_motors and again.sha256 == found.log.sha256
-    model = found.nominal_model()
+def test_motors_of_a_table_become_commands_of_a_craft(log, imported, tmp_path):
+    assert imported.log.has_motors and not imported.problems
+    np.testing.assert_allclose(imported.log["u"], log["u"], atol=1e-9)
+    again = through_file(imported.log, tmp_path / "log.npz")
+    assert again.has_motors and again.sha256 == imported.log.sha256
+    model = imported.nominal_model()
     truth = model_of(crafts()).effect("motors")
     motors = model.effect("motors")
     for name in ("front_y", "rear_y", "radius_x", "radius_y", "radius_z", "yaw_arm", "down_s"):
@@ -71,8 +71,8 @@ def test_stated_numbers_replace_those_of_a_known_craft_whatever_they_are(monkeyp
     frame = Frame(craft="crazyflie_2", **stated).known()
     assert frame.motors(0.028).yaw_arm == 0.00596
     unstated = {name: getattr(known, name) for name in ("front_m", "rear_m", "yaw_arm_m")}
-    for one in (frame, Frame(**unstated, inertia_kg_m2=known.inertia_kg_m2)):
-        motors = one.motors(0.028)
+    for craft in (frame, Frame(**unstated, inertia_kg_m2=known.inertia_kg_m2)):
+        motors = craft.motors(0.028)
         assert (motors.up_s, motors.down_s, motors.rotor_momentum) == (0.03, 0.03, 0.0)
 
 
@@ -93,12 +93,12 @@ def test_a_known_crafts_mass_and_inertia_are_not_replaced_in_silence(log, tmp_pa
     assert not warnings()
 
 
-def test_a_model_of_another_mass_than_the_mapping_states_is_doubted(found):
+def test_a_model_of_another_mass_than_the_mapping_states_is_doubted(imported):
     def doubts(model):
-        return [note for note in validate(model, found.log).notes if note.startswith("mass:")]
+        return [note for note in validate(model, imported.log).notes if note.startswith("mass:")]
 
-    model = found.nominal_model()
-    assert found.log.stated_mass_kg == 0.8 and not doubts(model)
+    model = imported.nominal_model()
+    assert imported.log.stated_mass_kg == 0.8 and not doubts(model)
     (note,) = doubts(model._replace(m=0.9))
     assert "states 0.8 kg, and the model 0.9 kg, which is used" in note
 
@@ -159,16 +159,16 @@ def test_a_motor_that_stands_still_is_named(log, tmp_path):
 def test_the_order_of_motors_is_found_and_corrected(log, tmp_path, order):
     columns = [COLUMNS[motor] for motor in order]
     swapped = with_channels(log, u=log["u"][:, list(order)])
-    found = check_log(swapped)
-    assert "u and w" not in {pair.name for pair in (*found.pairs, *found.after)}
+    check = check_log(swapped)
+    assert "u and w" not in {pair.name for pair in (*check.pairs, *check.after)}
     if order == (0, 1, 2, 3):
-        assert not found.contradicts
+        assert not check.contradicts
         return
     held = " ".join(str(motor + 1) for motor in order)
-    assert f"hold motors {held}, read as 1 2 3 4" in text_of(found)
+    assert f"hold motors {held}, read as 1 2 3 4" in text_of(check)
     assert any("hold motors" in problem for problem in find_problems(swapped))
     _, map_file = write_csv(tmp_path, log, columns)
-    fixed = fix_mapping(map_file.read_text(), found.explanations[0])
+    fixed = fix_mapping(map_file.read_text(), check.explanations[0])
     assert not fixed.left and parse_toml(fixed.text)["motors"]["columns"] == COLUMNS
 
 

@@ -40,9 +40,9 @@ def test_a_second_order_behind_the_lag(lag_s, damping):
     both = np.polymul([TAU[1], 1.0], [1.0 / frequency**2, lag_s, 1.0])
     time, risen = signal.step(([1.0], both), T=np.linspace(0.0, 0.3, 30001))
     model = MODEL.with_effects(effects.SecondOrderRates(pitch_s=lag_s, pitch_damping=damping))
-    found, plain = half_response_s(model), TAU * np.log(2.0)
-    assert found[1] == pytest.approx(time[np.argmax(risen >= 0.5)], abs=5e-5)
-    assert_allclose(found[[0, 2, 3]], plain[[0, 2, 3]], atol=1e-5)
+    times_s, plain_s = half_response_s(model), TAU * np.log(2.0)
+    assert times_s[1] == pytest.approx(time[np.argmax(risen >= 0.5)], abs=5e-5)
+    assert_allclose(times_s[[0, 2, 3]], plain_s[[0, 2, 3]], atol=1e-5)
 
 
 def test_a_limit_on_acceleration_delays_large_steps_only():
@@ -63,5 +63,5 @@ def test_what_turns_the_drone_anyway_and_what_its_sensors_read_do_not_matter():
 
 
 def test_a_drone_that_does_not_answer_has_no_time():
-    found = half_response_s(MODEL._replace(thrust_coeffs=np.zeros(6)))
-    assert np.isnan(found[3]) and np.isfinite(found[:3]).all()
+    times_s = half_response_s(MODEL._replace(thrust_coeffs=np.zeros(6)))
+    assert np.isnan(times_s[3]) and np.isfinite(times_s[:3]).all()
