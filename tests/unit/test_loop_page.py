@@ -1,7 +1,5 @@
 """The pages of the loop's benchmark are made of the records beside them."""
 
-import json
-
 import pytest
 
 from benchmarks.loop.__main__ import main
@@ -22,8 +20,6 @@ def test_records_come_back(tmp_path):
     longer = [{**result, "cpu_s": 1.0} for result in results]  # what the page does not use
     write_records(tmp_path / "loop.jsonl", longer, about)
     assert read_records(tmp_path / "loop.jsonl") == (about, results)
-    with (tmp_path / "loop.jsonl").open() as lines:
-        assert all(json.loads(line) for line in lines)
 
 
 def test_a_part_of_a_true_name_is_a_false_name():
