@@ -8,7 +8,6 @@ sticks and motors of Betaflight are compared with the settings in its logs. Flig
 ``benchmarks.real.crazyflie.DATA``.
 """
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -197,8 +196,7 @@ def controllers() -> dict[str, Any]:
                 "integral": integral / gain,
                 "derivative": derivative / gain,
             }
-        edges = np.linspace(0, len(log), num_parts + 1).astype(int)
-        parts = [log.select(slice(*pair)) for pair in itertools.pairwise(edges)]
+        parts = [log.select(rows) for rows in np.array_split(np.arange(len(log)), num_parts)]
         loops, *of_parts = (
             identify_loops(part, model, held_out_rows(part)) for part in (log, *parts)
         )

@@ -216,8 +216,9 @@ def test_limited_outputs_of_motors_are_shares_of_the_protocols_range(read, ends,
     names = [*NAMES, *(f"motor[{number}]" for number in range(4))]
     motors = 1100 + np.arange(200)[:, None] + np.arange(4)
     log = log_with(np.column_stack([frames(), motors]), names, motorOutput=ends)
-    commands = read(log, mapping="[motors]\nas_command = true\n", align=False).log["u"]
-    assert_allclose(commands[0], 2.0 * (motors[0] - off) / (full - off) - 1.0)
+    of_motors = read(log, mapping="[motors]\nas_command = true\n", align=False).log
+    assert_allclose(of_motors["u"][0], 2.0 * (motors[0] - off) / (full - off) - 1.0)
+    assert_allclose(of_motors["sticks"], read(log, align=False).log["u"])
 
 
 @pytest.mark.parametrize(

@@ -139,8 +139,13 @@ def with_outputs(messages, every=1):
 )
 def test_motors_are_commands_in_our_order(messages, read, parameters, shares):
     log = read(with_outputs(messages), OF_MOTORS, parameters=parameters).log
-    assert log.has_motors
+    assert log.has_motors and "sticks" not in log  # full stick is not known
     np.testing.assert_allclose(log["u"][0], 2.0 * np.array(shares) - 1.0, atol=3e-3)
+
+
+def test_sticks_are_kept_beside_motors(messages, read):
+    of_motors = read(with_outputs(messages), OF_MOTORS).log
+    np.testing.assert_allclose(of_motors["sticks"], read(messages).log["u"])
 
 
 @pytest.mark.parametrize(

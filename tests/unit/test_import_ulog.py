@@ -207,6 +207,11 @@ def test_motors_are_commands_in_our_order(topics, read, parameters, shares):
     assert_allclose(log["u"][0], 2.0 * np.array(shares) - 1.0, atol=3e-3)
 
 
+def test_sticks_are_kept_beside_motors(topics, read):
+    of_motors = read(with_motors(topics), mapping=OF_MOTORS).log
+    assert_allclose(of_motors["sticks"], read(topics).log["u"])
+
+
 @pytest.mark.parametrize(
     ("every", "parameters", "frame", "message"),
     [

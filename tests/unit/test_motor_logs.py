@@ -55,6 +55,29 @@ def test_motors_of_a_table_become_commands_of_a_craft(log, imported, tmp_path):
         assert getattr(motors, name) == pytest.approx(getattr(truth, name), rel=1e-6)
 
 
+COMMANDS = """
+[command]
+columns = ["w0", "w1", "w2", "f2"]
+low = [-10, -10, -10, -100]
+high = [10, 10, 10, 100]
+clip = true
+"""
+
+
+def test_sticks_of_a_table_are_kept_where_full_stick_is_known(log, tmp_path):
+    path, map_file = write_csv(tmp_path, log)
+    text = map_file.read_text() + COMMANDS
+    map_file.write_text(text)
+    flight = import_log(path, "csv", map_file)
+    assert "sticks" not in flight.log
+    (note,) = (note for note in flight.notes if "sticks are left out" in note)
+    assert "craft.max_rate_deg_s: missing" in note
+    map_file.write_text(text.replace("[craft]", "[craft]\nmax_rate_deg_s = [500, 500, 200]"))
+    kept = through_file(import_log(path, "csv", map_file).log, tmp_path / "log.npz")
+    np.testing.assert_allclose(kept["sticks"][:, :3], np.clip(0.1 * log["w"], -1.0, 1.0))
+    np.testing.assert_allclose(kept["u"], log["u"], atol=1e-9)
+
+
 def test_a_known_craft_has_a_frame_that_a_mapping_may_change(log, tmp_path):
     path, map_file = write_csv(tmp_path, log, frame='craft = "iris"\npropellers = "out"')
     motors = import_log(path, "csv", map_file).nominal_model().effect("motors")
