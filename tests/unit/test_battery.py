@@ -13,21 +13,20 @@ from flytrack_sysid.importing.flight import Craft
 from tests.support.coasting import Coasting
 from tests.support.slow import slow_but
 
-HANDOUT = Battery()
 CELL_V = (3.4, 4.2)
 MASS_KG = {1: 0.032, 4: 0.6, 6: 0.75}  # by cells: a whoop, a freestyle quadcopter, a racer
 NUM_STARTS = 256
 BATTERY_ROW = 22  # of the observation
 
 
-def craft_model(cells, mass_kg):
+def craft_model(cells):
     volts = (CELL_V[0] * cells, CELL_V[1] * cells)
-    return Craft((800.0, 800.0, 500.0), mass_kg, volts).nominal_model("a test")
+    return Craft((800.0, 800.0, 500.0), MASS_KG[cells], volts).nominal_model("a test")
 
 
 @pytest.mark.parametrize("cells", slow_but([4], MASS_KG))
 def test_episodes_stay_within_the_battery_of_the_craft(cells):
-    model = craft_model(cells, MASS_KG[cells])
+    model = craft_model(cells)
     assert model.battery == Battery(4.2 * cells, 3.4 * cells, 3.4 * cells, 4.2 * cells)
     env, params = gymnax.make("FlyTrack-v0", model=model, plant=Coasting())
     keys = jax.random.split(jax.random.key(0), NUM_STARTS)
@@ -41,7 +40,7 @@ def test_episodes_stay_within_the_battery_of_the_craft(cells):
 
 
 def test_an_episode_ends_at_the_empty_voltage_of_its_craft():
-    env = FlyTrack(model=craft_model(4, 0.6), plant=Coasting())
+    env = FlyTrack(model=craft_model(4), plant=Coasting())
     params = env.default_params
     drone, gate = env.sample_start(jnp.uint32(0), params)
     for volts, is_empty in ((13.61, False), (13.59, True)):
@@ -51,7 +50,7 @@ def test_an_episode_ends_at_the_empty_voltage_of_its_craft():
 
 
 def test_gymnasium_takes_the_voltages_of_the_craft():
-    craft = {"model": craft_model(1, 0.032), "plant": Coasting()}
+    craft = {"model": craft_model(1), "plant": Coasting()}
     env = gymnasium.make("flytrack_env:FlyTrack-v0", **craft).unwrapped
     observation, _ = env.reset(seed=0, options={"battery_v": 4.2})
     assert observation[BATTERY_ROW] == pytest.approx(1.0, abs=1e-4)
@@ -60,9 +59,9 @@ def test_gymnasium_takes_the_voltages_of_the_craft():
 
 
 def test_a_battery_beyond_the_fit_is_warned_of_or_refused():
-    model = craft_model(4, 0.6)
+    model = craft_model(4)
     near = model.battery._replace(fitted_low_v=16.0)
     with pytest.warns(BatteryWarning, match=r"fitted at 16 to 16.8 V.*from 13.6 to 16.8 V"):
         FlyTrack(model=model._replace(battery=near))
     with pytest.raises(ValueError, match=r"fitted at 22 to 24 V.*from 13.6 to 16.8 V"):
-        FlyTrack(model=model._replace(battery=HANDOUT._replace(full_v=16.8, empty_v=13.6)))
+        FlyTrack(model=model._replace(battery=Battery(full_v=16.8, empty_v=13.6)))

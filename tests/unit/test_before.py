@@ -46,10 +46,10 @@ def test_thrusts_that_are_not_shared_are_each_compared_with_the_model(estimate, 
     """No curve is read where its log has no commands: the factors of both are divided."""
     later, earlier = estimate(-0.3, 1.2), estimate(0.6, 0.4)
     marginal = SimpleNamespace(half_widths=lambda weights: np.array([half_n]))
-    found = scaled_thrust("thrust_scale", later, earlier, Change(None, (marginal, marginal)))
-    assert bool(found) == is_told
+    change = Change(None, (marginal, marginal))
+    values = scaled_thrust("thrust_scale", later, earlier, change)
+    assert bool(values) == is_told
     if is_told:
-        assert found["factor"].value == pytest.approx(3.0)
-        assert found["factor"].ci95[0] < 2.5  # the curve of the model may have a wrong exponent
-    unchanged = Change(None, (marginal, marginal))
-    assert scaled_thrust("thrust_scale", later, later, unchanged) == {}
+        assert values["factor"].value == pytest.approx(3.0)
+        assert values["factor"].ci95[0] < 2.5  # the curve of the model may have a wrong exponent
+    assert scaled_thrust("thrust_scale", later, later, change) == {}

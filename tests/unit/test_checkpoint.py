@@ -9,10 +9,12 @@ import pytest
 import safetensors.numpy
 
 from baselines.purejaxrl_ppo import CheckpointError, Config, load_checkpoint, make_network
-from baselines.purejaxrl_ppo import checkpoint as checkpoint_module
 from baselines.purejaxrl_ppo.checkpoint import (
+    FORMAT,
     as_named_arrays,
+    check_same_run,
     checksum,
+    describe_run,
     observation_layout,
     save_checkpoint,
 )
@@ -56,12 +58,7 @@ def test_round_trip(path, params):
     assert checkpoint.config == CONFIG
     assert (checkpoint.env_id, checkpoint.track) == ("FlyTrack-v0", "flytrack")
     for name, array in TRAINING.items():
-        loaded = checkpoint.training[name]
-        assert (loaded.dtype, loaded.shape, loaded.tobytes()) == (
-            array.dtype,
-            array.shape,
-            array.tobytes(),
-        )
+        np.testing.assert_array_equal(checkpoint.training[name], array, strict=True)
     checkpoint.check_fits(FlyTrack())
 
 
@@ -92,29 +89,30 @@ def test_observations_that_do_not_fit_are_refused(tmp_path, params):
 def test_a_run_of_an_older_version_continues(tmp_path, params):
     """Its file calls the Euler step by the old name."""
     path = tmp_path / "a.safetensors"
-    now = checkpoint_module.describe_run(FlyTrack(), "FlyTrack-v0", "flytrack", CONFIG, 0)
+    now = describe_run(FlyTrack(), "FlyTrack-v0", "flytrack", CONFIG, 0)
     old = {**now, "model": {**now["model"], "motion": "handout"}}
     save_checkpoint(path, params, CONFIG, old, TRAINING)
-    checkpoint_module.check_same_run(load_checkpoint(path), now)
+    check_same_run(load_checkpoint(path), now)
     other = {**now, "model": {**now["model"], "motion": "continuous"}}
     with pytest.raises(CheckpointError, match=r"model\.motion: found 'euler'"):
-        checkpoint_module.check_same_run(load_checkpoint(path), other)
+        check_same_run(load_checkpoint(path), other)
 
 
-@pytest.mark.parametrize("trained", ["sticks", "motors"])
-def test_policies_of_other_commands_are_refused(tmp_path, params, trained):
-    ids = {"sticks": "FlyTrack-v0", "motors": "FlyTrackMotors-v0"}
-    envs = {commands: make(env_id) for commands, env_id in ids.items()}
-    model = json.loads(json.dumps(model_as_json(envs[trained].default_params.model)))
-    description = {**DESCRIPTION, "env_id": ids[trained], "model": model}
+IDS = {"sticks": "FlyTrack-v0", "motors": "FlyTrackMotors-v0"}
+
+
+@pytest.mark.parametrize(("trained", "other"), [("sticks", "motors"), ("motors", "sticks")])
+def test_policies_of_other_commands_are_refused(tmp_path, params, trained, other):
+    env = make(IDS[trained])
+    model = model_as_json(env.default_params.model)
+    description = {**DESCRIPTION, "env_id": IDS[trained], "model": model}
     save_checkpoint(tmp_path / "d.safetensors", params, CONFIG, description)
     checkpoint = load_checkpoint(tmp_path / "d.safetensors")
-    checkpoint.check_fits(envs.pop(trained))
-    ((other, env),) = envs.items()
+    checkpoint.check_fits(env)
     with pytest.raises(
         CheckpointError, match=f"commands {trained} .*, expected one that commands {other}"
     ):
-        checkpoint.check_fits(env)
+        checkpoint.check_fits(make(IDS[other]))
 
 
 @pytest.mark.parametrize(
@@ -140,9 +138,9 @@ def test_what_is_not_a_checkpoint_is_refused(tmp_path, content, reason):
 
 def test_every_flipped_bit_is_noticed(path):
     whole = path.read_bytes()
-    for place in np.random.default_rng(0).integers(0, len(whole), 50):
+    for index in np.random.default_rng(0).integers(0, len(whole), 50):
         damaged = bytearray(whole)
-        damaged[place] ^= 1 << int(place % 8)
+        damaged[index] ^= 1 << int(index % 8)
         path.write_bytes(bytes(damaged))
         with pytest.raises(CheckpointError, match=r"a\.safetensors"):
             load_checkpoint(path)
@@ -154,7 +152,7 @@ def test_descriptions_that_cannot_be_used_are_refused(path, params, name, value,
     if name == "factor":
         arrays = {key: np.float32(value) * array for key, array in arrays.items()}
     meta = {
-        "format": checkpoint_module.FORMAT,
+        "format": FORMAT,
         "config": {"hidden_sizes": [8]},
         **DESCRIPTION,
         name: value,

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import nominal_parameters
@@ -20,15 +21,15 @@ SAME = HandoutPlant(NOMINAL.tau, NOMINAL.thrust_coeffs, NOMINAL.max_rate)
 @pytest.mark.parametrize("plant", [SAME, Simulator()], ids=["function", "plant"])
 def test_log_is_what_the_plant_did(plant):
     """Each row follows from the row before under that row's command, accelerations included."""
-    done = []
-    log = collect(plant, minutes=1.0, seed=2, report=lambda *counts: done.append(counts))
+    reports = []
+    log = collect(plant, minutes=1.0, seed=2, report=lambda *counts: reports.append(counts))
     # Of a function, one flight is flown after the other.
-    assert done == [(number + 1, 24) for number in range(24) if plant is SAME]
+    assert reports == [(number + 1, 24) for number in range(24) if plant is SAME]
     assert log.time.max() <= 2.5 and len(log) > 0.8 * 6000
     x = states_of(log)
     after = SAME(x[:-1], log["u"][:-1])
     inside = ~log.is_start()[1:]
-    np.testing.assert_allclose(x[1:][inside], after[inside], atol=2e-5)
+    assert_allclose(x[1:][inside], after[inside], atol=2e-5)
     first = np.flatnonzero(log.is_start())
     assert np.abs(log["a"][first]).max() > 0.1, "the first row's acceleration is the plant's"
 
@@ -43,13 +44,13 @@ def test_envelope_cuts_a_plant_of_huge_thrust():
     assert len(lengths) == 24 and lengths.min() < 250, "some flights are cut, and none is dropped"
 
 
-def broken(**parts):
-    """Return a step function of the handout's plant with a value replaced after 0.3 s of flight."""
+def broken(index, value):
+    """Return a step of the handout's plant with a component of the state replaced in flight."""
 
     def step(x, u):
         after = HandoutPlant()(x, u)
         if x[2] != 60.0:
-            after[parts["where"]] = parts["value"]
+            after[index] = value
         return after
 
     return step
@@ -64,11 +65,11 @@ def raises(x, u):
     [
         (replace(HandoutPlant(), coeffs=(1.0, 1.0, 0, 0, 0, 0)), {}, "sink and to climb"),
         (replace(HandoutPlant(), coeffs=(2.0 * GRAVITY, 1.0, 0, 0, 0, 0)), {}, "sink and to climb"),
-        (broken(where=20, value=np.nan), {}, "found nan in component 20, flight 0 .roll., step"),
+        (broken(index=20, value=np.nan), {}, "found nan in component 20, flight 0 .roll., step"),
         (lambda x, u: HandoutPlant()(x, u)[:20], {}, r"shape \(20,\), expected \(21,\)"),
         (lambda x, u: x * np.nan, {}, "vertical accelerations of nan and nan"),
         (raises, {}, "RuntimeError: no link"),
-        (broken(where=2, value=500.0), {}, "no flight stayed within the envelope"),
+        (broken(index=2, value=500.0), {}, "no flight stayed within the envelope"),
         (HandoutPlant(), {"minutes": 0.9}, "minutes: found 0.9, expected at least 1"),
         (HandoutPlant(), {"minutes": np.nan}, "minutes: found nan"),
         (HandoutPlant(), {"noise": -1.0}, "noise: found -1.0, expected 0 or more"),
@@ -82,8 +83,8 @@ def test_plants_that_do_not_fly_are_refused(step, arguments, message):
 def test_held_out_part_has_every_kind_a_clear_step_of_each_axis_and_all_voltages():
     log = collect(HandoutPlant(), minutes=1.0, seed=1)
     out = held_out_rows(log)
-    np.testing.assert_array_equal(out, block_numbers(log) % 4 == 3)
-    np.testing.assert_array_equal(held_out_rows(log, 2), block_numbers(log) % 2 == 1)
+    assert_array_equal(out, block_numbers(log) % 4 == 3)
+    assert_array_equal(held_out_rows(log, 2), block_numbers(log) % 2 == 1)
     assert not held_out_rows(log, 0).any()
     for every in (1, -4):
         with pytest.raises(ValueError, match=f"every: found {every}"):
@@ -103,18 +104,16 @@ def test_held_out_part_has_every_kind_a_clear_step_of_each_axis_and_all_voltages
 # --- Sensors --------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def truth():
-    return excited(HandoutPlant())
-
-
-def test_noise_is_as_stated(truth):
+def test_noise_is_as_stated():
+    truth = excited(HandoutPlant())
     log = sensors.measure(truth, 2.0, GRAVITY, np.random.default_rng(0))
-    keys = [np.round(own.time * 100).astype(int) + 1000 * own.segment for own in (truth, log)]
-    kept = np.isin(*keys)
+    row_ids = [
+        np.round(flight.time * 100).astype(int) + 1000 * flight.segment for flight in (truth, log)
+    ]
+    kept = np.isin(*row_ids)
     assert set(log.channels) == {"u", "w", "f", "v", "p", "q", "v_bat"}
     assert len(log) == kept.sum() and 0.03 < 1.0 - kept.mean() < 0.05
-    np.testing.assert_array_equal(log["u"], truth["u"][kept])
+    assert_array_equal(log["u"], truth["u"][kept])
     exact = {**truth.channels, "f": sensors.specific_force_b(truth, GRAVITY)}
     errors = {name: log[name] - exact[name][kept] for name in "wfvp"}
     quats = [Rotation.from_quat(quat, scalar_first=True) for quat in (exact["q"][kept], log["q"])]
@@ -127,6 +126,6 @@ def test_noise_is_as_stated(truth):
         "q": np.deg2rad(0.5),
     }
     for name, noise in stated.items():
-        np.testing.assert_allclose(errors[name].std(axis=0), 2.0 * noise, rtol=0.05, err_msg=name)
+        assert_allclose(errors[name].std(axis=0), 2.0 * noise, rtol=0.05, err_msg=name)
         assert np.abs(errors[name].mean(axis=0)).max() < 0.1 * noise, name
-    np.testing.assert_allclose(np.linalg.norm(log["q"], axis=1), 1.0, rtol=1e-12)
+    assert_allclose(np.linalg.norm(log["q"], axis=1), 1.0, rtol=1e-12)
