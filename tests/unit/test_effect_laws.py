@@ -50,19 +50,17 @@ CHOSEN = {
     "command_delay": {"delay_s": 1.3 * DT},
     # The second damping is 1 in single precision, between an oscillation and two lags.
     "second_order_rates": {
-        **{"roll_s": 0.03, "pitch_s": 0.04, "yaw_s": 0.05},
-        **{"roll_damping": 0.3, "pitch_damping": 1.0 + 1e-9, "yaw_damping": 2.0},
+        "roll_s": 0.03,
+        "pitch_s": 0.04,
+        "yaw_s": 0.05,
+        "roll_damping": 0.3,
+        "pitch_damping": 1.0 + 1e-9,
+        "yaw_damping": 2.0,
     },
 }
 
 
-@pytest.mark.parametrize(
-    "names",
-    [
-        *(pytest.param((name,), id=name) for name in SAME_LAWS),
-        pytest.param(TOGETHER, id="together"),
-    ],
-)
+@pytest.mark.parametrize("names", [*((name,) for name in SAME_LAWS), TOGETHER], ids=" and ".join)
 def test_laws_are_those_of_hidden_plants_in_plain_floats(names):
     """Alone and together, by equations that were written twice."""
     rng = np.random.default_rng(8)
@@ -90,10 +88,10 @@ def test_laws_are_those_of_hidden_plants_in_plain_floats(names):
 # --- Forces ---------------------------------------------------------------------------------------
 
 
-def force_of(parameters, thrust=-1.0, model=NOMINAL, **fields):
-    """Return the acceleration without gravity of one step, world, m/s^2."""
-    drone = drone_with(applied=(0.0, 0.0, 0.0, thrust), **fields)
-    return flown(parameters, held(thrust=thrust), drone, model)[0, ACCELERATION] + GRAVITY_W
+def force_of(parameters, model=NOMINAL, **fields):
+    """Return the acceleration without gravity of one step with centred sticks, world, m/s^2."""
+    rows = flown(parameters, drone=drone_with(**fields), model=model)
+    return rows[0, ACCELERATION] + GRAVITY_W
 
 
 @pytest.mark.parametrize(
@@ -110,7 +108,7 @@ def test_quadratic_drag_multiplies_each_axis_by_the_whole_speed(vel_w, quat, exp
 
 def lift_ratio(parameters, **fields):
     """Return the vertical specific force with an effect over that without."""
-    return float(force_of(parameters, 0.0, **fields)[2] / force_of((), 0.0, **fields)[2])
+    return float(force_of(parameters, **fields)[2] / force_of((), **fields)[2])
 
 
 @pytest.mark.parametrize(("speed", "share"), [(0.0, 0.0), (HALF_SPEED, 0.5), (3 * HALF_SPEED, 0.9)])
@@ -142,9 +140,7 @@ def test_a_hard_saturation_cuts_the_sticks_off(stick):
 
 
 @pytest.mark.parametrize("steps", [0, 2, STEPS_PER_DELAY])
-def test_a_delay_of_whole_steps_shifts_each_channel_by_its_own_and_none_is_early(
-    steps,
-):
+def test_a_delay_of_whole_steps_shifts_each_channel_by_its_own_and_none_is_early(steps):
     drone, commands = random_drone(3), random_commands(3, 20)
     applied = flown(effects.CommandDelay(steps * DT, 3 * DT, -3 * DT), commands, drone)[
         :, APPLIED_ACTION
@@ -198,8 +194,6 @@ def test_late_poses_are_those_of_the_past(steps):
 
 SHOWN = slice(15, 18)  # where the observation has the body rates
 GYRO_SCALE = next(entry.scale for entry in OBSERVATION if entry.key == "rates")
-
-
 BIAS = (0.1, -0.2, 0.3)
 
 
@@ -212,14 +206,9 @@ class WithoutGyro(Plant):
 @pytest.mark.parametrize(
     ("parameters", "plant", "lateness", "bias"),
     [
-        (
-            (effects.GyroBias(0.1, -0.2, 0.3), effects.AccelerometerBias(1.0)),
-            None,
-            0,
-            (0.1, -0.2, 0.3),
-        ),
-        ((effects.ImuLatency(DT),), None, 1, (0.0, 0.0, 0.0)),
-        ((effects.GyroBias(0.5),), WithoutGyro(), 0, (0.0, 0.0, 0.0)),
+        ((effects.GyroBias(*BIAS), effects.AccelerometerBias(1.0)), None, 0, BIAS),
+        ((effects.ImuLatency(DT),), None, 1, 0.0),
+        ((effects.GyroBias(0.5),), WithoutGyro(), 0, 0.0),
     ],
 )
 def test_the_observation_shows_the_gyro_of_the_plant(parameters, plant, lateness, bias):

@@ -9,13 +9,7 @@ pytest.importorskip("firmware", reason="firmware/ is in clones only")
 
 from firmware import Body, FirmwareError, read_body
 from firmware.building import HERE, NAME, build, cache_folder, find_executable
-from firmware.settings import (
-    REQUIRED,
-    check_read_back,
-    lines_of,
-    parse_dump,
-    settings_of,
-)
+from firmware.settings import REQUIRED, check_read_back, lines_of, parse_dump, settings_of
 from tests.support.refusals import refused
 from tests.support.tables import FOLDER, table
 
@@ -54,13 +48,26 @@ def test_other_lines_are_refused_by_name(line):
         parse_dump(line)
 
 
+SETTINGS = """
+set p_roll = 60
+profile 1
+set p_roll = 70
+set rates_type = actual
+set gone = 1
+"""
+SETTINGS_READ_BACK = """
+set rates_type = ACTUAL
+profile 0
+set p_roll = 60
+profile 1
+set p_roll = 71
+rateprofile 0
+"""
+
+
 def test_what_the_firmware_did_not_keep_is_named():
-    asked = ["set p_roll = 60", "profile 1", "set p_roll = 70"]
-    asked += ["set rates_type = actual", "set gone = 1"]
-    kept = ["set rates_type = ACTUAL", "profile 0", "set p_roll = 60", "profile 1"]
-    kept += ["set p_roll = 71", "rateprofile 0", ""]
     with pytest.raises(FirmwareError) as error:
-        check_read_back(parse_dump("\n".join(asked)), "\n".join(kept))
+        check_read_back(parse_dump(SETTINGS), SETTINGS_READ_BACK)
     assert "p_roll (asked for 70, has 71), gone (asked for 1, has None)" in str(error.value)
     assert "rates_type" not in str(error.value) and "has 60" not in str(error.value)
 
@@ -90,7 +97,7 @@ def test_missing_tools_and_other_files_are_one_sentence(tmp_path, monkeypatch, c
         build(lambda line: None, tmp_path / "nowhere")
     monkeypatch.setattr(shutil, "which", lambda tool: None)
     assert "gcc is not installed" in refused(capsys, "firmware", "build")
-    assert not [path for path in cache_folder().parent.iterdir()]
+    assert not list(cache_folder().parent.iterdir())
 
 
 @pytest.mark.parametrize(("content", "message"), table("bodies")["files"])
@@ -108,5 +115,5 @@ def test_what_is_built_already_is_left_alone(tmp_path, monkeypatch):
     cache_folder().mkdir(parents=True)
     (cache_folder() / NAME).write_text("there")
     monkeypatch.setattr(shutil, "which", lambda tool: None)
-    said: list[str] = []
-    assert build(said.append).read_text() == "there" and said[0].startswith("built already")
+    lines = []
+    assert build(lines.append).read_text() == "there" and lines[0].startswith("built already")

@@ -136,8 +136,8 @@ def test_two_gates_in_one_step_each_have_their_time_and_end(shift_m, end):
     track = replace(row, gates=(row.gates[0], aside, row.gates[2]))
     states = np.tile(pack(drone_at((0.0, 0.0, 2.0), (20.0, 0.0, 0.0))), (10, 1))
     states[:, 0] = 0.15 + 0.2 * np.arange(10)
-    race, found = race_and_end(states, track)
-    assert found == end
+    race, actual_end = race_and_end(states, track)
+    assert actual_end == end
     num_passed = 1 + (shift_m == 0.0)
     passed = [(gate_pass.time_s, gate_pass.pos_w[0]) for gate_pass in race.passes]
     assert_allclose(passed, [(0.0925, 2.0), (0.0975, 2.1)][:num_passed], atol=1e-5)
@@ -145,8 +145,8 @@ def test_two_gates_in_one_step_each_have_their_time_and_end(shift_m, end):
 
 def test_flight_that_goes_on_ended_when_its_steps_did():
     states, _ = ghost_rollout(REFERENCES, 100)
-    assert why_ended(states, TRACK, follow_race(states[:, POSITION], TRACK)) == "all steps flown"
+    assert race_and_end(states)[1] == "all steps flown"
     states[-1, BATTERY] = 21.9
-    assert why_ended(states, TRACK, follow_race(states[:, POSITION], TRACK)) == "battery empty"
+    assert race_and_end(states)[1] == "battery empty"
     states[:, BATTERY], states[:, VELOCITY] = 24.0, np.nan  # an unknown velocity ends nothing
     assert race_and_end(states)[1] == "all steps flown"
