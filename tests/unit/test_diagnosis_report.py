@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
@@ -36,7 +37,7 @@ from tests.support.hidden_flights import scripted
 from tests.support.slow import slow_but
 from tests.support.written_logs import with_channels
 
-SECONDS, DT_S = 12.0, 0.01
+SECONDS = 12.0
 SETTLED = 150  # rows until a start is forgotten
 DRAG = LinearDrag(0.3, 0.4, 0.1)
 
@@ -70,11 +71,11 @@ def test_pictures_of_a_cause_that_begins_in_flight_show_the_part_in_which_it_act
     )
     acting = report.while_acting(found, late, float(log.time[0]))
     expected = found.elapsed_s >= 7.0 - log.time[0]
-    np.testing.assert_array_equal(acting.counts["rates"], found.counts["rates"] & expected)
+    assert_array_equal(acting.counts["rates"], found.counts["rates"] & expected)
     assert 0.3 < acting.counts["rates"].mean() < 0.5
     ended = replace(late, onset_s=None, end_s=late.onset_s)
     kept = report.while_acting(found, ended, float(log.time[0])).counts["rates"]
-    np.testing.assert_array_equal(kept | acting.counts["rates"], found.counts["rates"])
+    assert_array_equal(kept | acting.counts["rates"], found.counts["rates"])
 
 
 def test_residuals_are_measured_minus_modelled(flown):
@@ -95,9 +96,9 @@ def test_residuals_are_measured_minus_modelled(flown):
         assert np.abs(expected).max() > 0.1
         for model, values in (("wrong", expected), ("right", 0.0)):
             residuals = found.residuals[model][name][SETTLED:]
-            np.testing.assert_allclose(residuals - values, 0.0, atol=tolerance, err_msg=name)
+            assert_allclose(residuals - values, 0.0, atol=tolerance, err_msg=name)
     drained = log["v_bat"][:, 0] - log["v_bat"][0, 0] + 0.5 / 60.0 * log.time
-    np.testing.assert_allclose(found.residuals["wrong"]["battery"][:, 0], drained, atol=1e-6)
+    assert_allclose(found.residuals["wrong"]["battery"][:, 0], drained, atol=1e-6)
 
 
 def shown(model, cause):

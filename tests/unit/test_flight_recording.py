@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
@@ -74,11 +75,11 @@ def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, models
     def arrows(name, part):
         return recording.series(f"/world/residual/{name}", f"Arrows3D:{part}")[is_inside]
 
-    np.testing.assert_allclose(arrows("nominal", "vectors") / SCALED_FORCE, expected, atol=0.02)
+    assert_allclose(arrows("nominal", "vectors") / SCALED_FORCE, expected, atol=0.02)
     assert np.abs(arrows("true", "vectors")).max() < 1e-3 * SCALED_FORCE
-    np.testing.assert_allclose(arrows("nominal", "origins"), log["p"][rows], rtol=1e-6, atol=1e-6)
+    assert_allclose(arrows("nominal", "origins"), log["p"][rows], rtol=1e-6, atol=1e-6)
     plotted = recording.series("/plots/residual/nominal", "Scalars:scalars")
-    np.testing.assert_allclose(plotted[rows], np.linalg.norm(expected, axis=1), atol=0.02)
+    assert_allclose(plotted[rows], np.linalg.norm(expected, axis=1), atol=0.02)
     assert np.isnan(plotted[[0, SECOND]]).all()
 
 
@@ -95,7 +96,7 @@ def distance_m(shown, log):
     """Return how far a flight is from the measured one at its rows, (T,) m."""
     time_s = trajectories.time_in_line(log)
     rows = np.searchsorted(time_s, shown.time_s - 1e-6)
-    np.testing.assert_allclose(time_s[rows], shown.time_s, atol=1e-9)
+    assert_allclose(time_s[rows], shown.time_s, atol=1e-9)
     return np.linalg.norm(shown.positions - log["p"][rows], axis=1)
 
 
@@ -108,7 +109,7 @@ def test_a_model_flies_by_itself_and_starts_anew_every_second(flown, flights):
     gaps = np.diff(starts_s[1:])
     is_jump = gaps > 1.5  # from the first segment into the second
     assert is_jump.sum() == 1 and len(gaps) >= 5
-    np.testing.assert_allclose(gaps[~is_jump], 1.0, atol=1e-6)
+    assert_allclose(gaps[~is_jump], 1.0, atol=1e-6)
     assert distance_m(right, log).max() < 1e-3
     away = distance_m(wrong, log)
     assert away[wrong.restarts].max() < 1e-9 and away.max() > 0.3
@@ -130,7 +131,7 @@ def test_position_is_integrated_where_it_was_not_measured(made):
     assert shown.name == "measured (position integrated)"
     moved = made["p"] - np.repeat(made["p"][[0, 300]], 300, axis=0)
     assert np.abs(moved).max() > 1.0
-    np.testing.assert_allclose(shown.positions, moved, atol=2e-3)
+    assert_allclose(shown.positions, moved, atol=2e-3)
     (still,) = trajectories.measure_trajectories(made.without("p", "v"), {})
     assert still.name == "measured (no position)" and (still.positions == 0.0).all()
     assert np.isnan(still.states[:, 3:9]).all() and np.isfinite(still.states[:, 9:16]).all()
@@ -140,7 +141,7 @@ def test_of_a_long_log_rows_are_left_out_but_no_start(monkeypatch, made):
     monkeypatch.setattr(trajectories, "MAX_ROWS", 150)
     (shown,) = trajectories.measure_trajectories(made, {})
     kept = [*range(0, 300, 4), *range(300, 600, 4)]
-    np.testing.assert_array_equal(shown.positions, made["p"][kept])
+    assert_array_equal(shown.positions, made["p"][kept])
     assert np.flatnonzero(shown.restarts).tolist() == [0, 75] and "1 row in 4" in shown.ended
 
 
