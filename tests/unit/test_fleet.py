@@ -151,17 +151,17 @@ def test_single_diagnoses_and_the_comparison_must_agree(tmp_path):
         flight.name: result_of(*["wind"] * (number >= 5), *["rotor_drag"] * (number < 6))
         for number, flight in enumerate(flights)
     }
-    asked = []
+    compared = []
 
     def run(function, jobs):
         for name, (later, earlier) in jobs.items():
-            asked.append((name, len(later), len(earlier)))
+            compared.append((name, len(later), len(earlier)))
             effects = ("wind", "gyro_bias") if "begun at flight6" in name else ()
             yield name, Outcome({"causes": result_of(*effects)["diagnosis"]["causes"]})
 
     store = Store(tmp_path / "out", run)
     changes = find_changes(flights, results, store, silent)
-    assert asked == [
+    assert compared == [
         ("red/begun at flight6.npz", 4, 4),
         ("red/begun at flight9.npz", 2, 4),
         ("red/ended at flight7.npz", 4, 4),
@@ -173,9 +173,8 @@ def test_single_diagnoses_and_the_comparison_must_agree(tmp_path):
     assert "- **red**: wind () begins with flight 6, flight6.npz (before: flight5.npz)" in page
     assert "no cause begins with flight 9" in page
     assert "gyro_bias" not in page
-    # A second call asks nothing again.
     find_changes(flights, results, store, silent)
-    assert len(asked) == 3
+    assert len(compared) == 3, "a second call compares nothing again"
 
 
 def silent(done, total):
@@ -198,7 +197,7 @@ def test_results_are_kept_and_a_changed_log_is_done_again(tmp_path):
     touched(path, "22")
     results(jobs, silent)
     assert len(calls) == 2
-    assert not [one for one in Path(tmp_path / "out").rglob(".*") if one.is_file()]
+    assert not [path for path in (tmp_path / "out").rglob(".*") if path.is_file()]
 
 
 def test_notes_move_to_the_next_diagnosed_flight_and_all_flights_count(tmp_path):
@@ -211,13 +210,13 @@ def test_notes_move_to_the_next_diagnosed_flight_and_all_flights_count(tmp_path)
         for name in jobs:
             yield name, Outcome({"causes": []})
 
-    told = find_changes(flights, results, Store(tmp_path / "out", run), silent)
-    assert [(one.flight, one.before, one.note) for one in told] == [
+    changes = find_changes(flights, results, Store(tmp_path / "out", run), silent)
+    assert [(change.flight, change.before, change.note) for change in changes] == [
         (2, "", "new frame"),
         (4, "2.npz", "new motor; new props"),
     ]
     assert "with flight 2, 2.npz (before: no diagnosed flight); noted: new frame" in format_page(
-        flights, results, told
+        flights, results, changes
     )
 
 
@@ -231,12 +230,12 @@ def test_a_failure_is_told_and_run_again_by_the_next_call(tmp_path):
             yield name, outcomes.pop(0)
 
     results = {flight.name: result_of() for flight in flights}
-    told = []
+    changes = []
     for _ in range(2):
-        told += find_changes(flights, results, Store(tmp_path / "out", run), silent)
-    assert [one.failure for one in told] == ["it hung", ""]
+        changes += find_changes(flights, results, Store(tmp_path / "out", run), silent)
+    assert [change.failure for change in changes] == ["it hung", ""]
     results["red/3.npz"] = {"state": fleet.FAILED, "reason": "it crashed"}
-    page = format_page(flights, results, told)
+    page = format_page(flights, results, changes)
     assert "unknown what begins with flight 2, 2.npz (before: 1.npz); the comparison failed" in page
     assert "1 whose diagnosis failed" in page and "| red/3.npz | failed | it crashed |" in page
 

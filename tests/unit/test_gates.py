@@ -39,7 +39,7 @@ def course_of(*gates):
 
 def frame_of(gate):
     """Return the gate's flight frame as scalars."""
-    return jax.tree.map(lambda table: jnp.asarray(table[0]), course_of(gate, gate).gates)
+    return course_of(gate, gate).gate(0)
 
 
 def vectors(rows):
