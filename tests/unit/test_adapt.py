@@ -16,7 +16,6 @@ from flytrack_env.dynamics import step
 from flytrack_env.effects import WIND, CommandDelay, LinearDrag, Motors, QuadraticDrag
 from flytrack_env.effects.actual_rates import ActualRates
 from flytrack_env.effects.betaflight_rates import BetaflightRates
-from flytrack_env.model_file import model_from_json
 from flytrack_env.motion import Motion
 from flytrack_env.thrust import collective_thrust
 from flytrack_loop import adapt as adapting
@@ -51,7 +50,7 @@ def diagnosis(extended, joint=Joint(), causes=(CAUSE,), unexplained=Unexplained(
 
 def seen_at(sticks, std_n):
     """Return the covariance of a thrust map that was fitted at some sticks and 24 V."""
-    rows = np.stack([thrust(one, sticks) for one in np.eye(6)], axis=1)
+    rows = np.stack([thrust(coeffs, sticks) for coeffs in np.eye(6)], axis=1)
     return np.linalg.inv(rows.T @ rows / std_n**2 + 1e-6 * np.eye(6))
 
 
@@ -73,7 +72,7 @@ def test_only_thrust_that_was_flown_is_the_logs():
     assert_allclose(thrust(mean, STICKS), 1.1 * thrust(truth, STICKS), atol=1.5)
     drawn = drawn_by(models.draw, 400)
     maps = np.asarray(drawn.thrust_coeffs, float)
-    spread = np.std([thrust(one, STICKS) for one in maps], axis=0)
+    spread = np.std([thrust(coeffs, STICKS) for coeffs in maps], axis=0)
     assert spread[-1] < 0.1 < 0.5 < spread[0] < 5.0
     assert_allclose(drawn.effects[0].d_x, 0.3, rtol=1e-6)  # known exactly here
 
@@ -105,14 +104,15 @@ def test_a_drain_that_no_cause_names_is_that_of_the_model(cause, drain):
 
 
 def test_a_model_in_the_structure_of_another_flies_as_it_did():
-    own = NOMINAL.with_effects(QuadraticDrag(0.01, 0.02, 0.03))
-    like = DRAG.with_effects(QuadraticDrag(), WIND.parameters(1.0, 2.0))
-    same = embed(own, like)
-    assert jax.tree.structure(same) == jax.tree.structure(like)
+    model = NOMINAL.with_effects(QuadraticDrag(0.01, 0.02, 0.03))
+    structure = DRAG.with_effects(QuadraticDrag(), WIND.parameters(1.0, 2.0))
+    embedded = embed(model, structure)
+    assert jax.tree.structure(embedded) == jax.tree.structure(structure)
     state = np.zeros(21, np.float32)
     state[[2, 3, 4, 9, 20]] = 5.0, 4.0, -3.0, 1.0, 23.5
     command = jnp.array([0.3, -0.2, 0.1, 0.4])
-    after = [np.asarray(step(state, command, 0.01, model)) for model in (own, same, like)]
+    models = (model, embedded, structure)
+    after = [np.asarray(step(state, command, 0.01, flown)) for flown in models]
     assert_array_equal(after[0], after[1])
     assert np.abs(after[0] - after[2]).max() > 1e-4
 
@@ -135,7 +135,7 @@ def test_a_policys_model_flies_alike_with_another_battery_and_mass():
 def test_settings_of_a_craft_replace_the_policys_but_for_what_was_fitted():
     policy_model = NOMINAL.with_effects(BetaflightRates(0.3, 0.3, 0.3), LinearDrag(0.3, 0.2, 0.1))
     craft = adapting.as_craft(policy_model, NOMINAL.with_effects(ActualRates(0.5, 0.5, 0.5)))
-    assert {type(one) for one in craft.effects} == {ActualRates, LinearDrag}
+    assert {type(effect) for effect in craft.effects} == {ActualRates, LinearDrag}
     flown = NOMINAL.with_effects(GENERIC._replace(roll_arm=33.0))
     assert adapting.as_craft(flown, NOMINAL.with_effects(GENERIC)) is flown
     other = NOMINAL.with_effects(GENERIC._replace(p_roll=50.0))
@@ -207,7 +207,7 @@ def judged(finish, lap_s):
 )
 def test_the_old_policy_is_kept_where_the_new_one_is_worse(lap_s, finish, is_new, monkeypatch):
     champion = load_checkpoint("champion")
-    model = model_from_json(champion.meta["model"], "model")
+    model = adapting.read_policy_model(champion)
     models = find_plausible_models(diagnosis(model))
     flights = iter([judged(100, 3.7), judged(90, 4.2), judged(100, 3.7), judged(finish, lap_s)])
     monkeypatch.setattr(adapting, "polish", lambda env, policy, *_: policy.params)
@@ -226,7 +226,7 @@ def test_the_old_policy_is_kept_where_the_new_one_is_worse(lap_s, finish, is_new
 def test_the_settings_of_a_craft_are_there_from_the_start(log, monkeypatch):
     """A rate loop that is there by half has no half of its response."""
     champion = load_checkpoint("champion")
-    policy_model = model_from_json(champion.meta["model"], "model")
+    policy_model = adapting.read_policy_model(champion)
     craft = NOMINAL._replace(max_rate=np.float32([500.0, 500.0, 200.0])).with_effects(GENERIC)
     nominal = adapting.as_craft(policy_model, craft)
     assert_array_equal(nominal.max_rate, craft.max_rate)

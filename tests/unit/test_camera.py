@@ -67,13 +67,13 @@ IMAGES = {
 def test_corners_are_where_rays_cast_apart_meet_the_image(name, params):
     image, (gates, positions, quaternions, indices) = IMAGES[name], poses(1000)
     find = quick_jit(jax.vmap(lambda p, q, i: corners_at(image, p, q, params.course.gate(i))))
-    found, is_visible = find(positions, quaternions, indices)
+    pixels, is_visible = find(positions, quaternions, indices)
     arguments = positions.astype(float), quaternions.astype(float), gates, indices
     expected, _ = ray_caster.find_corners(*arguments, image)
     beyond_px = (np.abs(expected) - 0.5 * np.array([image.width, image.height])).max(axis=-1)
     is_on_edge = np.abs(beyond_px) < FRAME_TOLERANCE_PX
     assert_array_equal(np.asarray(is_visible)[~is_on_edge], (beyond_px <= 0.0)[~is_on_edge])
-    errors_px = np.abs(found - expected)[np.asarray(is_visible)]
+    errors_px = np.abs(pixels - expected)[np.asarray(is_visible)]
     assert 500 < is_visible.sum() < is_visible.size and errors_px.max() < FRAME_TOLERANCE_PX
 
 
@@ -81,10 +81,10 @@ def test_corners_are_where_rays_cast_apart_meet_the_image(name, params):
 def test_masks_are_those_of_rays_cast_apart(image):
     gates, positions, quaternions, _ = poses(100)
     env = GateMask(FlyTrack(), size=(image.height, image.width))
-    own = env.own_defaults()._replace(
+    lens = env.own_defaults()._replace(
         field_of_view_deg=image.field_of_view_deg, pitch_deg=image.pitch_deg
     )
-    params = env.with_own_params(env.default_params, own)
+    params = env.with_own_params(env.default_params, lens)
     draw = quick_jit(jax.vmap(lambda p, q: env.compose([*p, *q], params)))
     masks = np.asarray(draw(positions, quaternions))
     assert set(np.unique(masks)) == {0, 255} and masks.shape[1:] == env.observation_space().shape
@@ -170,10 +170,12 @@ def test_nothing_of_the_camera_survives_an_episode_and_settings_do_not_compile_a
     for _ in range(2):
         state = step(key, state, np.zeros(4, np.float32), params)[1]
     assert [past.pos_w.x for past in state.past] == pytest.approx([0.2, 0.0, 0.0])
-    own = env.own_params(params)._replace(latency_s=jnp.float32(0.02), width_px=jnp.float32(320.0))
+    detector = env.own_params(params)._replace(
+        latency_s=jnp.float32(0.02), width_px=jnp.float32(320.0)
+    )
     num_programs = step._cache_size()
     _, state, _, terminated, *_ = step(
-        key, state, np.full(4, np.nan, np.float32), env.with_own_params(params, own)
+        key, state, np.full(4, np.nan, np.float32), env.with_own_params(params, detector)
     )
     assert terminated and state.steps == 0 and step._cache_size() == num_programs
     begun = env.drone(state)
@@ -200,9 +202,9 @@ def test_gradients_of_corners_are_those_of_finite_differences(params):
 @pytest.mark.parametrize(("changes", "message"), table("cameras")["refused"])
 def test_cameras_that_show_nothing_are_refused_by_the_name_of_the_field(changes, message):
     env = GateCorners(FlyTrack(plant=Coasting()))
-    own = env.own_defaults()._replace(**changes)
+    detector = env.own_defaults()._replace(**changes)
     with pytest.raises(ValueError, match=rf"params\.wrappers\['gate_corners'\]\.{message}"):
-        env.reset(jax.random.key(0), env.with_own_params(env.default_params, own))
+        env.reset(jax.random.key(0), env.with_own_params(env.default_params, detector))
 
 
 @pytest.mark.parametrize(("size", "side"), [((7, 64), "height"), ((64, 4), "width")])
@@ -226,9 +228,12 @@ def test_a_detector_is_drawn_for_an_episode_within_its_ranges():
     first, later = jax.vmap(detectors)(jnp.arange(500, dtype=jnp.uint32))
     for name, value in first._asdict().items():
         assert_array_equal(value, getattr(later, name))
-        own, half = getattr(NOISY_DETECTOR, name), {"pitch_deg": 3.0, "field_of_view_deg": 5.0}
-        is_error = name in ("noise_px", "missed", "swapped", "latency_s")
-        low, high = (0.0, own) if is_error else (own - half.get(name, 0), own + half.get(name, 0))
+        nominal = getattr(NOISY_DETECTOR, name)
+        if name in ("noise_px", "missed", "swapped", "latency_s"):
+            low, high = 0.0, nominal
+        else:
+            margin = {"pitch_deg": 3.0, "field_of_view_deg": 5.0}.get(name, 0.0)
+            low, high = nominal - margin, nominal + margin
         assert_allclose([value.min(), value.max()], [low, high], atol=0.02 * (high - low))
     wide = params.wrappers["detector_randomization"]._replace(field_of_view_deg=60.0)
     with pytest.raises(ValueError, match="field_of_view_deg: found 180"):
@@ -236,10 +241,10 @@ def test_a_detector_is_drawn_for_an_episode_within_its_ranges():
 
 
 def test_the_state_beside_corners_is_that_of_the_drone():
-    env = StateObservation(ObservationNoise(GateCorners(FlyTrack(plant=Coasting()))))
+    plain = FlyTrack(plant=Coasting())
+    env = StateObservation(ObservationNoise(GateCorners(plain)))
     drone = drone_at((14.0, 2.5, 1.5), (-8.0, 1.0, 0.5))
     rows = env.observe(None, env.begin(drone, 0, env.default_params), None, env.default_params)
-    plain = FlyTrack(plant=Coasting())
     state = plain.begin(drone, 0, plain.default_params)
     assert_allclose(rows[31:], plain.observe(None, state, None, plain.default_params), atol=1e-6)
 

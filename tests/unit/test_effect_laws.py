@@ -183,7 +183,9 @@ def test_late_poses_are_those_of_the_past(steps):
     start = np.concatenate([drone.pos_w, drone.vel_w, drone.quat])
     known = np.concatenate([[start], rows[:, [*range(6), *range(9, 13)]]])
     moments = np.arange(1, len(known)) - steps
-    then = np.stack([np.interp(moments, np.arange(len(known)), one) for one in known.T], axis=1)
+    then = np.stack(
+        [np.interp(moments, np.arange(len(known)), column) for column in known.T], axis=1
+    )
     then[:, 6:] /= np.linalg.norm(then[:, 6:], axis=1, keepdims=True)
     signs = np.sign(np.sum(then[:, 6:] * rows[:, 33:37], axis=1, keepdims=True))
     assert_allclose(rows[:, 27:33], then[:, :6], rtol=2e-5, atol=2e-4)

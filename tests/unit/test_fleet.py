@@ -134,8 +134,8 @@ def test_a_beginning_is_told_only_where_flights_before_and_after_agree(named, fi
 
 def test_no_beginning_is_told_of_names_by_chance():
     rng = np.random.default_rng(5)
-    told = [find_beginning(list(rng.random(16) < 0.1)) for _ in range(2000)]
-    assert sum(first is not None for first in told) <= 20
+    beginnings = [find_beginning(list(rng.random(16) < 0.1)) for _ in range(2000)]
+    assert sum(first is not None for first in beginnings) <= 20
 
 
 def result_of(*effects):

@@ -44,11 +44,11 @@ def races_and_causes(states):
     params = env.default_params
     begun = env.begin(unpack(states[0]), 0, params)
 
-    def one(state, _):
+    def advance(state, _):
         after, _, causes, events = env.transition(state, Action(0.0, 0.0, 0.0, 0.0), params)
         return after, (after.race, causes._replace(missed_gate=events.is_miss))
 
-    return begun.race, *jax.lax.scan(one, begun, None, len(states) - 1)[1]
+    return begun.race, *jax.lax.scan(advance, begun, None, len(states) - 1)[1]
 
 
 def fly_recorded(states):
