@@ -294,13 +294,15 @@ def test_what_a_given_model_has_too_much_is_taken_out_again(flown):
     diagnosis = diagnose(log, model.with_effects(LinearDrag(0.2, 0.2, 0.2)))
     drag, drain = sorted(diagnosis.causes, key=lambda cause: cause.effect)[::-1]
     assert (drag.effect, drain.effect) == ("linear_drag", "battery_drain")
-    for one in drag.parameters.values():
-        assert one.value == pytest.approx(0.0, abs=0.02)
+    for estimate in drag.parameters.values():
+        assert estimate.value == pytest.approx(0.0, abs=0.02)
     assert drag.heldout_gain > 0.0 and drag.lambda_ > 100.0
     assert drain.parameters["battery_drain_v_per_min"].value == pytest.approx(truth.drain, rel=0.05)
-    for one, tau in zip(diagnosis.half_response_s["extended"].values(), truth.tau, strict=True):
-        half = one.ci95[1] - one.time
-        assert 0.0 < half < 0.05 * tau and abs(one.time - tau * np.log(2.0)) < 1.5 * half
+    for estimate, tau in zip(
+        diagnosis.half_response_s["extended"].values(), truth.tau, strict=True
+    ):
+        half = estimate.ci95[1] - estimate.time
+        assert 0.0 < half < 0.05 * tau and abs(estimate.time - tau * np.log(2.0)) < 1.5 * half
 
 
 def test_logs_are_joined_by_what_they_all_have_with_a_warning(flown):

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden import measure
 from flytrack_env.dynamics import nominal_motor_parameters
-from flytrack_env.effects import EFFECTS, AccelerometerBias, LinearDrag
+from flytrack_env.effects import BY_NAME, EFFECTS, AccelerometerBias, LinearDrag
 from flytrack_sysid.diagnosis import report, summary
 from flytrack_sysid.diagnosis.evidence import EVIDENCE
 from flytrack_sysid.diagnosis.result import (
@@ -29,7 +29,7 @@ from flytrack_sysid.diagnosis.result import (
     Unexplained,
 )
 from flytrack_sysid.diagnosis.traces import REGRESSORS, traces
-from flytrack_sysid.inference.parameters import names_of, to_vector, with_values
+from flytrack_sysid.inference.parameters import parameter_values, with_values
 from flytrack_sysid.inference.score_test import ALL_BASE_CAUSES, BASE_CAUSES
 from flytrack_sysid.page import Bullets, Picture, Section, Table, Text, Verdict, page
 from tests.contract.test_effects import inside_ranges
@@ -57,7 +57,7 @@ def measured(flown):
 
 def test_pictures_of_a_cause_that_begins_in_flight_show_the_part_in_which_it_acts(flown):
     model, log = flown
-    found = traces(log, {"nominal": model}, like="nominal")
+    residual_traces = traces(log, {"nominal": model}, like="nominal")
     late = Cause(
         "linear_drag",
         (),
@@ -69,20 +69,20 @@ def test_pictures_of_a_cause_that_begins_in_flight_show_the_part_in_which_it_act
         9.0,
         onset_s=Estimated(7.0, (6.8, 7.2), "s"),
     )
-    acting = report.while_acting(found, late, float(log.time[0]))
-    expected = found.elapsed_s >= 7.0 - log.time[0]
-    assert_array_equal(acting.counts["rates"], found.counts["rates"] & expected)
+    acting = report.while_acting(residual_traces, late, float(log.time[0]))
+    expected = residual_traces.elapsed_s >= 7.0 - log.time[0]
+    assert_array_equal(acting.counts["rates"], residual_traces.counts["rates"] & expected)
     assert 0.3 < acting.counts["rates"].mean() < 0.5
     ended = replace(late, onset_s=None, end_s=late.onset_s)
-    kept = report.while_acting(found, ended, float(log.time[0])).counts["rates"]
-    assert_array_equal(kept | acting.counts["rates"], found.counts["rates"])
+    kept = report.while_acting(residual_traces, ended, float(log.time[0])).counts["rates"]
+    assert_array_equal(kept | acting.counts["rates"], residual_traces.counts["rates"])
 
 
 def test_residuals_are_measured_minus_modelled(flown):
     base, log = flown
     wrong = base._replace(max_rate=1.1 * base.max_rate, battery_drain_v_per_min=0.5)
     wrong = wrong.with_effects(LinearDrag(0.1, 0.2, 0.0))
-    found = traces(log, {"right": base.with_effects(DRAG), "wrong": wrong}, like="wrong")
+    residual_traces = traces(log, {"right": base.with_effects(DRAG), "wrong": wrong}, like="wrong")
     to_body = Rotation.from_quat(log["q"], scalar_first=True).inv()
     airspeed_b = to_body.apply(log["v"])[SETTLED - 1 : -1]
     lacking = (np.array([0.1, 0.2, 0.0]) - DRAG) * airspeed_b
@@ -95,29 +95,25 @@ def test_residuals_are_measured_minus_modelled(flown):
     ):
         assert np.abs(expected).max() > 0.1
         for model, values in (("wrong", expected), ("right", 0.0)):
-            residuals = found.residuals[model][name][SETTLED:]
+            residuals = residual_traces.residuals[model][name][SETTLED:]
             assert_allclose(residuals - values, 0.0, atol=tolerance, err_msg=name)
     drained = log["v_bat"][:, 0] - log["v_bat"][0, 0] + 0.5 / 60.0 * log.time
-    assert_allclose(found.residuals["wrong"]["battery"][:, 0], drained, atol=1e-6)
+    assert_allclose(residual_traces.residuals["wrong"]["battery"][:, 0], drained, atol=1e-6)
 
 
 def shown(model, cause):
     """Return the model with a cause, far from neutral."""
     if cause in BASE_CAUSES:
-        values = dict(zip(names_of(model), to_vector(model), strict=True))
+        values = parameter_values(model)
         return with_values(model, {name: 1.4 * values[name] for name in BASE_CAUSES[cause]})
-    effect = next(effect for effect in EFFECTS if effect.name == cause)
-    return model.with_effects(inside_ranges(effect, 0.9))
-
-
-SETTINGS = [effect for effect in EFFECTS if effect.search.is_setting]
+    return model.with_effects(inside_ranges(BY_NAME[cause], 0.9))
 
 
 # A diagnosis does not search settings, so that their models take another compiled program.
 @pytest.mark.parametrize("are_settings", slow_but([False], [False, True]))
 def test_every_cause_has_a_plot_in_which_it_shows(flown, are_settings):
     model, log = flown
-    effects = [effect for effect in EFFECTS if (effect in SETTINGS) == are_settings]
+    effects = [effect for effect in EFFECTS if effect.search.is_setting == are_settings]
     base = model.with_effects(*(effect.parameters() for effect in effects))
     # Some effects act near the ground only.
     low = log["p"] - [0.0, 0.0, log["p"][:, 2].min() - 0.1]
@@ -125,10 +121,9 @@ def test_every_cause_has_a_plot_in_which_it_shows(flown, are_settings):
     causes = [effect.name for effect in effects]
     if not are_settings:
         causes += BASE_CAUSES
-        names = {*causes, *ALL_BASE_CAUSES, *(effect.name for effect in SETTINGS)}
-        assert set(EVIDENCE) == names
+        assert set(EVIDENCE) == {*(effect.name for effect in EFFECTS), *ALL_BASE_CAUSES}
     models = {"without": base, **{cause: shown(base, cause) for cause in causes}}
-    found = traces(log, models, like="without")
+    residual_traces = traces(log, models, like="without")
     sizes = {"rates": 0.01, "attitude": 0.01, "force": 0.05, "velocity": 0.05, "battery": 0.02}
     for cause in causes:
         evidence = EVIDENCE[cause]
@@ -137,7 +132,7 @@ def test_every_cause_has_a_plot_in_which_it_shows(flown, are_settings):
         for panel in evidence.panels:
             assert panel.regressor in REGRESSORS
             (less, counts), (full, _) = (
-                found.column(name, panel.residual) for name in ("without", cause)
+                residual_traces.column(name, panel.residual) for name in ("without", cause)
             )
             explained.append(
                 np.abs(full - less)[counts].max() / sizes[panel.residual.split("_")[0]]
@@ -250,8 +245,8 @@ def test_what_refitting_a_guess_or_a_learnt_law_reaches_is_no_gain_of_effects(di
 def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):
     drag, lag, _ = diagnosis.causes
     at_end = replace(lag, beyond="tau_roll at most 0.001 s")
-    found = replace(diagnosis, causes=(drag,), beyond=(at_end,))
-    text = report.describe_verdict(found).text
+    changed = replace(diagnosis, causes=(drag,), beyond=(at_end,))
+    text = report.describe_verdict(changed).text
     assert text.startswith(
         "The model lacks drag in proportion to airspeed. Named linear_drag: flies"
     )
@@ -259,7 +254,7 @@ def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):
         "Beyond the list, so that its cause may be another: lag of roll (tau_roll at most 0.001 s)."
         in text
     )
-    alone = replace(found, causes=(), unexplained=Unexplained())
+    alone = replace(changed, causes=(), unexplained=Unexplained())
     assert "lag of roll (tau_roll at most 0.001 s)" in report.describe_verdict(alone).text
     (stored,) = alone.as_json()["beyond_the_list"]
     assert stored["effect"] == "tau_roll" and alone.as_json()["causes"] == []
@@ -269,8 +264,8 @@ def test_what_is_beyond_the_list_is_told_and_not_named(diagnosis):
 
 def test_what_remains_is_told_in_sentences(diagnosis):
     names = ("heading", "command", "periodic at 5.2 Hz", "stochastic")
-    found = replace(diagnosis, causes=(), unexplained=Unexplained(True, names))
-    assert report.describe_verdict(found).text.startswith(
+    changed = replace(diagnosis, causes=(), unexplained=Unexplained(True, names))
+    assert report.describe_verdict(changed).text.startswith(
         "The model is wrong, and no known cause explains it. It depends on heading, command. "
         "It swings at 5.2 Hz. It wanders at random, as gusts do."
     )

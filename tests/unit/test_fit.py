@@ -11,10 +11,10 @@ from flytrack_env.dynamics import collective_thrust
 from flytrack_sysid import FitError, fit
 from flytrack_sysid.estimate import estimate
 from flytrack_sysid.inference.parameters import (
-    BASE,
     DRAIN,
     TAUS,
     THRUST_COEFFS,
+    parameter_values,
     to_vector,
     with_values,
 )
@@ -27,7 +27,7 @@ from tests.support.written_logs import held_still, with_channels
 
 PLANT = HandoutPlant()
 DRAG = (0.3, 0.5, 0.2)
-TRUTH = dict(zip(BASE, to_vector(PLANT.model()), strict=True))
+TRUTH = parameter_values(PLANT.model())
 ACTION, BATTERY_V = np.meshgrid(np.linspace(-1, 1, 21), np.linspace(22, 24, 9))
 
 
@@ -46,19 +46,19 @@ def fitted(noisy):
     return fit(noisy)
 
 
-def map_error(found):
+def map_error(result):
     """Return the largest error of thrust between -1 and 1 and 22 and 24 V, of full thrust."""
     truth = collective_thrust(ACTION, BATTERY_V, np.array(PLANT.coeffs))
-    thrust = collective_thrust(ACTION, BATTERY_V, np.asarray(found.estimate.model.thrust_coeffs))
+    thrust = collective_thrust(ACTION, BATTERY_V, np.asarray(result.estimate.model.thrust_coeffs))
     return float(np.abs(thrust - truth).max() / truth.max())
 
 
-def tau_error(found):
-    return float(np.abs(found.estimate.model.tau / np.array(PLANT.tau) - 1.0).max())
+def tau_error(result):
+    return float(np.abs(result.estimate.model.tau / np.array(PLANT.tau) - 1.0).max())
 
 
-def half_widths(found):
-    return {name: 0.5 * (high - low) for name, (_, low, high) in found.intervals.items()}
+def half_widths(result):
+    return {name: 0.5 * (high - low) for name, (_, low, high) in result.intervals.items()}
 
 
 ABLE = {
@@ -74,8 +74,8 @@ ABLE = {
 @pytest.mark.slow
 @pytest.mark.parametrize(("log_of", "tolerance"), ABLE.values(), ids=ABLE)
 def test_truth_is_found_from_fewer_channels_and_at_other_steps(exact, log_of, tolerance):
-    found = fit(log_of(exact))
-    assert tau_error(found) < tolerance and map_error(found) < tolerance
+    result = fit(log_of(exact))
+    assert tau_error(result) < tolerance and map_error(result) < tolerance
 
 
 @pytest.mark.parametrize("is_one_flight", [False, True])
@@ -129,9 +129,9 @@ def dragged():
 
 @pytest.mark.slow
 def test_drag_is_found(dragged):
-    found = fit(dragged, effects=("linear_drag",))
-    assert_allclose(found.estimate.model.effect("linear_drag"), DRAG, rtol=1e-4)
-    assert tau_error(found) < 1e-4 and map_error(found) < 1e-4 and not found.warnings
+    result = fit(dragged, effects=("linear_drag",))
+    assert_allclose(result.estimate.model.effect("linear_drag"), DRAG, rtol=1e-4)
+    assert tau_error(result) < 1e-4 and map_error(result) < 1e-4 and not result.warnings
 
 
 def at_rest(log):
@@ -188,8 +188,8 @@ def test_result_as_text_and_json(fitted):
 
 def test_replacing_values_changes_those_alone_and_refuses_unknown_names():
     model = PLANT.model()
-    changed = dict(zip(BASE, to_vector(with_values(model, {"tau_yaw": 0.07})), strict=True))
-    assert changed == {**TRUTH, "tau_yaw": 0.07}
+    changed = with_values(model, {"tau_yaw": 0.07})
+    assert parameter_values(changed) == {**TRUTH, "tau_yaw": 0.07}
     for name in ("tau_jaw", "linear_drag.d_x", ""):
         with pytest.raises(KeyError, match=f"{name}: unknown; expected of tau_roll"):
             with_values(model, {name: 1.0})
