@@ -127,14 +127,20 @@ def test_probes_show_the_effect(effect):
 GYRO, ACCELEROMETER, POSE = {*range(21, 24)}, {*range(24, 27)}, {*range(27, 37)}
 FORCE = {*range(0, 9), *range(27, 33)} | ACCELEROMETER
 TURN = {*range(9, 16), *range(33, 37)} | GYRO
-CHANGES = {"command": set(range(37)) - {20}, "rates": TURN, "thrust": FORCE, "air": FORCE}
-CHANGES |= {
-    "lag": CHANGES["command"],
-    "respond": CHANGES["command"],
+BUT_BATTERY = set(range(37)) - {20}
+CHANGES = {
+    "command": BUT_BATTERY,
+    "lag": BUT_BATTERY,
+    "respond": BUT_BATTERY,
+    "rates": TURN,
+    "thrust": FORCE,
+    "air": FORCE,
     "force": FORCE,
     "battery": {20},
+    "gyro": GYRO,
+    "accelerometer": ACCELEROMETER,
+    "pose": POSE,
 }
-CHANGES |= {"gyro": GYRO, "accelerometer": ACCELEROMETER, "pose": POSE}
 
 
 @OVER_EFFECTS

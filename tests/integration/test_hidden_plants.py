@@ -1,18 +1,15 @@
 """Plants with hidden effects: equations, motion, flights and logs. A diagnosis is graded on them.
 
-Fine motion is that of SciPy's integrator on the same differential equations, and the package's
-continuous motion converges to it (tests/unit/test_motion.py); the plants that a policy races on, in
-JAX, fly as those in plain floats.
+The package's continuous motion, which shares no code, converges to fine motion
+(tests/unit/test_motion.py). The plants that a policy races on, in JAX, fly as those in plain
+floats.
 """
 
 from dataclasses import replace
-from itertools import pairwise
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.spatial.transform import Rotation
 
 from benchmarks import hidden
 from benchmarks.loop.plants import EFFECTS, draw_plant_with_law
@@ -27,10 +24,9 @@ from tests.support.tables import table
 
 START = Start((1.0, -2.0, 6.0), 0.7, 23.8, -0.2)
 LOOP_STEPS = 120
-STEP_S, STEPS = 0.01, 100
 MOVING_EFFECTS = table("moving_effects")
-DELAY_S = MOVING_EFFECTS["command_delay"]["delay_s"]
-LATENCY_S, MOCAP_S = MOVING_EFFECTS["imu_latency"]["latency_s"], 0.0246
+MOCAP_LATE_MS, IMU_LATE_MS = 4, round(1e3 * MOVING_EFFECTS["imu_latency"]["latency_s"])
+LATE_MS = dict.fromkeys("pvq", MOCAP_LATE_MS) | dict.fromkeys(("f", "w", "slope"), IMU_LATE_MS)
 # A thousandth of the sensors' noise or less (slopes: of 140 rad/s^2, times an arm of 0.06 m).
 FINE_ERRORS = {"p": 1e-4, "v": 1e-4, "q": 5e-5, "f": 1e-3, "w": 1e-3, "slope": 0.1}
 MINUTE_S = 60.0
@@ -45,17 +41,13 @@ def flown(truth, seconds=MINUTE_S, seed=1):
     return hidden.fly(truth, seconds, np.random.default_rng(seed))
 
 
-def open_loop(truth, count=150, start=START):
-    """Return what a plant does, flown by random steps of the sticks."""
-    return flown_in_floats(truth, random_sticks(count), start)
-
-
 def test_ground_effect_fades_with_the_height():
     low = START._replace(pos_w=(0.0, 0.0, 0.3))
-    own = open_loop(base(ground_effect={"gain": 0.5, "height_m": 0.3}), 1, low)["f"]
-    np.testing.assert_allclose(
-        own, open_loop(base(), 1, low)["f"] * [1.0, 1.0, 1.0 + 0.5 * np.exp(-1.0)]
+    lifted, plain = (
+        flown_in_floats(truth, random_sticks(10), low)["f"][0]
+        for truth in (base(ground_effect={"gain": 0.5, "height_m": 0.3}), base())
     )
+    np.testing.assert_allclose(lifted, plain * [1.0, 1.0, 1.0 + 0.5 * np.exp(-1.0)])
 
 
 # Laws that the package has as well are flown against its own (tests/unit/test_effect_laws.py).
@@ -130,84 +122,45 @@ def test_noise_has_its_standard_deviation_tails_and_colour(noise, clean):
 
 
 def test_the_accelerometer_feels_gusts():
-    calm = open_loop(base(), 6000)
+    sticks = random_sticks(6000)
+    calm = flown_in_floats(base(), sticks, START)
     for std in (0.3, 1.5):
-        seen = open_loop(replace(base(), gust=hidden.Gust(std, 0.3, 0.05)), 6000)
+        gust = hidden.Gust(std, 0.3, 0.05)
+        seen = flown_in_floats(replace(base(), gust=gust), sticks, START)
         # Thrust has no part in body x and y.
         assert np.std(seen["f"][:, :2]) == pytest.approx(std, rel=0.15)
         assert 0.04 < np.std(seen["w"] - calm["w"]) < 0.06
 
 
-def derivative(own, time_s, x, stick):
-    """Return dx/dt of position, velocity, attitude, lagged sticks, rates, slopes; and the force."""
-    _, vel_w, quat, applied, rates, slopes = np.split(x, [3, 6, 10, 14, 17])
-    change = (stick - applied) / np.array(own.tau)
-    volt = START.open_v - own.drain * time_s / 60.0 - 0.8 * (0.5 + 0.5 * applied[3]) ** 2
-    u = applied[3]
-    thrust = np.dot(own.coeffs, [1.0, u, u * u, u**3, volt, u * volt]) / own.mass
-    asked = np.radians(own.max_rate) * applied[:3]
-    asked += np.array([0.01 * thrust, -0.005 * thrust, 0.05 * change[3]])
-    attitude = Rotation.from_quat(quat, scalar_first=True)
-    air_b = attitude.inv().apply(vel_w)
-    force_b = (
-        [0.0, 0.0, thrust]
-        - np.array([0.3, 0.2, 0.1]) * air_b
-        - 0.02 * thrust * air_b * [1.0, 1.0, 0.0]
-    )
-    w, axis = quat[0], quat[1:]
-    spin = 0.5 * np.concatenate([[-axis @ rates], w * rates + np.cross(axis, rates)])
-    damping, lag_s = np.array([0.6, 0.8, 0.5]), np.array([0.02, 0.025, 0.015])
-    bend = (2.0 * damping / lag_s) ** 2 * (asked - rates - lag_s * slopes)
-    acc_w = attitude.apply(force_b) - [0.0, 0.0, own.gravity]
-    return np.concatenate([vel_w, acc_w, spin, change, slopes, bend]), force_b
+def test_fine_motion_has_converged_and_late_sensors_read_the_past(monkeypatch):
+    """The flight in parts of 0.1 ms, logged at 1 kHz without late sensors, is the reference."""
+    late = replace(base(**MOVING_EFFECTS), motion="fine", mocap_late_s=1e-3 * MOCAP_LATE_MS)
+    effects = {name: MOVING_EFFECTS[name] for name in MOVING_EFFECTS if name != "imu_latency"}
+    on_time = replace(late, effects=effects, mocap_late_s=0.0, step_s=1e-3)
+    sticks = random_sticks(100)
+    ends = np.arange(len(sticks)) * 10 + 9  # of the steps, as rows at 1 kHz
+    default_s = drone.MAX_SUBSTEP_S
 
+    def flown_in_parts(truth, sticks, part_s):
+        monkeypatch.setattr(drone, "MAX_SUBSTEP_S", part_s)
+        return flown_in_floats(truth, sticks, START)
 
-def integrated(own):
-    """Return the same from DOP853, between the times of arriving commands and sensor readings."""
-    sticks, rows = random_sticks(STEPS), np.arange(STEPS + 1) * STEP_S
-    felt_s, tracked_s = rows[1:] - LATENCY_S % STEP_S, rows[1:] - MOCAP_S % STEP_S
-    times = np.unique(np.round([0.0, *rows, *(rows + DELAY_S), *felt_s, *tracked_s], 9))
-    times = times[times <= rows[-1] + 1e-9]
-    quat = [np.cos(0.35), 0.0, 0.0, np.sin(0.35)]
-    x = np.concatenate(
-        [START.pos_w, np.zeros(3), quat, np.zeros(3), [START.thrust_stick], np.zeros(6)]
-    )
-    found: dict[str, list] = {name: [] for name in FINE_ERRORS}
-    for begin, end in pairwise(times):
-        number = int(np.floor((0.5 * (begin + end) - DELAY_S) / STEP_S))
-        acting = sticks[max(number, 0)]
+    exact = flown_in_parts(on_time, np.repeat(sticks, 10, axis=0), 1e-4)
+    mean_slopes = 0.5 * (exact["slope"][1:] + exact["slope"][:-1])
+    slope_errors = np.diff(exact["w"], axis=0) / on_time.step_s - mean_slopes
+    assert np.median(np.abs(slope_errors)) < 0.01  # of 140; larger where a command arrives
 
-        def slope(time_s, x, acting=acting):
-            return derivative(own, time_s, x, acting)[0]
-
-        x = solve_ivp(slope, (begin, end), x, "DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
-        if np.abs(felt_s - end).min() < 1e-8:
-            for name, value in zip(
-                "fw", (derivative(own, end, x, acting)[1], x[14:17]), strict=True
-            ):
-                found[name].append(value)
-            found["slope"].append(x[17:])
-        if np.abs(tracked_s - end).min() < 1e-8:
-            for name, value in zip("pvq", np.split(x[:10], [3, 6]), strict=True):
-                found[name].append(value)
-    return {name: np.array(values) for name, values in found.items()}
-
-
-@pytest.mark.slow
-def test_fine_motion_obeys_the_differential_equations(monkeypatch):
-    own = replace(base(**MOVING_EFFECTS), motion="fine", mocap_late_s=MOCAP_S)
-    exact = integrated(own)
-
-    def errors():
-        seen = open_loop(own, STEPS)
+    def errors(part_s):
+        seen = flown_in_parts(late, sticks, part_s)
         assert np.abs(np.linalg.norm(seen["q"], axis=1) - 1.0).max() < 1e-12
-        return {name: float(np.abs(seen[name] - values).max()) for name, values in exact.items()}
+        return {
+            name: np.abs(seen[name] - exact[name][ends - LATE_MS[name]]).max()
+            for name in FINE_ERRORS
+        }
 
-    found = errors()
-    assert all(found[name] < bound for name, bound in FINE_ERRORS.items()), found
-    monkeypatch.setattr(drone, "MAX_SUBSTEP_S", 0.5 * drone.MAX_SUBSTEP_S)
-    halved = errors()
-    assert all(found[name] > 3.0 * halved[name] for name in exact), (found, halved)
+    coarse, halved = errors(default_s), errors(0.5 * default_s)
+    assert all(coarse[name] < bound for name, bound in FINE_ERRORS.items()), coarse
+    assert all(coarse[name] > 3.0 * halved[name] for name in FINE_ERRORS), (coarse, halved)
 
 
 @pytest.mark.parametrize("motion", hidden.MOTIONS)

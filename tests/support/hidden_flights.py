@@ -9,7 +9,7 @@ from flytrack_bench.hidden import HiddenDrone, Start
 
 LOW_START = Start((1.0, -2.0, 3.0), 0.7, 23.5, -0.3)
 # The state as the handout has it; what is tracked and what is felt of each step.
-COLUMNS = {"x": 21, "p": 3, "v": 3, "q": 4, "f": 3, "w": 3, "slope": 3}
+COLUMNS = ("x", "p", "v", "q", "f", "w", "slope")
 
 
 def scripted(seed, seconds, noise="sensors", **changes):
@@ -30,17 +30,12 @@ def flown_in_floats(truth, commands, start=LOW_START):
     plant, rows = HiddenDrone(truth, start, np.random.default_rng(5)), []
     for command in np.asarray(commands, float).tolist():
         plant.step(tuple(command))
-        rows.append(np.concatenate([state_of(plant), *plant.tracked, *plant.felt]))
-    parts = np.split(np.array(rows), np.cumsum(list(COLUMNS.values()))[:-1], axis=1)
-    return dict(zip(COLUMNS, parts, strict=True))
+        rows.append((state_of(plant), *plant.tracked, *plant.felt))
+    columns = map(np.array, zip(*rows, strict=True))
+    return dict(zip(COLUMNS, columns, strict=True))
 
 
-def random_sticks(num_steps, seed=4):
+def random_sticks(num_steps):
     """Return steps of the sticks at random, each held for ten steps, (num_steps, 4)."""
-    sticks = np.random.default_rng(seed).uniform(-1.0, 1.0, (-(-num_steps // 10), 4)) * [
-        0.5,
-        0.5,
-        1.0,
-        1.0,
-    ]
-    return np.repeat(sticks, 10, axis=0)[:num_steps]
+    sticks = np.random.default_rng(4).uniform(-1.0, 1.0, (num_steps // 10, 4))
+    return np.repeat(sticks * [0.5, 0.5, 1.0, 1.0], 10, axis=0)
