@@ -57,18 +57,12 @@ class Rails(Plant):
         return state[0]
 
 
-def write_checkpoint(
-    path,
-    env_id="FlyTrackRandomized-v0",
-    track="flytrack",
-    hidden_sizes=(8,),
-    memory_size=0,
-):
+def write_checkpoint(path, env_id="FlyTrackRandomized-v0", track="flytrack", hidden_sizes=(8,)):
     """Write a policy that has learned nothing, with all that a checkpoint tells."""
     env = make(
         env_id, track=track, model=nominal_parameters().with_effects(LinearDrag(0.3, 0.3, 0.1))
     )
-    config = Config(hidden_sizes=hidden_sizes, memory_size=memory_size)
+    config = Config(hidden_sizes=hidden_sizes)
     size = env.observation_space().shape[0]
     params = make_network(config).init(jax.random.key(5), jnp.zeros((1, size)))
     uneven = jax.tree.map(

@@ -8,30 +8,20 @@ from flytrack_env.effects import LinearDrag, RotorDrag
 from flytrack_env.motors import NAMES
 
 
-def crafts(count=1, **changes):
-    """Return crafts of 0.8 kg with 6.5 inch frames; ``changes`` replace fields."""
-    frame = np.array([[-0.08, -0.1], [0.09, -0.09], [-0.08, 0.1], [0.09, 0.09]])
-    places = np.concatenate([frame, np.zeros((4, 1))], axis=1)
-
-    def each(value):
-        return np.tile(np.asarray(value, float), (count, *[1] * np.ndim(value)))
-
+def crafts(**changes):
+    """Return one craft of 0.8 kg with a 6.5 inch frame; ``changes`` replace fields."""
     fields = {
-        "mass": each(0.8),
-        "inertia": each(np.diag([0.004, 0.005, 0.008])),
-        "places": each(places),
-        "thrust": each(np.full(4, 6.0)),
-        "linear": each(0.2),
-        "yaw_arm": each(0.013),
-        "momentum": each(0.01),
-        "up_s": each(0.025),
-        "down_s": each(0.04),
-        "drag": each(np.zeros(3)),
-        "quadratic": each(np.zeros(3)),
-        "rotor_drag": each(0.0),
-        "damping": each(np.zeros(3)),
-    }
-    return Crafts(**{**fields, **{name: each(value) for name, value in changes.items()}})
+        "mass": 0.8,
+        "inertia": np.diag([0.004, 0.005, 0.008]),
+        "places": [[-0.08, -0.1, 0.0], [0.09, -0.09, 0.0], [-0.08, 0.1, 0.0], [0.09, 0.09, 0.0]],
+        "thrust": np.full(4, 6.0),
+        "linear": 0.2,
+        "yaw_arm": 0.013,
+        "momentum": 0.01,
+        "up_s": 0.025,
+        "down_s": 0.04,
+    } | changes
+    return Crafts(**{name: np.array([value], float) for name, value in fields.items()})
 
 
 def model_of(crafts):
