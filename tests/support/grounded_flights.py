@@ -14,18 +14,18 @@ TAU_THRUST_S = 0.036
 NOISE = {"w": 0.02, "f": 0.3}  # rad/s, m/s^2: idle propellers shake
 
 
-def stands_flies_and_lands(step_s=STEP_S, seed=0):
+def stands_flies_and_lands(seed=0):
     """Return a log that stands until TAKE_OFF_S and from LANDING_S on.
 
     Thrust is linear in throttle.
     """
-    time = np.arange(0.0, END_S, step_s)
+    time = np.arange(0.0, END_S, STEP_S)
     rng = np.random.default_rng(seed)
     is_flying = (time >= TAKE_OFF_S) & (time < LANDING_S)
     rates, phases = rng.uniform(2.0, 8.0, (4, 3)), rng.uniform(0.0, 2.0 * np.pi, (4, 3))
     waves = np.sin(time[:, None, None] * rates + phases).mean(axis=2)
     throttle = np.where(is_flying, HOVER + 0.2 * waves[:, 3], IDLE * (time > 1.0))
-    keep = np.exp(-step_s / TAU_THRUST_S)
+    keep = np.exp(-STEP_S / TAU_THRUST_S)
     thrust = lfilter([1.0 - keep], [1.0, -keep], throttle)
     turns = 3.0 * waves[:, :3] * is_flying[:, None]
     force = np.zeros((len(time), 3))
@@ -39,13 +39,7 @@ def stands_flies_and_lands(step_s=STEP_S, seed=0):
     return FlightLog(time, channels, np.zeros(len(time), int))
 
 
-def falls(
-    kind,
-    noise=1.0,
-    terminal_speed=12.0,
-    throttle=0.0,
-    seed=0,
-):
+def falls(kind, noise, terminal_speed, throttle, seed):
     """Return a flight of 10 s, a fall of 10 s that does not turn, and a flight of 10 s.
 
     Args:
@@ -59,17 +53,17 @@ def falls(
     flight = stands_flies_and_lands(seed=seed)
     part = flight.select((flight.time >= TAKE_OFF_S + 0.1) & (flight.time < LANDING_S - 0.1))
     num_fall = round(10.0 / STEP_S)
-    thrust, speed, felt = GRAVITY * throttle / HOVER, 0.0, np.zeros(num_fall)
-    for row in range(num_fall):
-        drag = GRAVITY * (speed / terminal_speed) ** 2 if kind == "descent" else 0.0
-        felt[row] = thrust + drag
-        speed += STEP_S * (GRAVITY - felt[row])
+    thrust, time = GRAVITY * throttle / HOVER, STEP_S * np.arange(num_fall)
+    felt = np.full(num_fall, thrust)
+    if kind == "descent":  # the speed rises as a hyperbolic tangent
+        rate = np.sqrt(GRAVITY * (GRAVITY - thrust)) / terminal_speed
+        felt += (GRAVITY - thrust) * np.tanh(rate * time) ** 2
     rng = np.random.default_rng(seed + 1)
     fall = {
         "u": np.tile([0.0, 0.0, 0.0, 2.0 * throttle - 1.0], (num_fall, 1)),
         "w": noise * NOISE["w"] * rng.standard_normal((num_fall, 3)),
-        "f": noise * NOISE["f"] * rng.standard_normal((num_fall, 3))
-        + felt[:, None] * [0.0, 0.0, 1.0],
+        "f": np.outer(felt, [0.0, 0.0, 1.0])
+        + noise * NOISE["f"] * rng.standard_normal((num_fall, 3)),
         "v_bat": np.full((num_fall, 1), 16.0),
     }
     channels = {name: np.concatenate([part[name], fall[name], part[name]]) for name in fall}

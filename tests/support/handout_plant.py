@@ -40,42 +40,32 @@ class HandoutPlant:
         return ModelParameters(*arrays, 1.0, self.gravity, self.drain)
 
     def __call__(self, x, u, dt=None):
-        """Return the state ``dt`` later, (..., 21)."""
+        """Return the state ``dt`` later, (21,) or (n, 21)."""
         dt = self.dt if dt is None else dt
-        x = np.asarray(x, float)
-        p, v, q, applied, volt = x[..., 0:3], x[..., 3:6], x[..., 9:13], x[..., 16:20], x[..., 20]
+        rows = np.atleast_2d(np.asarray(x, float))
+        p, v, applied, volt = rows[:, 0:3], rows[:, 3:6], rows[:, 16:20], rows[:, 20]
         applied = applied + (1.0 - np.exp(-dt / np.array(self.tau))) * (u - applied)
-        omega = np.radians(np.array(self.max_rate) * applied[..., :3])
-        # q (x) [0, omega] as a matrix product, from the left
-        w, i, j, k = np.moveaxis(q, -1, 0)
-        left = np.array([[-i, -j, -k], [w, -k, j], [k, w, -i], [-j, i, w]])
-        turned = q + 0.5 * dt * np.einsum("ab...,...b->...a", left, omega)
-        s = applied[..., 3]
+        omega = np.radians(np.array(self.max_rate) * applied[:, :3])
+        attitude = Rotation.from_quat(rows[:, 9:13], scalar_first=True)
+        # q + 0.5 dt q (x) [0, omega], normalised
+        half_turn = np.insert(0.5 * dt * omega, 0, 1.0, axis=1)
+        turned = attitude * Rotation.from_quat(half_turn, scalar_first=True)
+        s = applied[:, 3]
         c = self.coeffs
         thrust = c[0] + c[1] * s + c[2] * s**2 + c[3] * s**3 + c[4] * volt + c[5] * s * volt
-        body_to_world = rotation(q)
-        speed_b = np.einsum("...ji,...j->...i", body_to_world, v)
-        force_b = -np.array(self.drag_b) * speed_b
-        force_b[..., 2] += thrust
-        a = np.einsum("...ij,...j->...i", body_to_world, force_b) - [0.0, 0.0, self.gravity]
-        return np.concatenate(
-            [
-                p + v * dt + 0.5 * a * dt**2,
-                v + a * dt,
-                a,
-                turned / np.linalg.norm(turned, axis=-1, keepdims=True),
-                omega,
-                applied,
-                (volt - self.drain / 60.0 * dt)[..., None],
-            ],
-            axis=-1,
-        )
-
-
-def rotation(quat):
-    """Return rotation matrices, body to world, (..., 3, 3)."""
-    matrices = Rotation.from_quat(quat.reshape(-1, 4), scalar_first=True).as_matrix()
-    return matrices.reshape(*quat.shape[:-1], 3, 3)
+        force_b = -np.array(self.drag_b) * attitude.inv().apply(v)
+        force_b[:, 2] += thrust
+        a = attitude.apply(force_b) - [0.0, 0.0, self.gravity]
+        after = [
+            p + v * dt + 0.5 * a * dt**2,
+            v + a * dt,
+            a,
+            turned.as_quat(scalar_first=True),
+            omega,
+            applied,
+            volt - self.drain / 60.0 * dt,
+        ]
+        return np.column_stack(after).reshape(np.shape(x))
 
 
 def states_of(log):
