@@ -29,6 +29,7 @@ CLAIM = re.compile(r"^(- \*\*|\| \[).*?(?=^- |^\| |^$)", re.MULTILINE | re.DOTAL
 NUMBER = re.compile(r"(?<![\w.,-])\d+(?:[.,]\d+)*(?:e\+\d+)?(?![\w-])")
 FAST = "wrappers.md"  # one page's examples run in the fast tests
 RUN = (
+    FAST,
     "environment.md",
     "effects.md",
     "gymnasium.md",
@@ -37,8 +38,12 @@ RUN = (
     "real_logs.md",
     "check.md",
     "camera.md",
+    "diagnosis.md",
+    "quick_start.md",
+    "faq.md",
+    "exercise.md",
+    "../README.md",
 )
-RUN = (FAST, *RUN, "diagnosis.md", "quick_start.md", "faq.md", "exercise.md", "../README.md")
 
 
 def test_every_public_package_is_in_the_reference():
@@ -64,13 +69,13 @@ def test_what_a_page_imports_is_public(path):
 
 def claims(path):
     """Return the lines of a page that link to a result, each with the text of the result's page."""
-    found = []
+    lines = []
     for match in CLAIM.finditer(path.read_text(encoding="utf-8")):
         (target,) = re.findall(r"\]\((?:docs/results/)?(\w+\.md)\)", match[0])
         page = (DOCS / "results" / target).read_text(encoding="utf-8")
         cells = match[0].split("|")[2:4] if match[0].startswith("|") else [match[0].split("](")[0]]
-        found.append((" ".join(cells), page))
-    return found
+        lines.append((" ".join(cells), page))
+    return lines
 
 
 @pytest.mark.parametrize("path", READ_FIRST, ids=lambda path: path.name)
@@ -120,7 +125,10 @@ def test_every_constant_of_the_diagnosis_says_what_it_means():
         ("SILENT", "5", ""),
     ]
     silent = [
-        (module, one.names) for module, _, many in modules() for one in many if not one.comment
+        (module, constant.names)
+        for module, _, constants in modules()
+        for constant in constants
+        if not constant.comment
     ]
     assert not silent, f"expected a unit, a meaning or a reason in a comment beside {silent}"
 

@@ -41,10 +41,10 @@ CHECKED = [
 CRASH = np.full(4, np.nan, np.float32)  # an action that ends the episode
 
 
-def make_vector(env_id=BASE, num_envs=3, **arguments):
-    """Return the vector environment of an id."""
+def make_vector(num_envs=3, **arguments):
+    """Return the vector environment."""
     return gymnasium.make_vec(
-        env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **arguments
+        BASE, num_envs=num_envs, vectorization_mode="vector_entry_point", **arguments
     )
 
 
@@ -185,10 +185,10 @@ def test_64_bit_numbers_may_be_switched_on_between_steps():
     again = env.step(np.zeros(4))
     env.reset(seed=3)
     expected = env.step(np.zeros(4)), env.step(np.zeros(4))
-    for found, step in zip((with_x64, again), expected, strict=True):
-        assert_allclose(found[0], step[0], atol=2e-5)
-        assert found[2:4] == step[2:4]
-        assert found[4] == pytest.approx(step[4], abs=2e-5)
+    for step, expected_step in zip((with_x64, again), expected, strict=True):
+        assert_allclose(step[0], expected_step[0], atol=2e-5)
+        assert step[2:4] == expected_step[2:4]
+        assert step[4] == pytest.approx(expected_step[4], abs=2e-5)
 
 
 # --- Seeding ------------------------------------------------------------------------------------

@@ -8,9 +8,6 @@ import json
 import re
 import struct
 import zlib
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,7 +18,6 @@ from tests.support.tables import table
 from tests.support.written_logs import read_mapping
 
 FLIP = np.array([1.0, -1.0, -1.0])  # FLU to FRD; north, west, up to NED
-Rows = list[tuple[Any, ...]]
 
 
 def flying(num_rows=30, step_s=0.01, start_s=1.0):
@@ -46,8 +42,13 @@ def _rows(stamps, *columns):
 
 ULOG_TYPES = {"uint64_t": "Q", "float": "f", "bool": "?"}
 PX4_FULL_STICK_DEG_S = (720.0, 360.0, 180.0)
-PX4_PARAMETERS = {"MC_ACRO_R_MAX": 720.0, "MC_ROLLRATE_MAX": 220.0, "MC_ACRO_P_MAX": 360.0}
-PX4_PARAMETERS |= {"MC_ACRO_Y_MAX": 90.0, "MC_YAWRATE_MAX": 180.0}
+PX4_PARAMETERS = {
+    "MC_ACRO_R_MAX": 720.0,
+    "MC_ROLLRATE_MAX": 220.0,
+    "MC_ACRO_P_MAX": 360.0,
+    "MC_ACRO_Y_MAX": 90.0,
+    "MC_YAWRATE_MAX": 180.0,
+}
 
 
 def ulog_message(kind, content):
@@ -111,25 +112,23 @@ BLACKBOX_NAMES = [
     "time",
     *(f"setpoint[{axis}]" for axis in range(4)),
     "vbatLatest",
+    *(f"gyroADC[{axis}]" for axis in range(3)),
+    *(f"accSmooth[{axis}]" for axis in range(3)),
 ]
-BLACKBOX_NAMES += [f"{sensor}[{axis}]" for sensor in ("gyroADC", "accSmooth") for axis in range(3)]
 
 
 def _variable_bytes(value, is_signed):
     """Return a whole number as blackbox logs have it: zigzag if signed, seven bits a byte."""
-    rest = (value << 1 if value >= 0 else (-value << 1) - 1) if is_signed else value
+    if is_signed:
+        value = 2 * value if value >= 0 else -2 * value - 1
     content = bytearray()
-    while rest > 0x7F:
-        content.append(rest & 0x7F | 0x80)
-        rest >>= 7
-    return bytes([*content, rest])
+    while value > 0x7F:
+        content.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*content, value])
 
 
-def blackbox(
-    rows,
-    names=BLACKBOX_NAMES,
-    headers=BLACKBOX_HEADERS,
-):
+def blackbox(rows, names=BLACKBOX_NAMES, headers=BLACKBOX_HEADERS):
     """Return a blackbox log of full frames only: rows (num_rows, len(names)) of whole numbers."""
     signed = [int(name not in ("loopIteration", "time")) for name in names]
     lines = {
@@ -180,8 +179,6 @@ COPTER_PARAMETERS = {
     "FRAME_CLASS": 1.0,
 }
 COPTER_FULL_STICK_DEG_S = (500.0, 360.0, 180.0)
-# Of a message: types and names of its fields, of which the first is the time, us; and its rows.
-Messages = dict[str, tuple[str, str, Rows]]
 
 
 def dataflash(
@@ -189,7 +186,11 @@ def dataflash(
     parameters=COPTER_PARAMETERS,
     text="ArduCopter V4.5.1 (d4a1b2c3)",
 ):
-    """Return an ArduPilot log; messages are written one kind after the other."""
+    """Return an ArduPilot log; messages are written one kind after the other.
+
+    Args:
+        messages: by name, types and names of fields, of which the first is the time (us), and rows.
+    """
     stored = [(0, name, value) for name, value in parameters.items()]
     messages = {
         "FMT": ("BBnNZ", "Type,Length,Name,Format,Columns", []),
@@ -201,11 +202,13 @@ def dataflash(
     def pattern(types):
         return "<" + "".join(DATAFLASH_TYPES[kind] for kind in types)
 
+    def pack_value(kind, value):
+        if isinstance(value, str):
+            return value.encode()
+        return value if kind == "f" else round(value)
+
     def packed(number, types, row):
-        values = []
-        for kind, value in zip(types, row, strict=True):
-            is_text = isinstance(value, str)
-            values.append(value.encode() if is_text else value if kind == "f" else round(value))
+        values = map(pack_value, types, row)
         return DATAFLASH_HEAD + bytes([number]) + struct.pack(pattern(types), *values)
 
     formats, rows = b"", b""
@@ -219,13 +222,10 @@ def dataflash(
 def dataflash_messages(log):
     """Return the messages of a flight: FRD and NED, degrees, all at the same times."""
     stamps, zero = np.round(1e6 * log.time), np.zeros(len(log))
-    setpoints = (log["u"][:, :3] * COPTER_FULL_STICK_DEG_S * FLIP).T
-    rates = np.rad2deg(log["w"] * FLIP).T
-    axes = [
-        column
-        for setpoint, rate in zip(setpoints, rates, strict=True)
-        for column in (setpoint, rate, zero)
-    ]
+    setpoints = log["u"][:, :3] * COPTER_FULL_STICK_DEG_S * FLIP
+    rates = np.rad2deg(log["w"] * FLIP)
+    outputs = np.zeros_like(rates)
+    axes = np.stack([setpoints, rates, outputs], axis=2).reshape(len(log), 9)
     throttle = 0.5 * (log["u"][:, 3] + 1.0)
     messages = {
         "BAT": ("QBf", "TimeUS,Instance,Volt", _rows(stamps, zero, log["v_bat"])),
@@ -244,7 +244,7 @@ def dataflash_messages(log):
         rows = _rows(stamps, zero, log["v"] * FLIP, log["p"] * FLIP)
         messages["XKF1"] = ("QBffffff", "TimeUS,C,VN,VE,VD,PN,PE,PD", rows)
     columns = "TimeUS,RDes,R,ROut,PDes,P,POut,YDes,Y,YOut,ADes,A,AOut"
-    rows = _rows(stamps, *axes, zero, zero, throttle)
+    rows = _rows(stamps, axes, zero, zero, throttle)
     messages["RATE"] = ("Qffffffffffff", columns, rows)
     return messages
 
@@ -302,7 +302,7 @@ def save_messages(path, messages):
     from mcap.writer import Writer
 
     with path.open("wb") as file:
-        writer, topics = Writer(file), dict[str, int]()
+        writer, topics = Writer(file), {}
         writer.start()
         schema = writer.register_schema("any", "jsonschema", b"{}")
         for topic, time_ns, content in messages:
@@ -347,7 +347,7 @@ def write_csv_files(folder, log):
 
 # Of each kind of log: its format, and what writes a flight to a folder and returns the log and the
 # mapping to read it with.
-WRITERS: dict[str, tuple[str, Callable[[Path, FlightLog], tuple[Path, Path | None]]]] = {
+WRITERS = {
     "ULog": ("ulog", write_ulog),
     "blackbox": ("betaflight", write_betaflight),
     "DataFlash": ("dataflash", write_dataflash),
