@@ -13,28 +13,33 @@ from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.networks import Policy
 from baselines.purejaxrl_ppo.polish import LostError, Settings, decay_gradient, polish
 from benchmarks.champion import CHAMPION, FOLDER, MODEL
-from flytrack_env import blackbox, load_model, make
+from flytrack_env import load_model, make
 from flytrack_env.model_file import model_from_json
 from flytrack_env.motion import Motion
 from flytrack_env.references import model_digest, shipped_reference
 
 MAX_BYTES = 100_000
-MAX_RATIO, MAX_RATIO_ROBUST, MIN_SUCCESS_ROBUST = 1.03, 1.1, 0.9  # the optimum; of few plants
-MAX_RATIO_CORNERS, MIN_SUCCESS_CORNERS = 1.25, 0.9  # by a camera
+MAX_RATIO_ROBUST, MIN_SUCCESS_ROBUST = 1.1, 0.9  # of few plants
 ROBUST = FOLDER / "robust.safetensors"
 NUM_FLIGHTS, NUM_STEPS, NUM_LAPS = 32, 2500, 3
 SHORT = Settings(updates=20, learning_rate=3e-4, flights=8, laps=1, slowest_lap_s=4.6)
 OFF = 0.03  # of every weight: the champion flies on, slower
 
 
-def test_champion_races_on_the_black_box_near_the_optimum():
-    champion = load_checkpoint(CHAMPION)
-    env = plant_env(champion, blackbox.load(blackbox.SHIPPED))
+@pytest.mark.parametrize(
+    ("name", "min_success", "max_ratio"),
+    [("champion", 1.0, 1.03), ("corners", 0.9, 1.25)],  # the second sees by a camera
+)
+def test_shipped_policies_race_on_the_black_box_near_the_optimum(
+    name, min_success, max_ratio, black_box
+):
+    policy = load_checkpoint(name)
+    env = plant_env(policy, black_box)
     keys = start_keys(7, NUM_FLIGHTS)
-    result = score(race_many(env, champion.policy, keys, NUM_STEPS, NUM_LAPS))
+    result = score(race_many(env, policy.policy, keys, NUM_STEPS, NUM_LAPS))
     optimum = shipped_reference("flytrack", "flying", "black_box")
-    assert result.success == 1.0
-    assert optimum.time_s < result.flying_lap_s <= MAX_RATIO * optimum.time_s
+    assert result.success >= min_success
+    assert optimum.time_s < result.flying_lap_s <= max_ratio * optimum.time_s
 
 
 def test_robust_champion_races_on_plants_that_it_has_not_met():
@@ -42,31 +47,18 @@ def test_robust_champion_races_on_plants_that_it_has_not_met():
     model = load_model(MODEL)
     env = make("FlyTrack-v0", model=model)
     keys, plants = start_keys(8, NUM_FLIGHTS), draw_plants(8, NUM_FLIGHTS, model)
-    flown = race_many(env, champion.policy, keys, NUM_STEPS, NUM_LAPS, models=plants.models)
-    result = score(flown)
+    result = score(race_many(env, champion.policy, keys, NUM_STEPS, NUM_LAPS, models=plants.models))
     optimum = shipped_reference("flytrack", "flying", "black_box")
     assert result.success >= MIN_SUCCESS_ROBUST
     assert result.flying_lap_s <= MAX_RATIO_ROBUST * optimum.time_s
 
 
-def test_a_policy_that_has_a_camera_races_on_the_black_box():
-    policy = load_checkpoint("corners")
-    env = plant_env(policy, blackbox.load(blackbox.SHIPPED))
-    keys = start_keys(9, NUM_FLIGHTS)
-    result = score(race_many(env, policy.policy, keys, NUM_STEPS, NUM_LAPS))
-    optimum = shipped_reference("flytrack", "flying", "black_box")
-    assert result.success >= MIN_SUCCESS_CORNERS
-    assert result.flying_lap_s <= MAX_RATIO_CORNERS * optimum.time_s
-
-
 def test_champion_is_a_small_policy_of_the_model_of_its_reference():
     champion = load_checkpoint(CHAMPION)
     assert champion.training is None and CHAMPION.stat().st_size < MAX_BYTES
-    model = model_from_json(champion.meta["model"], "champion")
-    assert model_digest(model) == model_digest(load_model(MODEL))
-    assert model_digest(model) == model_digest(
-        shipped_reference("flytrack", "flying", "black_box").model
-    )
+    reference = shipped_reference("flytrack", "flying", "black_box")
+    models = (model_from_json(champion.meta["model"], "champion"), load_model(MODEL))
+    assert {model_digest(model) for model in models} == {model_digest(reference.model)}
 
 
 def first_lap_s(env, network, params):

@@ -36,14 +36,6 @@ def test_checkpoints_are_written_at_the_steps_asked_for(whole):
     assert {path.name for path in whole[0].iterdir()} == names
 
 
-def test_a_resumed_run_ends_bit_for_bit(trainer, whole, tmp_path):
-    updates = 2
-    _, metrics = trainer.train(tmp_path, SEED, EVERY_OTHER_UPDATE, step_path(whole[0], updates))
-    assert_same_end(tmp_path / "final.safetensors", whole[0] / "final.safetensors")
-    for name, values in metrics.items():
-        np.testing.assert_array_equal(values, whole[1][name][updates:], err_msg=name)
-
-
 def test_a_complete_run_is_left_alone_and_no_run_is_overwritten(trainer, whole, tmp_path):
     shutil.copytree(whole[0], tmp_path / "run")
     final = tmp_path / "run" / "final.safetensors"
@@ -55,7 +47,9 @@ def test_a_complete_run_is_left_alone_and_no_run_is_overwritten(trainer, whole, 
             trainer.train(final.parent, SEED, resume=resume)
 
 
-def test_the_newest_intact_checkpoint_is_taken(trainer, whole, tmp_path, caplog):
+def test_a_run_resumed_from_the_newest_intact_checkpoint_ends_bit_for_bit(
+    trainer, whole, tmp_path, caplog
+):
     shutil.copytree(whole[0], tmp_path / "cut_off")
     cut_off, newest = tmp_path / "cut_off", step_path(tmp_path / "cut_off", 6)
     (cut_off / "final.safetensors").write_bytes(
@@ -65,13 +59,15 @@ def test_the_newest_intact_checkpoint_is_taken(trainer, whole, tmp_path, caplog)
     content[len(content) // 2] ^= 1
     newest.write_bytes(content)
     with caplog.at_level(logging.WARNING):
-        trainer.train(tmp_path / "resumed", SEED, resume=cut_off)
+        _, metrics = trainer.train(tmp_path / "resumed", SEED, resume=cut_off)
     reports = [record.getMessage() for record in caplog.records]
     assert len(reports) == 2 and "final.safetensors" in reports[0] and newest.name in reports[1]
     assert all(
         "damaged" in report and "the checkpoint before it is used" in report for report in reports
     )
     assert_same_end(tmp_path / "resumed" / "final.safetensors", whole[0] / "final.safetensors")
+    for name, values in metrics.items():
+        np.testing.assert_array_equal(values, whole[1][name][4:], err_msg=name)
 
 
 def test_folders_without_an_intact_checkpoint_are_refused(whole, tmp_path):
@@ -103,20 +99,21 @@ def test_another_machine_or_software_is_a_warning(whole, caplog):
 def test_a_complete_run_is_extended(whole, tmp_path, capsys):
     """The first 7 updates are those of the shorter run; a cut in what follows changes no bit."""
     longer = Trainer(dataclasses.replace(CONFIG, total_timesteps=10 * BATCH), ENV_ID)
-    for name in ("one", "two"):
-        shutil.copytree(whole[0], tmp_path / name)
-    final, metrics = longer.train(tmp_path / "one", SEED, EVERY_OTHER_UPDATE, tmp_path / "one")
+    uncut, cut = tmp_path / "uncut", tmp_path / "cut"
+    for folder in (uncut, cut):
+        shutil.copytree(whole[0], folder)
+    final, metrics = longer.train(uncut, SEED, EVERY_OTHER_UPDATE, uncut)
     assert final.steps == 10 * BATCH and len(metrics["learning_rate"]) == 3
     assert "learning rate: 6e-05 up to step 2688, 0.000942 from there" in capsys.readouterr().out
-    shutil.copy(whole[0] / "final.safetensors", step_path(tmp_path / "two", 7))
-    shutil.copy(step_path(tmp_path / "one", 8), step_path(tmp_path / "two", 8))
-    (tmp_path / "two" / "final.safetensors").unlink()
-    longer.train(tmp_path / "two", SEED, EVERY_OTHER_UPDATE, tmp_path / "two")
-    assert_same_end(tmp_path / "two" / "final.safetensors", final.path)
+    shutil.copy(whole[0] / "final.safetensors", step_path(cut, 7))
+    shutil.copy(step_path(uncut, 8), step_path(cut, 8))
+    (cut / "final.safetensors").unlink()
+    longer.train(cut, SEED, EVERY_OTHER_UPDATE, cut)
+    assert_same_end(cut / "final.safetensors", final.path)
     with pytest.raises(
         CheckpointError, match=f"steps: found {10 * BATCH}, expected at most {7 * BATCH}"
     ):
-        Trainer(CONFIG, ENV_ID).train(tmp_path / "one", SEED, resume=tmp_path / "one")
+        Trainer(CONFIG, ENV_ID).train(uncut, SEED, resume=uncut)
 
 
 def poison(trainer, monkeypatch, from_update):
