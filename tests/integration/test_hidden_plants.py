@@ -52,7 +52,7 @@ def test_ground_effect_fades_with_the_height():
 
 # Laws that the package has as well are flown against its own (tests/unit/test_effect_laws.py).
 def test_an_accelerometer_off_the_centre_feels_the_turn():
-    clean, moved = (flown(base(**own), seconds=4.0) for own in ({}, {"imu_offset": ARM}))
+    clean, moved = (flown(base(**effects), seconds=4.0) for effects in ({}, {"imu_offset": ARM}))
     arm, rates = np.array(list(ARM.values())), clean["w"][1:]
     expected = np.cross(rates, np.cross(rates, arm)) + np.cross(
         np.diff(clean["w"], axis=0) / 0.01, arm
@@ -165,8 +165,8 @@ def test_fine_motion_has_converged_and_late_sensors_read_the_past(monkeypatch):
 
 @pytest.mark.parametrize("motion", hidden.MOTIONS)
 def test_late_motion_capture_and_effects_that_begin_in_the_log(motion):
-    def log(own):
-        return hidden.fly(replace(own, motion=motion), 4.0, np.random.default_rng(2))
+    def log(truth):
+        return hidden.fly(replace(truth, motion=motion), 4.0, np.random.default_rng(2))
 
     rng = np.random.default_rng(5)
     late, sudden = hidden.draw_late(rng), hidden.draw_onset(rng, 4.0)
@@ -187,8 +187,8 @@ def check_flight(truth, without, rng):
     commands = np.repeat(rng.uniform(-1.0, 1.0, (LOOP_STEPS // 4, 4)), 4, axis=0).astype(np.float32)
     expected = flown_in_floats(truth, commands)["x"]
     start = jnp.asarray(state_of(HiddenDrone(truth, LOW_START, rng)), jnp.float32)
-    found = flown_by(HiddenPlant(truth), nominal_parameters(), start, commands)
-    np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-4)
+    states = flown_by(HiddenPlant(truth), nominal_parameters(), start, commands)
+    np.testing.assert_allclose(states, expected, rtol=2e-4, atol=2e-4)
     assert (
         without is None or np.abs(expected - flown_in_floats(without, commands)["x"]).max() > 1e-3
     )

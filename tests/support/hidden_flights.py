@@ -21,8 +21,8 @@ def scripted(seed, seconds, noise="sensors", **changes):
 
 def state_of(plant):
     """Return the handout's vector (21,) of a plant."""
-    own = (plant.pos_w, plant.vel_w, plant.acc_w, plant.quat, plant.rates_b, plant.applied)
-    return np.concatenate([*own, [plant.battery_v]])
+    vectors = (plant.pos_w, plant.vel_w, plant.acc_w, plant.quat, plant.rates_b, plant.applied)
+    return np.concatenate([*vectors, [plant.battery_v]])
 
 
 def flown_in_floats(truth, commands, start=LOW_START):
