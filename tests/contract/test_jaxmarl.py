@@ -1,5 +1,6 @@
 """JaxMARL races our drones: what its own tests ask of an environment, and its wrapper."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import pytest
@@ -37,7 +38,7 @@ def test_it_is_an_environment_of_jaxmarl():
     assert set(rewards) == set(env.agents) and set(dones) == {*env.agents, "__all__"}
     assert infos["rank"].shape == (3,) and env.get_avail_actions(first)["drone_0"].all()
     assert dones["__all__"]
-    assert all(jax.tree.leaves(jax.tree.map(jnp.array_equal, state, given)))
+    chex.assert_trees_all_equal(state, given)
 
 
 @pytest.mark.slow  # it compiles a step with auto-reset

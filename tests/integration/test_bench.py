@@ -2,7 +2,7 @@
 
 import json
 
-import jax
+import chex
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -14,7 +14,7 @@ from flytrack_bench import Data, DataError, cli, load_policy, load_suite, result
 from flytrack_bench.policies import Function, Policy, PolicyError
 from flytrack_bench.suite import FOLDER, digest_of
 from flytrack_env.jobs import ClusterError, Outcome
-from flytrack_env.tracks import TrackError, load_track
+from flytrack_env.tracks import load_track
 from flytrack_loop.adapt import Adapted
 from tests.support.refusals import refused, run
 from tests.support.small_suite import CENTRED, hover, write_small_suite
@@ -32,16 +32,12 @@ def test_the_suite_is_what_its_seed_draws(tmp_path):
     for name in drawn.TRACK_SEEDS:
         rows = [load_track(folder / "v1" / f"{name}.toml").rows() for folder in (tmp_path, FOLDER)]
         assert_allclose(*rows, rtol=1e-12, atol=1e-12)
-    suites = [
+    drawn_tasks, tasks = (
         json.loads((folder / "v1.json").read_text())["tasks"] for folder in (tmp_path, FOLDER)
-    ]
-    for again, task in zip(*suites, strict=True):
-        assert all(again[name] == task[name] for name in ("id", "track", "optimal_lap_s"))
-        assert jax.tree.structure(again["craft"]) == jax.tree.structure(task["craft"])
-        crafts = [
-            np.array(jax.tree.leaves(suite_task["craft"]), float) for suite_task in (again, task)
-        ]
-        assert_allclose(*crafts, rtol=1e-14)
+    )
+    for drawn_task, task in zip(drawn_tasks, tasks, strict=True):
+        assert all(drawn_task[name] == task[name] for name in ("id", "track", "optimal_lap_s"))
+        chex.assert_trees_all_close(drawn_task["craft"], task["craft"], rtol=1e-14)
     suite = load_suite("v1")
     assert sum(task.craft is not None for task in suite.tasks) == 8 and len(suite.tasks) == 12
 
@@ -79,7 +75,7 @@ def test_a_cluster_is_given_whole_paths(small, tmp_path, monkeypatch):
     assert sent[0].suite == str(tmp_path / "small.json")
 
 
-def test_a_changed_suite_is_refused(small, monkeypatch):
+def test_a_changed_suite_is_refused(small):
     content = json.loads(small.read_text()) | {"starts": 1}
     small.write_text(json.dumps(content))
     with pytest.raises(ValueError, match="digest"):
@@ -87,7 +83,7 @@ def test_a_changed_suite_is_refused(small, monkeypatch):
     content["tasks"][0]["track"] = "speedway"
     content["digest"] = digest_of(content)
     small.write_text(json.dumps(content))
-    with pytest.raises((ValueError, TrackError), match="the track was changed"):
+    with pytest.raises(ValueError, match="the track was changed"):
         load_suite(small)
 
 
