@@ -49,11 +49,12 @@ def random_inputs(count, seed=0):
     return x.astype(np.float32), rng.uniform(-1.0, 1.0, (count, 4)).astype(np.float32)
 
 
-def write_artifact(path, function, shapes=((21,), (4,)), **options):
-    """Export any function as an artifact, float32 unless ``dtype`` says otherwise."""
-    dtype = options.pop("dtype", jnp.float32)
+def write_artifact(
+    path, function, shapes=((21,), (4,)), dtype=jnp.float32, platforms=("cpu",), disabled_checks=()
+):
+    """Export any function as an artifact."""
     arguments = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
-    options.setdefault("platforms", ["cpu"])
+    options = {"platforms": platforms, "disabled_checks": disabled_checks}
     exported = export.export(jax.jit(function), **options)(*arguments)
     path.write_bytes(exported.serialize())
     return path

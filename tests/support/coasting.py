@@ -27,15 +27,9 @@ class Coasting(Plant):
         return state
 
 
-def drone_at(
-    position,
-    velocity=(0.0, 0.0, 0.0),
-    quat=(1.0, 0.0, 0.0, 0.0),
-    battery_v=23.5,
-    **fields,
-):
+def drone_at(position, velocity=(0.0, 0.0, 0.0), battery_v=23.5, **fields):
     """Return a drone of float32 leaves; ``fields`` replace the other parts of its state."""
-    drone = drone_with(pos_w=position, vel_w=velocity, quat=quat, **fields)
+    drone = drone_with(pos_w=position, vel_w=velocity, **fields)
     return drone._replace(battery_v=jnp.float32(battery_v))
 
 
@@ -55,4 +49,4 @@ def direction_of_flight(gate):
 @cache
 def coasting_env(*distances):
     """Return the environment of a drone that coasts along a row of gates."""
-    return FlyTrack(track=track_of_row(list(distances)), plant=Coasting())
+    return FlyTrack(track=track_of_row(distances), plant=Coasting())
