@@ -9,14 +9,14 @@ plants without effects that the policy claims to be made for: nothing is to be a
 plants of other batteries and masses, and configurations of real firmware (docs/firmware.md), whose
 settings are known. Appends a line a trial to docs/results/adapt.jsonl, and a later run resumes
 there; ``--page`` writes docs/results/adapt.md from the last commit of each kind of trial, length of
-a log and seed.
+a log and seed, and of firmware from the last flight of each configuration.
 """
 
 import time
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -311,8 +311,9 @@ def crafts_table(lines: list[Line]) -> str:
         gap = f"{flown_s / simulated_s - 1.0:+.2%}" if flown_s and simulated_s else "-"
         verdict = line.get("refused") or line["verdict"]
         laps = [format_lap(entries.get(name)) for name in ("nothing", "adapted")]
-        rows.append([line["hidden"], verdict, named, *laps, gap, str(line.get("cpu_s", "-"))])
-    header = "craft | verdict | named | nothing | adapted | gap to its simulator | CPU s"
+        cpu_s = str(line.get("cpu_s", "-"))
+        rows.append([line["hidden"], verdict, named, *laps, gap, cpu_s, line["commit"]])
+    header = "craft | verdict | named | nothing | adapted | gap to its simulator | CPU s | commit"
     return report.table(header, rows)
 
 
@@ -320,7 +321,21 @@ def describe_not_flown(lines: list[Line]) -> str:
     """Return which configurations of firmware have no line."""
     flown = {line["hidden"] for line in lines}
     missing = [name for name in CONFIGURATIONS if name not in flown]
-    return f"Not flown at this commit: {', '.join(missing)}." if missing else ""
+    return f"Not flown: {', '.join(missing)}." if missing else ""
+
+
+def last_lines(lines: list[Line]) -> list[Line]:
+    """Return the lines of the last commit of each kind of trial, length of a log and seed.
+
+    A flight of firmware takes minutes, so that of these the last line of each configuration counts.
+    """
+
+    def group(line: Line) -> tuple[Any, ...]:
+        numbers = [line["number"]] if line["kind"] == FIRMWARE else []
+        return (line["kind"], line["seconds"], line["seed"], *numbers)
+
+    last = {group(line): line["commit"] for line in lines}
+    return [line for line in lines if line["commit"] == last[group(line)]]
 
 
 def write_page(all_lines: list[Line]) -> None:
@@ -345,7 +360,7 @@ def write_page(all_lines: list[Line]) -> None:
     text += f", and {refused} more refused." if refused else "."
     if deviations:
         text += f" Something was found on {'; '.join(deviations)}."
-    commits = {line["kind"]: line["commit"] for line in lines}
+    commits = {line["kind"]: line["commit"] for line in lines if line["kind"] != FIRMWARE}
     trials = list_trials(SECONDS, SEED)
     planned = sum(trial.kind == PLANT for trial in trials)
     report.fill_page(
@@ -562,12 +577,7 @@ def main(
         kinds: of trials that are run.
     """
     if page:
-        lines = report.lines_in(LINES)
-        kept = ("kind", "seconds", "seed")
-        last = {tuple(line[name] for name in kept): line["commit"] for line in lines}
-        write_page(
-            [line for line in lines if line["commit"] == last[tuple(line[name] for name in kept)]]
-        )
+        write_page(last_lines(report.lines_in(LINES)))
     else:
         if RIVALS in kinds:
             for name in POLICIES:

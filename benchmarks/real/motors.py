@@ -1,13 +1,14 @@
 """Measured flights from their motors: ``python -m benchmarks.real.motors``.
 
 The first half of each flight is learnt from, the second is predicted, beside a linear ARX of the
-same motors and rates. Then the parameters of two flights of one craft, and the rotor drag of a
-simulated flight of others (PX4 in Gazebo), whose truth is known. Two flights of NanoBench are
-diagnosed twice, from motors and from sticks, and two others are predicted. Last, loops between the
-sticks and motors of Betaflight are compared with the settings in its logs. Flights come from
-``benchmarks.real.crazyflie.DATA``.
+same motors and rates. Then comes the rotor drag of a simulated flight of others (PX4 in Gazebo),
+whose truth is known. Alone (``--only``) run: diagnoses of two flights of NanoBench from motors and
+from sticks, which predict two others; the torque that each flight shows; loops between sticks and
+motors of Betaflight, beside the settings in its logs; and diagnoses of four flights of one craft.
+Flights come from ``benchmarks.real.crazyflie.DATA``.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +29,7 @@ from benchmarks.real.crafts import MAPPINGS, nanobench_flights
 from benchmarks.real.crazyflie import DATA, MAX_WINDOWS
 from benchmarks.real.section import diagnose_log
 from flytrack_env import ModelParameters
-from flytrack_sysid import FitError, FlightLog, fit, import_log
+from flytrack_sysid import FitError, FlightLog, diagnose, fit, import_log
 from flytrack_sysid.diagnosis.controller import AXES, examine_controller, identify_loops
 from flytrack_sysid.diagnosis.result import Loop
 from flytrack_sysid.fit import Interval
@@ -52,7 +53,8 @@ LAGS = {"motors.up_s": 0.02, "motors.down_s": 0.03}
 PARTS = {"Betaflight 6S": 1, "Gecko": 6}  # of a log: a flight of less than 20 s has no parts
 PID_SCALES = (0.032029, 0.244381, 0.000529)  # of P, I and D: Betaflight's pid.h
 DSHOT_LOW = 48  # a motor that is off
-PHOENIX = "crazyflie_rate_flights/seed00048_log1.csv.gz"
+RATE_POLICIES = ("seed00048_log1", "seed00048_log2", "seed00066_log2", "seed00069_log2")
+PHOENIX = f"crazyflie_rate_flights/{RATE_POLICIES[0]}.csv.gz"
 NANOBENCH_LEARNT = ("B8_star_fast_rep1", "B9_trefoil_fast_rep14")
 NANOBENCH_HELD = ("B7_oval_fast_rep1", "B10_lissajous_fast_rep1")
 NANOBENCH_ERRORS = (("position_m", "0.5"), ("attitude_rad", "0.25"), ("rates_rad_per_s", "0.25"))
@@ -67,14 +69,11 @@ class Craft(NamedTuple):
     fixed: Mapping[str, float] = {}
 
 
-ARPL = {
-    name: Craft((f"cf_arpl_motors/{name}",), "usd", f"arpl_motors_{name}")
-    for name in ("log15", "log16")
-}
+ARPL_YAW = Craft(("cf_arpl_motors/log16",), "usd", "arpl_motors_log16")
 CRAFTS = {
     "Betaflight 6S": Craft(("betaflight_acro_log/shortLog.BFL",), "betaflight", "acro_motors"),
     "Gecko": Craft(("bf_gecko/btfl_002.bbl",), "betaflight", "gecko_motors", LAGS),
-    "Crazyflie, log15": ARPL["log15"],
+    "Crazyflie, log15": Craft(("cf_arpl_motors/log15",), "usd", "arpl_motors_log15"),
 }
 IRIS = Craft(("eth_quadrotor_model/quadrotor_model.csv",), "csv", "eth_motors")
 
@@ -116,18 +115,28 @@ def fit_craft(craft: Craft, effects: tuple[str, ...] = ()) -> Mapping[str, Inter
     return fit(flight.log, flight.nominal_model(), effects=effects, accept=True).intervals
 
 
-def compare_flights() -> dict[str, list[Any]]:
-    """Return by parameter the intervals of two flights of a craft, and whether they overlap."""
-    first, second = map(fit_craft, ARPL.values())
-    return {
-        name: [
-            list(first[name]),
-            list(second[name]),
-            first[name].low <= second[name].high and second[name].low <= first[name].high,
-        ]
-        for name in first
-        if name in second and name.startswith("motors.")
-    }
+def compare_flights() -> dict[str, Any]:
+    """Return what diagnoses of flights of one craft say of its motors, and which of it agrees.
+
+    Agreement: by parameter, pairs of flights whose intervals overlap, and all pairs.
+    """
+    intervals: dict[str, dict[str, list[float]]] = {}
+    for name in RATE_POLICIES:
+        path = DATA / f"crazyflie_rate_flights/{name}.csv.gz"
+        flight = import_log(path, "csv", MAPPINGS / "phoenix_motors.toml")
+        changed = diagnose(flight.log, flight.nominal_model()).changed
+        intervals[name] = {
+            one.name: [one.value, *one.ci95] for one in changed if one.name.startswith("motors.")
+        }
+        print(name, intervals[name], flush=True)
+    agreement: dict[str, list[int]] = {}
+    for first, second in itertools.combinations(intervals.values(), 2):
+        for name in first.keys() & second.keys():
+            (_, low, high), (_, other_low, other_high) = first[name], second[name]
+            overlaps = low <= other_high and other_low <= high
+            counts = agreement.setdefault(name, [0, 0])
+            agreement[name] = [counts[0] + overlaps, counts[1] + 1]
+    return {"intervals": intervals, "agreement": agreement}
 
 
 def nanobench() -> dict[str, Any]:
@@ -157,7 +166,7 @@ def torques() -> dict[str, list[float]]:
     phoenix = MAPPINGS / "phoenix_motors.toml"
     flights = {
         **{name: read(craft) for name, craft in CRAFTS.items()},
-        "Crazyflie, log16": read(ARPL["log16"]),
+        "Crazyflie, log16": read(ARPL_YAW),
         "Crazyflie, rate policy": import_log(DATA / PHOENIX, "csv", phoenix),
         "Gazebo's iris": read(IRIS),
     }
@@ -237,12 +246,17 @@ def _values(loops: Sequence[Loop]) -> dict[str, dict[str, Any]]:
     }
 
 
-PARTIAL = {"nanobench": nanobench, "torque": torques, "controller": controllers}
+PARTIAL = {
+    "nanobench": nanobench,
+    "torque": torques,
+    "controller": controllers,
+    "flights": compare_flights,
+}
 
 
 def main(
     out: Path | None = None,
-    only: Literal["all", "nanobench", "torque", "controller"] = "all",
+    only: Literal["all", "nanobench", "torque", "controller", "flights"] = "all",
 ) -> None:
     """Measure and print; out: a file of JSON values."""
     results: dict[str, Any] = {"commit": report.commit_of_checkout()}
@@ -259,9 +273,6 @@ def main(
         except FitError as error:
             results[name] = str(error)
         print(name, results[name], flush=True)
-    flights = results["two flights"] = compare_flights()
-    num_overlapping = sum(overlaps for *_, overlaps in flights.values())
-    print(f"overlapping: {num_overlapping} of {len(flights)}", flights, flush=True)
     drag = fit_craft(IRIS, ("rotor_drag", "linear_drag"))["rotor_drag.h"]
     results["rotor drag"] = list(drag)
     print("rotor drag", drag, drag.low <= ROTOR_DRAG <= drag.high)
