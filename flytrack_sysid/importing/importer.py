@@ -307,7 +307,9 @@ def _count_of(path: Path, wanted: Manifest) -> int:
 
 
 def _concatenate(logs: list[FlightLog], sources: list[str]) -> FlightLog:
-    """Return the logs as segments of one."""
+    """Return the logs as segments of one; without sticks if they are left out in one of them."""
+    if not all("sticks" in log for log in logs):
+        logs = [log.without("sticks") for log in logs]
     first = logs[0]
     for log, source in zip(logs, sources, strict=True):
         if set(log.channels) != set(first.channels):

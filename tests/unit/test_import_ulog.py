@@ -212,6 +212,15 @@ def test_sticks_are_kept_beside_motors(topics, read):
     assert_allclose(of_motors["sticks"], read(topics).log["u"])
 
 
+def test_sticks_that_one_of_two_files_lacks_are_left_out(topics, tmp_path):
+    content, files = with_motors(topics), [tmp_path / "a.ulg", tmp_path / "b.ulg"]
+    files[0].write_bytes(ulog(content))
+    files[1].write_bytes(ulog({name: content[name] for name in content if name != SETPOINT}))
+    (tmp_path / "map.toml").write_text(OF_MOTORS + "[craft]\nmax_rate_deg_s = [700, 700, 300]\n")
+    log = import_log(files, "ulog", tmp_path / "map.toml").log
+    assert len(np.unique(log.segment)) == 2 and "sticks" not in log
+
+
 @pytest.mark.parametrize(
     ("every", "parameters", "frame", "message"),
     [
