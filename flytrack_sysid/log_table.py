@@ -151,7 +151,8 @@ def log_of_table(table: Table) -> FlightLog:
     is_later = (np.diff(table.columns["t"]) > 0.0) | (segment[1:] != segment[:-1])
     expected = "a later time than in the row before, or a new segment"
     table.check(np.concatenate([[True], is_later]), "t", expected)
-    for column in CHANNELS["u"]:
+    held = [*CHANNELS["u"], *(name for name in CHANNELS["sticks"] if name in table.columns)]
+    for column in held:
         is_command = np.abs(table.columns[column]) <= 1.0 + COMMAND_MARGIN
         table.check(is_command, column, "a command in [-1, 1]")
     origin, stated_voltage_v = _origin(table), _stated_voltages(table)

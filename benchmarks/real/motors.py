@@ -31,7 +31,7 @@ from benchmarks.real.section import diagnose_log
 from flytrack_env import ModelParameters
 from flytrack_sysid import FitError, FlightLog, diagnose, fit, import_log
 from flytrack_sysid.diagnosis.controller import AXES, examine_controller, identify_loops
-from flytrack_sysid.diagnosis.result import Loop
+from flytrack_sysid.diagnosis.result import RateLoop
 from flytrack_sysid.fit import Interval
 from flytrack_sysid.importing.importer import Imported
 from flytrack_sysid.inference.chunks import at_usual_rate
@@ -231,7 +231,7 @@ def _faults(log: FlightLog, model: ModelParameters) -> tuple[str, ...]:
     return () if controller is None else controller.faults
 
 
-def _values(loops: Sequence[Loop]) -> dict[str, dict[str, Any]]:
+def _values(loops: Sequence[RateLoop]) -> dict[str, dict[str, Any]]:
     """Return the values of loops with half of their intervals, by axis."""
     return {
         loop.axis: {

@@ -18,7 +18,7 @@ from scipy import signal
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.effects import BY_NAME, acts
 from flytrack_env.motion import Motion
-from flytrack_sysid.diagnosis.controller import changes, examine_controller
+from flytrack_sysid.diagnosis.controller import compare_controllers, examine_controller
 from flytrack_sysid.diagnosis.diagnose import (
     Logs,
     Report,
@@ -204,12 +204,8 @@ def diagnose_change(
     causes = tuple(
         replace(one, equivalent=(drifts | equivalents).get(one.effect, ())) for one in causes
     )
-    controller = diagnosis.controller
-    if controller is not None:
-        controller_before = examine_controller(
-            parts_before.logged, model, parts_before.logged_held_out
-        )
-        controller = replace(controller, faults=tuple(changes(controller, controller_before)))
+    controller_before = examine_controller(parts_before.logged, model, parts_before.logged_held_out)
+    controller, controller_notes = compare_controllers(diagnosis.controller, controller_before)
     is_of_thrust = any(base_fields(one.effect) == THRUST_COEFFS for one in causes)
     unchanged = {one.effect for one in named} - {one.effect for one in causes}
     return replace(
@@ -220,6 +216,7 @@ def diagnose_change(
         controller=controller,
         warnings=(
             *diagnosis.warnings,
+            *controller_notes,
             *(f"{name}: as in the log before, so no change" for name in sorted(unchanged)),
             *([NOT_SHARED] if is_of_thrust and not share_thrusts(later, earlier) else []),
         ),

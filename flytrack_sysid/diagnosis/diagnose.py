@@ -214,7 +214,7 @@ def split(
     model = nominal_parameters() if model is None else model
     check_commands(log, model)
     warnings += torque_notes(log, model) + voltage_notes(log, model.battery)
-    warnings += controller_notes(logged)
+    warnings += controller_notes(logged, logged_held_out)
     log = with_voltage(log, model)
     model = model._replace(battery=battery_of_craft(log, model.battery))
     reductions: list[Callable[[FlightLog], tuple[FlightLog, np.ndarray, list[str]]]] = [

@@ -12,6 +12,7 @@ from flytrack_env.effects import BY_NAME, LearnedLaw, takes_motors
 from flytrack_env.files import write_atomically
 from flytrack_env.pictures.drawing import new_figure, plain
 from flytrack_env.scene import BLUE, GREEN, GREY, ORANGE
+from flytrack_sysid.diagnosis.controller import AXES
 from flytrack_sysid.diagnosis.evidence import (
     EVIDENCE,
     Panel,
@@ -29,7 +30,7 @@ from flytrack_sysid.diagnosis.result import (
     Diagnosis,
     Estimated,
     HalfResponse,
-    Loop,
+    RateLoop,
     Unexplained,
 )
 from flytrack_sysid.diagnosis.traces import Traces, traces
@@ -415,7 +416,7 @@ def _lift_text(diagnosis: Diagnosis) -> list[str]:
     ]
 
 
-def _loop_row(loop: Loop) -> list[str]:
+def _loop_row(loop: RateLoop) -> list[str]:
     """Return the cells of a controller's loop."""
     shares = (
         (loop.integral, 1.0, "1/s"),
@@ -447,6 +448,9 @@ def describe_side(diagnosis: Diagnosis) -> str:
         *(["the controller"] if diagnosis.controller.faults else []),
     ]
     text = "Which side of the motors is wrong: " + (" and ".join(wrong) or "neither") + "."
+    axes = [loop.axis for loop in diagnosis.controller.loops]
+    if len(axes) < len(AXES):
+        text += f" Of the controller, only {' and '.join(axes)} showed."
     return " ".join([text, *(f"{fault}." for fault in diagnosis.controller.faults)])
 
 

@@ -231,18 +231,18 @@ class Lift:
 
 
 @dataclass(frozen=True)
-class Loop:
+class RateLoop:
     """The loop of rates of one axis: ``flytrack_sysid.diagnosis.controller`` has its law.
 
     Attributes:
         axis: its name.
-        explained: share of the held-out variance of the motors' share; NaN without such rows.
+        explained: share of the held-out variance of the demand; NaN without such rows.
         full_stick: rate that full stick asks for, deg/s.
         gain: P, in hundredths of the motors' range per 100 deg/s.
         integral: I over P, 1/s.
         derivative: D over P, s.
         feedforward: F over P and the rate of full stick, s.
-        stick_delay_s: from the sticks to the motors.
+        stick_delay_s: from the sticks to the motors; up to 0.048 s are searched.
         gyro_delay_s: from the gyro to the motors.
     """
 
@@ -266,7 +266,7 @@ class Controller:
         faults: what is wrong with them, a sentence each.
     """
 
-    loops: tuple[Loop, ...]
+    loops: tuple[RateLoop, ...]
     faults: tuple[str, ...]
 
 

@@ -15,7 +15,7 @@ from flytrack_env.effects import effect_of
 from flytrack_env.messages import quote_name, quote_value
 from flytrack_env.motors import NAMES
 from flytrack_sysid.importing.betaflight_settings import RATES_TYPES, full_stick_rate, stick_curve
-from flytrack_sysid.importing.commands import commands_of_motors
+from flytrack_sysid.importing.commands import LEFT_OUT, commands_of_motors
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import (
     ImportedFlight,
@@ -29,7 +29,7 @@ from flytrack_sysid.importing.mapping import Mapping
 from flytrack_sysid.importing.units import PER_DEGREE, UNITS
 from flytrack_sysid.kinematics import GRAVITY
 from flytrack_sysid.log import LogError
-from flytrack_sysid.log_table import Table
+from flytrack_sysid.log_table import COMMAND_MARGIN, Table
 from flytrack_sysid.timestamps import number_segments, put_on_one_line, read_clock
 
 FIRMWARE = "Betaflight"
@@ -129,7 +129,12 @@ def _read_log(
     channels = _channels(table, headers)
     sticks, clipped = _commands(table, headers, full)
     if of_motors:
-        channels |= {"u": _motors_as_commands(source, table, headers), "sticks": sticks}
+        channels["u"] = _motors_as_commands(source, table, headers)
+        largest = float(np.abs(sticks).max())
+        if largest <= 1.0 + COMMAND_MARGIN:
+            channels["sticks"] = sticks
+        else:
+            clipped = [f"{LEFT_OUT}: found setpoints of {largest:.3g} times full stick"]
     else:
         channels["u"] = sticks
     if mapping.rules.motors_as_thrust:

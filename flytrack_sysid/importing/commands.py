@@ -28,6 +28,7 @@ FLYING_THRUST = -0.9  # command: below, it may stand on the ground, where rates 
 # Candidate lags and delays, s, of the rate loop while an attitude gain is identified.
 LAGS_S, DELAYS_S = (0.0, 0.02, 0.04, 0.06, 0.1, 0.15), (0.0, 0.01, 0.02, 0.03, 0.04)
 MIN_CORRELATION = 0.7  # of the rates with those of an identified attitude gain
+LEFT_OUT = "the controller's sticks are left out"
 MIN_EXPLAINED = 0.9  # of the torques' variance: a controller computes torques without noise
 
 
@@ -102,26 +103,28 @@ def read_commands(
 
 def read_sticks(
     source: str,
-    time: np.ndarray,
     channels: Channels[str, np.ndarray],
-    rules: CommandRules,
     max_rate_deg_s: tuple[float, ...] | None,
 ) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """Return what a controller was asked for beside motors that are the commands, and notes.
+    """Return the rate setpoints that a log holds beside motors that are the commands, and a note.
 
-    Arguments are those of ``read_commands``. The sticks, (num_rows, 4) in [-1, 1], are None where
-    a log does not hold them.
+    Setpoints that follow from attitudes or torques are none: they would have the rates of the
+    motors in them.
+
+    Args:
+        source: the log, for messages.
+        channels: as for ``read_commands``.
+        max_rate_deg_s: rates of roll, pitch, yaw at a command of 1; None if unknown.
+
+    Returns:
+        sticks: (num_rows, 4) in [-1, 1]; None where the log does not hold them or their scale.
+        notes: for the user.
     """
-    if channels.keys().isdisjoint({"u", "attitude_command", "torque_command"}):
+    if "u" not in channels:
         return None, ()
-    of_sticks = rules._replace(motors_as_command=False)
-    without_motors = {name: values for name, values in channels.items() if name != "motors"}
-    try:
-        if max_rate_deg_s is None:
-            raise LogError(f"{source}: craft.max_rate_deg_s: missing in the mapping")
-        return read_commands(source, time, without_motors, of_sticks, max_rate_deg_s)
-    except LogError as error:
-        return None, (f"the controller's sticks are left out: {error}",)
+    if max_rate_deg_s is None:
+        return None, (f"{source}: {LEFT_OUT}: craft.max_rate_deg_s: missing in the mapping",)
+    return np.clip(channels["u"], -1.0, 1.0), ()
 
 
 def commands_of_motors(source: str, motors: np.ndarray | None) -> np.ndarray:

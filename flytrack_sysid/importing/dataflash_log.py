@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.effects import Motors
 from flytrack_env.messages import quote_name
-from flytrack_sysid.importing.commands import check_motors_of_autopilot
+from flytrack_sysid.importing.commands import LEFT_OUT, check_motors_of_autopilot
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import (
     ImportedFlight,
@@ -120,9 +120,10 @@ def read_dataflash(path: Path, mapping: Mapping) -> ImportedFlight:
         try:
             full_deg_s = _full_stick_deg_s(path, parameters, chosen["RATE"], remarks)
             craft = craft._replace(max_rate_deg_s=full_deg_s)
-        except LogError:
+        except LogError as error:
             if not of_motors:  # which need no full stick
                 raise
+            remarks.append(f"{LEFT_OUT}: {error}")
     channels = _channels(chosen, parameters, craft.max_rate_deg_s, remarks)
     if of_motors:
         unused = ("motors",) if craft.max_rate_deg_s else ("u", "motors")

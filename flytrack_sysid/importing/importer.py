@@ -16,6 +16,7 @@ from flytrack_env.messages import error_text, quote_name, quote_value
 from flytrack_sysid.clocks import ClockOffset, align_clocks
 from flytrack_sysid.importing.bag_log import read_bag
 from flytrack_sysid.importing.betaflight_log import read_betaflight
+from flytrack_sysid.importing.commands import LEFT_OUT
 from flytrack_sysid.importing.dataflash_log import read_dataflash
 from flytrack_sysid.importing.flight import Craft, ImportedFlight
 from flytrack_sysid.importing.ground import find_ground
@@ -148,6 +149,8 @@ def import_log(
     notes = (*loaded.notes, *(note for _, flight in flights_read for note in flight.notes))
     flights, ground_notes = _flights_in_the_air(flights_read, loaded, format in DENSE_FORMATS)
     notes += ground_notes
+    flights, stick_notes = _with_common_sticks(flights)
+    notes += stick_notes
     sources = [flight.log.source for flight in flights]
     log = _concatenate([flight.log for flight in flights], sources)
     log, offsets = align_clocks(log, align)
@@ -306,10 +309,28 @@ def _count_of(path: Path, wanted: Manifest) -> int:
         raise LogError(f"{where}: {path.name}: {quote_name(wanted.count)}: {problem}") from error
 
 
+def _with_common_sticks(
+    flights: list[ImportedFlight],
+) -> tuple[list[ImportedFlight], tuple[str, ...]]:
+    """Return flights of motors without sticks if these differ in scale or one lacks them; a note.
+
+    The body needs no sticks, so such flights are of one craft nevertheless.
+    """
+    kinds = {("sticks" in flight.log, flight.craft.max_rate_deg_s) for flight in flights}
+    if len(kinds) == 1 or not flights[0].log.has_motors:
+        return flights, ()
+    unscaled = [
+        flight._replace(
+            log=flight.log.without("sticks"), craft=flight.craft._replace(max_rate_deg_s=None)
+        )
+        for flight in flights
+    ]
+    problem = "found files without them, or with other rates at full stick; expected the same"
+    return unscaled, (f"{LEFT_OUT}: {problem}",)
+
+
 def _concatenate(logs: list[FlightLog], sources: list[str]) -> FlightLog:
-    """Return the logs as segments of one; without sticks if they are left out in one of them."""
-    if not all("sticks" in log for log in logs):
-        logs = [log.without("sticks") for log in logs]
+    """Return the logs as segments of one."""
     first = logs[0]
     for log, source in zip(logs, sources, strict=True):
         if set(log.channels) != set(first.channels):

@@ -205,12 +205,12 @@ def _flight(
     mapping: Mapping,
 ) -> ImportedFlight:
     """Return the flight of converted channels; steps above ``max_gap_s`` begin a new segment."""
-    described = table.source, time, values, mapping.rules, mapping.craft.max_rate_deg_s
-    commands, notes = read_commands(*described)
+    max_rate_deg_s = mapping.craft.max_rate_deg_s
+    commands, notes = read_commands(table.source, time, values, mapping.rules, max_rate_deg_s)
     channels = {**values, "u": commands}
     segment, of_motors = number_segments(time, max_gap_s), mapping.rules.motors_as_command
     if of_motors:
-        sticks, stick_notes = read_sticks(*described)
+        sticks, stick_notes = read_sticks(table.source, values, max_rate_deg_s)
         notes += stick_notes
         if sticks is not None:
             channels["sticks"] = sticks

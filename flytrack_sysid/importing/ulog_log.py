@@ -13,7 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from flytrack_env.effects import Motors
 from flytrack_env.motors import NAMES
-from flytrack_sysid.importing.commands import check_motors_of_autopilot, commands_of_motors
+from flytrack_sysid.importing.commands import (
+    LEFT_OUT,
+    check_motors_of_autopilot,
+    commands_of_motors,
+)
 from flytrack_sysid.importing.decoding import decode
 from flytrack_sysid.importing.flight import (
     Craft,
@@ -39,6 +43,7 @@ from flytrack_sysid.timestamps import (
 MAX_BYTES = 2**29  # the decoder may take time and memory in proportion
 FIRST_BYTES = b"ULog\x01\x12\x35"
 MICROSECOND = UNITS["time"]["us"]
+MAX_LOST = 0.01  # share of a flight's rows without setpoints, which begin later than the gyro
 # Full stick in acro mode, and the limit of other modes, deg/s. Setpoints stay below the larger of
 # both.
 RATE_PARAMETERS = (
@@ -127,13 +132,21 @@ def read_ulog(path: Path, mapping: Mapping) -> ImportedFlight:
         except LogError as error:
             if not of_motors:
                 raise
-            remarks.append(f"the controller's sticks are left out: {error}")
+            remarks.append(f"{LEFT_OUT}: {error}")
     base = samples["w"].times
     for name in ("w", "f", "p", "v"):
         if name in samples:
             converted[name] = samples[name]._replace(values=vector_from(samples[name].values, True))
     if "v_bat" in samples:
         converted["v_bat"] = samples["v_bat"]
+    if "sticks" in converted:
+        _, has_sticks = on_one_base({"sticks": converted["sticks"]}, base)
+        without = {name: values for name, values in converted.items() if name != "sticks"}
+        _, is_known = on_one_base(without, base)
+        if np.sum(is_known & ~has_sticks) > MAX_LOST * is_known.sum():  # the body needs these rows
+            converted = without
+            count = f"found in {np.sum(is_known & has_sticks)} of {is_known.sum()} rows"
+            remarks.append(f"{LEFT_OUT}: topic vehicle_rates_setpoint: {count}, expected all")
     channels, is_known = on_one_base(converted, base)
     if not is_known.any():
         raise LogError(

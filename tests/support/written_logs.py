@@ -23,7 +23,8 @@ def make_log(seed=0, num_rows=NUM_ROWS, names=tuple(CHANNELS)):
     """Return a log of random numbers in two segments that every check of a file passes."""
     rng = np.random.default_rng(seed)
     channels = {name: rng.standard_normal((num_rows, len(CHANNELS[name]))) for name in names}
-    channels["u"] = rng.uniform(-1.0, 1.0, (num_rows, 4))
+    for name in ("u", "sticks") if "sticks" in names else ("u",):
+        channels[name] = rng.uniform(-1.0, 1.0, (num_rows, 4))
     if "q" in channels:
         channels["q"] /= np.linalg.norm(channels["q"], axis=1, keepdims=True)
     segment = np.where(np.arange(num_rows) < num_rows // 2, 7, -2)

@@ -7,17 +7,23 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from flytrack_sysid.diagnosis.controller import changes, controller_notes, examine_controller
+from flytrack_env import nominal_parameters
+from flytrack_sysid.diagnosis.controller import (
+    compare_controllers,
+    controller_notes,
+    examine_controller,
+)
 from flytrack_sysid.diagnosis.report import describe_side
 from flytrack_sysid.log import FlightLog
 from flytrack_sysid.split import held_out_rows
 from tests.support.motor_models import crafts, model_of
-from tests.support.written_logs import through_file
+from tests.support.written_logs import through_file, with_channels
 
 STEP_S, SECONDS = 2e-3, 20.0
 FULL_STICK = np.deg2rad([700.0, 600.0, 400.0])  # rad/s
 # A command per rad/s, rad, rad/s^2, and per 1/s of a stick.
 GAIN, INTEGRAL, DERIVATIVE, FEEDFORWARD = 0.12, 0.9, 0.0015, 0.0008
+PER_100_DEG = 50.0 * np.deg2rad(100.0)  # in per cent of the motors' range
 STICK_S, GYRO_S, LAG_S = 0.008, 0.004, 0.03
 PUSH = np.array([900.0, 800.0, 500.0])  # rad/s^2 per command
 # Rear right, front right, rear left, front left: roll to the right, pitch down, yaw to the left.
@@ -59,6 +65,10 @@ def examined(log, stated_deg_s=(700.0, 600.0, 400.0)):
     return examine_controller(log, model, held_out_rows(log))
 
 
+def notes_on(log):
+    return controller_notes(log, held_out_rows(log))
+
+
 @pytest.fixture(scope="module")
 def log():
     return fly()
@@ -67,44 +77,84 @@ def log():
 def test_the_settings_of_a_controller_are_found_and_nothing_is_wrong(log, tmp_path):
     found = examined(through_file(log, tmp_path / "log.npz"))
     assert found.faults == () and [loop.axis for loop in found.loops] == ["roll", "pitch", "yaw"]
-    per_100_deg = 50.0 * np.deg2rad(100.0)
     for loop, full_stick in zip(found.loops, FULL_STICK, strict=True):
         assert loop.explained > 0.99
-        assert loop.full_stick.value == pytest.approx(np.rad2deg(full_stick), rel=0.03)
-        assert loop.gain.value == pytest.approx(GAIN * per_100_deg, rel=0.05)
+        assert loop.full_stick.value == pytest.approx(np.rad2deg(full_stick), rel=0.04)
+        assert loop.gain.value == pytest.approx(GAIN * PER_100_DEG, rel=0.05)
         assert loop.integral.value == pytest.approx(INTEGRAL / GAIN, rel=0.1)
         # To first order, a longer delay is as much more of the derivative and the feedforward.
         lead_s = loop.derivative.value - loop.gyro_delay_s
         assert lead_s == pytest.approx(DERIVATIVE / GAIN - GYRO_S, abs=1e-3)
         stick_lead_s = loop.feedforward.value - loop.stick_delay_s
         assert stick_lead_s == pytest.approx(FEEDFORWARD / GAIN / full_stick - STICK_S, abs=1e-3)
-        assert loop.gyro_delay_s == pytest.approx(GYRO_S, abs=2.5e-3)
+        assert loop.gyro_delay_s == pytest.approx(GYRO_S, abs=4.5e-3)
 
 
 def test_other_rates_at_full_stick_are_a_fault_of_the_controller(log):
     (fault,) = examined(log, (700.0, 900.0, 400.0)).faults
-    assert fault.startswith("pitch: full stick asks for 6") and fault.endswith("expected 900")
-    slower = examined(fly(FULL_STICK * [1.0, 1.0, 0.6], seed=1))
-    (change,) = changes(slower, examined(log))
-    assert change.startswith("yaw: full stick asks for 24")
-    assert changes(examined(log), examined(log)) == []
+    assert fault.startswith("pitch: full stick asks for 58") and fault.endswith("expected 900")
+    # A model that nobody stated rates for has the nominal ones.
+    nominal_deg_s = np.asarray(nominal_parameters().max_rate, float)
+    assert examined(log, nominal_deg_s).faults == ()
+
+
+def test_a_change_since_an_earlier_log_is_a_fault_where_both_show_the_axis(log):
+    before = examined(log)
+    assert compare_controllers(before, before) == (before, [])
+    slower, notes = compare_controllers(examined(fly(FULL_STICK * [1.0, 1.0, 0.6], 1)), before)
+    (fault,) = slower.faults
+    assert fault.startswith("yaw: full stick asks for 24") and notes == []
+    assert compare_controllers(None, before) == (None, [])
+    none, (note,) = compare_controllers(before, None)
+    assert none is None and note.startswith("controller: roll, pitch, yaw: not compared")
 
 
 def test_motors_that_push_a_turn_on_are_a_fault(log):
-    against = replace(log, channels={**log.channels, "u": -0.4 - log["u"]})
-    faults = examined(against).faults
-    assert [fault.partition(":")[0] for fault in faults] == ["roll", "pitch", "yaw"]
-    assert all("push a turn on" in fault for fault in faults)
+    against = examined(replace(log, channels={**log.channels, "u": -0.4 - log["u"]}))
+    for faults in (against.faults, compare_controllers(against, examined(log))[0].faults):
+        assert [fault.partition(":")[0] for fault in faults] == ["roll", "pitch", "yaw"]
+        assert all("push a turn on" in fault for fault in faults)
+
+
+@pytest.mark.parametrize("are_segments", [True, False])
+def test_pieces_of_a_flight_show_the_same_loop(log, are_segments):
+    """Flights of 3 s with a second between."""
+    piece, second = np.divmod(log.time, 4.0)
+    pieces = replace(log, segment=(are_segments * piece).astype(int))
+    controller = examined(pieces.select(second < 3.0))
+    assert controller.faults == ()
+    for loop, full_stick in zip(controller.loops, FULL_STICK, strict=True):
+        assert loop.gain.value == pytest.approx(GAIN * PER_100_DEG, rel=0.1)
+        assert loop.full_stick.value == pytest.approx(np.rad2deg(full_stick), rel=0.05)
 
 
 def test_a_log_without_sticks_or_of_few_rows_a_second_shows_no_controller(log):
-    assert examined(log.without("sticks")) is None and controller_notes(log) == []
-    slow = log.select(slice(None, None, 5))
-    assert examined(slow) is None
-    (note,) = controller_notes(slow)
-    assert "found a row each 10 ms, expected 5 ms or less" in note
-    still = replace(log, channels={**log.channels, "sticks": np.zeros((len(log), 4))})
-    assert examined(still) is None
+    assert examined(log.without("sticks")) is None
+    assert notes_on(log) == [] and notes_on(log.without("sticks")) == []
+    row = np.arange(len(log))
+    held = {name: log[name][row - row % 5] for name in ("u", "sticks")}
+    cases = {
+        "found a row each 10 ms, expected 5 ms": log.select(row % 5 == 0),
+        "found other motors each 10 ms": with_channels(log, u=held["u"]),
+        "found other sticks each 10 ms": with_channels(log, sticks=held["sticks"]),
+        "found steps of 0.002 to 0.004 s, expected equal": replace(
+            log, segment=row // 5000, time=np.where(row < 5000, 1.0, 2.0) * log.time
+        ),
+        "found fewer than 8 blocks of 1 s": log.select(row < 2000),
+    }
+    for message, case in cases.items():
+        (note,) = notes_on(case)
+        assert message in note and examined(case) is None
+
+
+@pytest.mark.parametrize("channel", ["sticks", "w"])
+def test_an_axis_that_does_not_move_is_not_examined(log, channel):
+    still = log[channel].copy()
+    still[:, 1] = 0.1
+    controller = examined(with_channels(log, **{channel: still}))
+    assert [loop.axis for loop in controller.loops] == ["roll", "yaw"]
+    text = describe_side(SimpleNamespace(verdict="consistent", controller=controller))
+    assert text.endswith("wrong: neither. Of the controller, only roll and yaw showed.")
 
 
 @pytest.mark.parametrize(

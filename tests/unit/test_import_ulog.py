@@ -212,13 +212,25 @@ def test_sticks_are_kept_beside_motors(topics, read):
     assert_allclose(of_motors["sticks"], read(topics).log["u"])
 
 
-def test_sticks_that_one_of_two_files_lacks_are_left_out(topics, tmp_path):
+@pytest.mark.parametrize("rates_are_stated", [True, False])
+def test_sticks_that_one_of_two_files_lacks_are_left_out(topics, tmp_path, rates_are_stated):
     content, files = with_motors(topics), [tmp_path / "a.ulg", tmp_path / "b.ulg"]
     files[0].write_bytes(ulog(content))
     files[1].write_bytes(ulog({name: content[name] for name in content if name != SETPOINT}))
-    (tmp_path / "map.toml").write_text(OF_MOTORS + "[craft]\nmax_rate_deg_s = [700, 700, 300]\n")
-    log = import_log(files, "ulog", tmp_path / "map.toml").log
-    assert len(np.unique(log.segment)) == 2 and "sticks" not in log
+    rates = "[craft]\nmax_rate_deg_s = [700, 700, 300]\n" if rates_are_stated else ""
+    (tmp_path / "map.toml").write_text(OF_MOTORS + rates)
+    flights = import_log(files, "ulog", tmp_path / "map.toml")
+    assert len(np.unique(flights.log.segment)) == 2 and "sticks" not in flights.log
+    assert any("sticks are left out: found files without them" in note for note in flights.notes)
+
+
+def test_sticks_of_a_part_of_a_flight_are_left_out_and_no_row_is(topics, read):
+    content = with_motors(topics)
+    fields, rows = content[SETPOINT]
+    flight = read({**content, SETPOINT: (fields, rows[: len(rows) // 4])}, mapping=OF_MOTORS)
+    assert "sticks" not in flight.log
+    assert len(flight.log) == len(read({**content, SETPOINT: (fields, [])}, mapping=OF_MOTORS).log)
+    assert any("sticks are left out: topic vehicle_rates" in note for note in flight.notes)
 
 
 @pytest.mark.parametrize(
