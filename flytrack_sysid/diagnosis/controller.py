@@ -13,7 +13,6 @@ of their range do not follow the law, and slow drifts (a relaxed integral, a bat
 are no part of it: such rows and frequencies are left out.
 """
 
-import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -192,16 +191,20 @@ class _Signal(NamedTuple):
             slopes = np.gradient(values, step_s, axis=0) if len(rows) > 1 else 0.0 * values
             for number, part in enumerate((values, slopes, np.cumsum(values, axis=0) * step_s)):
                 parts[number, rows] = _filtered(part - part[0], step_s)  # filters begin at rest
-        return cls(*parts, step_s)
+        return cls(parts[0], parts[1], parts[2], step_s)
 
     def of_axis(self, axis: int) -> "_Signal":
         """Return the parts of one signal, (num_rows,)."""
-        return _Signal(*(part[:, axis] for part in self[:3]), self.step_s)
+        values, slopes, integrals = (
+            part[:, axis] for part in (self.values, self.slopes, self.integrals)
+        )
+        return _Signal(values, slopes, integrals, self.step_s)
 
     def before(self, rows: np.ndarray, delay_s: float) -> np.ndarray:
         """Return the parts of one signal some seconds before rows, (len(rows), 3)."""
         earlier = np.maximum(rows - round(delay_s / self.step_s), 0)
-        return np.stack([part[earlier] for part in self[:3]], axis=1)
+        parts = (self.values, self.slopes, self.integrals)
+        return np.stack([part[earlier] for part in parts], axis=1)
 
 
 class _Rows(NamedTuple):
@@ -307,8 +310,11 @@ def _best_delays(
         inverse = np.linalg.pinv(products[np.ix_(chosen, chosen)], hermitian=True)
         return float(moments[chosen] @ inverse @ moments[chosen])
 
-    best = max(itertools.product(range(len(delays_s)), repeat=2), key=explained)
-    return delays_s[best[0]], delays_s[best[1]]
+    numbers = range(len(delays_s))
+    stick_number, gyro_number = max(
+        [(first, second) for first in numbers for second in numbers], key=explained
+    )
+    return delays_s[stick_number], delays_s[gyro_number]
 
 
 def _loop(axis: str, demand: np.ndarray, stick: _Signal, gyro: _Signal, rows: _Rows) -> RateLoop:
