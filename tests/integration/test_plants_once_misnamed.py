@@ -4,6 +4,7 @@ The drawn ones were found by drawing plants that no rule was made on. Logs 52 an
 the suite misspec-v1. Each chose a rule since.
 """
 
+import numpy as np
 import pytest
 
 from baselines.purejaxrl_ppo import load_checkpoint
@@ -17,6 +18,7 @@ from flytrack_env.model_file import model_from_json
 from flytrack_sysid.diagnosis import diagnose
 from tests.support.motor_flights import flown
 from tests.support.motor_models import crafts
+from tests.support.written_logs import with_channels
 
 pytestmark = pytest.mark.slow
 SEED = 6101
@@ -125,6 +127,9 @@ def test_a_lag_at_zero_does_not_shorten_a_delay() -> None:
 )
 def test_one_number_of_a_craft_whose_motors_are_commanded(changes, expected) -> None:
     log, name = flown(crafts(**changes), duration_s=30.0), expected[0]
-    (cause,) = diagnose(log, nominal_model(crafts())).causes
+    log = with_channels(log, sticks=np.zeros((len(log), 4)))
+    diagnosis = diagnose(log, nominal_model(crafts()))
+    (cause,) = diagnosis.causes
+    assert any("the controller is not examined: found a row" in note for note in diagnosis.warnings)
     assert cause.effect == "motors" and set(cause.parameters) == {name}
     assert cause.parameters[name].value == pytest.approx(expected[1], rel=0.05)

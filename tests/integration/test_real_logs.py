@@ -8,7 +8,9 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from flytrack_sysid import diagnose, import_log
+from flytrack_sysid.diagnosis.controller import examine_controller
 from flytrack_sysid.kinematics import GRAVITY, cut_windows, summed_turns
+from flytrack_sysid.split import held_out_rows
 from tests.support.real_logs import CRAZYFLIE, import_shared, shared
 from tests.support.tables import table
 
@@ -106,6 +108,23 @@ def test_torques_of_motors_show_the_rotation_that_follows(tmp_path, number, from
     for axis in axes:
         smooth = [np.convolve(one[:, axis], np.ones(60) / 60, "same") for one in (asked, turned)]
         assert np.corrcoef(*smooth)[0, 1] > 0.5
+
+
+def test_the_settings_of_a_betaflight_controller_are_found_between_sticks_and_motors(tmp_path):
+    """The log's header states 700 deg/s at full stick, and P 35, 39 and 40."""
+    (tmp_path / "map.toml").write_text(
+        "[rows]\nevery = 1\n[motors]\nas_command = true\n"
+        '[frame]\npropellers = "out"\ncraft = "five_inch"\nmass_kg = 0.6\n'
+    )
+    flight = import_shared("bf_gecko/btfl_002.bbl", "betaflight", tmp_path / "map.toml")
+    log = flight.log
+    controller = examine_controller(log, flight.nominal_model(), held_out_rows(log))
+    assert controller.faults == ()
+    for loop, setting in zip(controller.loops, (35, 39, 40), strict=True):
+        assert loop.full_stick.value == pytest.approx(700.0, rel=0.1)
+        # Thousandths of the range from idle (5.5 %) a deg/s, times Betaflight's scale.
+        assert loop.gain.value == pytest.approx(0.945 * 10.0 * 0.032029 * setting, rel=0.2)
+        assert loop.gyro_delay_s <= 0.01
 
 
 def test_px4():
