@@ -99,9 +99,11 @@ def compare_controllers(
     faults: list[str] = []
     for loop in loops:
         faults += _wrong_sense(loop) or _other_full_stick(loop, before[loop.axis].full_stick)
-    missing = [loop.axis for loop in later.loops if loop.axis not in before]
-    notes = [f"controller: {', '.join(missing)}: not compared: the earlier log does not show it"]
-    return Controller(loops, tuple(faults)) if loops else None, notes if missing else []
+    controller = Controller(loops, tuple(faults)) if loops else None
+    missing = ", ".join(loop.axis for loop in later.loops if loop.axis not in before)
+    if not missing:
+        return controller, []
+    return controller, [f"controller: {missing}: not compared: the earlier log does not show it"]
 
 
 def identify_loops(

@@ -189,7 +189,8 @@ def dataflash(
     """Return an ArduPilot log; messages are written one kind after the other.
 
     Args:
-        messages: by name, types and names of fields, of which the first is the time (us), and rows.
+        messages: for each message name, the types of its fields, their names and its rows. The
+            first field is the time (us).
     """
     stored = [(0, name, value) for name, value in parameters.items()]
     messages = {

@@ -75,9 +75,10 @@ def log():
 
 
 def test_the_settings_of_a_controller_are_found_and_nothing_is_wrong(log, tmp_path):
-    found = examined(through_file(log, tmp_path / "log.npz"))
-    assert found.faults == () and [loop.axis for loop in found.loops] == ["roll", "pitch", "yaw"]
-    for loop, full_stick in zip(found.loops, FULL_STICK, strict=True):
+    controller = examined(through_file(log, tmp_path / "log.npz"))
+    assert controller.faults == ()
+    assert [loop.axis for loop in controller.loops] == ["roll", "pitch", "yaw"]
+    for loop, full_stick in zip(controller.loops, FULL_STICK, strict=True):
         assert loop.explained > 0.99
         assert loop.full_stick.value == pytest.approx(np.rad2deg(full_stick), rel=0.04)
         assert loop.gain.value == pytest.approx(GAIN * PER_100_DEG, rel=0.05)

@@ -58,7 +58,7 @@ DISTURBANCE = np.repeat([0.1, 1.5, 1e-3], [3, 3, 1])
 WANDER, TAU_S = 0.1 * LEVEL, 0.3
 
 
-def cause_of(effect, **parameters):
+def make_cause(effect, **parameters):
     """Return a named cause with these estimates."""
     return Cause(effect, (), "rates", parameters, 100.0, 30.0, 100.0, 90.0)
 
@@ -83,7 +83,7 @@ def delay_after_flights(problem, half_widths_s, listed, **delays_s):
     fit = Fit(vector, indices, np.diag(half_widths**2), half_widths, np.zeros(1), NO_SLOPES)
     estimates = {name: Estimated(0.01, (0.0, 0.02), "s") for name in listed}
     return with_refined_values(
-        [cause_of("command_delay", **estimates)], refined(problem, fit), vector
+        [make_cause("command_delay", **estimates)], refined(problem, fit), vector
     )
 
 
@@ -326,13 +326,13 @@ def test_logs_are_joined_by_what_they_all_have_with_a_warning(flown):
 def test_a_cause_matters_if_another_value_is_wrong_without_it(state):
     problem = state.problem
     index = problem.names.index("gyro_scale.x")
-    cause = cause_of("gyro_scale", x=Estimated(0.05, (0.04, 0.06), "1"))
+    cause = make_cause("gyro_scale", x=Estimated(0.05, (0.04, 0.06), "1"))
     vector, near, far = (problem.start.copy() for _ in range(3))
     vector[index], near[index], far[index] = 0.05, 0.055, 0.07
     assert not is_bent(cause, problem, vector, near)
     assert is_bent(cause, problem, vector, far)
     # A factor that was found between two thrust curves is no parameter of the model.
-    factor = cause_of("thrust_scale", factor=Estimated(0.8, (0.7, 0.9), "1"))
+    factor = make_cause("thrust_scale", factor=Estimated(0.8, (0.7, 0.9), "1"))
     assert not is_bent(factor, problem, problem.start, problem.start)
 
 
@@ -391,7 +391,7 @@ def test_values_at_the_end_of_their_range_are_beyond_the_list(state, field, valu
     vector = problem.start.copy()
     vector[problem.names.index(field)] = value
     effect, _, name = field.rpartition(".")
-    cause = cause_of(effect or name, **{name: Estimated(value, (value, value), "1")})
+    cause = make_cause(effect or name, **{name: Estimated(value, (value, value), "1")})
     (cause,) = with_refined_values([cause], refined(problem), vector)
     assert cause.beyond.startswith(f"{name} at most {value:g}" if is_warned_of else "")
     warnings = "".join(collect_warnings(problem, [cause], []))

@@ -88,7 +88,7 @@ def test_laws_are_those_of_hidden_plants_in_plain_floats(names):
 # --- Forces ---------------------------------------------------------------------------------------
 
 
-def force_of(parameters, model=NOMINAL, **fields):
+def compute_force(parameters, model=NOMINAL, **fields):
     """Return the acceleration without gravity of one step with centred sticks, world, m/s^2."""
     rows = flown(parameters, drone=drone_with(**fields), model=model)
     return rows[0, ACCELERATION] + GRAVITY_W
@@ -102,13 +102,15 @@ def force_of(parameters, model=NOMINAL, **fields):
     ],
 )
 def test_quadratic_drag_multiplies_each_axis_by_the_whole_speed(vel_w, quat, expected):
-    force = force_of(effects.QuadraticDrag(0.1, 0.2, 0.3), model=NO_THRUST, vel_w=vel_w, quat=quat)
+    force = compute_force(
+        effects.QuadraticDrag(0.1, 0.2, 0.3), model=NO_THRUST, vel_w=vel_w, quat=quat
+    )
     assert_allclose(force, expected, atol=2e-5)
 
 
 def lift_ratio(parameters, **fields):
     """Return the vertical specific force with an effect over that without."""
-    return float(force_of(parameters, **fields)[2] / force_of((), **fields)[2])
+    return float(compute_force(parameters, **fields)[2] / compute_force((), **fields)[2])
 
 
 @pytest.mark.parametrize(("speed", "share"), [(0.0, 0.0), (HALF_SPEED, 0.5), (3 * HALF_SPEED, 0.9)])

@@ -46,7 +46,7 @@ def compiled_flight(model, start, commands, dt):
     return jax.lax.scan(step, start, commands)[1]
 
 
-def flight_of(model, start, commands, dt=DT):
+def simulate(model, start, commands, dt=DT):
     """Return a flight's states, (num_steps, 21)."""
     return np.asarray(compiled_flight(model, start, padded(commands), dt))[: len(commands)]
 
@@ -75,7 +75,7 @@ def begun(model, state):
 def both(craft, state, commands, dt=DT):
     """Return the states after each command of the NumPy craft, (n, 15 + 3), and of the model."""
     model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model_of(craft))
-    flown = flight_of(model, begun(model, state), 2.0 * commands - 1.0, dt)
+    flown = simulate(model, begun(model, state), 2.0 * commands - 1.0, dt)
     step_s, rows = (1e-4 if len(commands) < 10 else 1e-3), []
     for command in commands:
         for _ in range(round(dt / step_s)):
@@ -102,7 +102,7 @@ def test_a_hover_with_delayed_commands_stays_level():
     model = model.with_effects(effects.CommandDelay(0.02))
     drone, _ = begun(model_of(BALANCED), start)
     memories = effects.start_memories(model.effects, drone)
-    flown = flight_of(model, (drone, memories), 2.0 * held(*[HOVER] * 4, steps=20) - 1.0)
+    flown = simulate(model, (drone, memories), 2.0 * held(*[HOVER] * 4, steps=20) - 1.0)
     assert_allclose(flown[:, 13:16], 0.0, atol=1e-9)
     assert_allclose(flown[:, 3:6], 0.0, atol=1e-9)
     turning = drone._replace(applied=Action(0.2, -0.1, 0.1, 0.4))
@@ -157,7 +157,7 @@ def test_motors_are_slower_down_than_up():
     model = model_of(crafts(up_s=0.02, down_s=0.08))
     start = begun(model, hovering(crafts()))
     up, down = (
-        flight_of(model, start, 2.0 * held(*[end] * 4) - 1.0)[-1, 19]
+        simulate(model, start, 2.0 * held(*[end] * 4) - 1.0)[-1, 19]
         for end in (HOVER + 0.2, HOVER - 0.2)
     )
     base = 2.0 * HOVER - 1.0
