@@ -31,7 +31,7 @@ from flytrack_sysid import Diagnosis, FlightLog, LogError, diagnose
 from flytrack_sysid.check import check_log
 from flytrack_sysid.diagnosis import text_of
 from flytrack_sysid.diagnosis.plausible import PlausibleModels, find_plausible_models
-from flytrack_sysid.inference.parameters import from_vector, to_vector
+from flytrack_sysid.inference.parameters import from_vector, to_vector, without_neutral_effects
 from flytrack_sysid.log import usual_step
 from flytrack_sysid.plausibility import check_plausible
 
@@ -298,7 +298,7 @@ def improve(
     _, new = judge(env, Policy(policy.network, params), *flown)
     if new.speed <= old.speed:
         return Adapted(diagnosis, checkpoint, False, known, old, new)
-    meta = {**checkpoint.meta, "model": model_as_json(models.model)}
+    meta = {**checkpoint.meta, "model": model_as_json(without_neutral_effects(models.model))}
     adapted = checkpoint._replace(params=params, meta=meta, training=None)
     return Adapted(diagnosis, adapted, True, known, old, new)
 

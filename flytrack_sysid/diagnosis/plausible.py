@@ -3,8 +3,8 @@
 A log says little about thrust at sticks that it does not hold, and a fit leaves the thrust curve
 anywhere there. There the model that was diagnosed decides: a curve is the less likely, the more it
 differs from a multiple of that model's. Nor do seconds of flight show how fast a battery drains:
-unless a cause names it, the drain is that model's, too, and the voltage that a load takes is about
-that model's.
+unless a cause names it, the drain is that model's, too. The voltage that a load takes is about that
+model's; where a log could not have shown it, drawn models have it all the same.
 """
 
 from typing import NamedTuple
@@ -24,6 +24,7 @@ from flytrack_sysid.inference.parameters import (
     names_of,
     range_of,
     to_vector,
+    with_neutral_effects,
 )
 from flytrack_sysid.log_voltage import voltages_of
 
@@ -34,7 +35,8 @@ NUM_STICKS, NUM_VOLTAGES = 7, 3  # at which thrust is compared
 BATTERY_DRAIN = "battery_drain"  # the cause
 # Flights at full thrust show the voltage that a load takes at their start only: 10 s of two hidden
 # plants (suite v1, plants 2 and 5) left 2.4 +- 0.5 V of 0.44 V, and 0.9 +- 0.2 V of 0.25 V.
-SAG, SAG_STD = "voltage_sag.at_full_v", 0.5  # V
+SAG, SAG_FIELD, SAG_STD = "voltage_sag", "voltage_sag.at_full_v", 0.5  # V
+UNKNOWN_V = 10.0  # standard deviation where the log shows no sag at all
 SPREAD = "learned_law.spread"  # in standard errors of a learnt law's coefficients
 
 
@@ -71,7 +73,8 @@ class PlausibleModels(NamedTuple):
 
 def find_plausible_models(diagnosis: Diagnosis) -> PlausibleModels:
     """Return the models that a diagnosed log leaves possible."""
-    like = diagnosis.extended
+    unseen = {limit.effect: limit.smallest for limit in diagnosis.not_identifiable}
+    like = with_neutral_effects(diagnosis.extended, [SAG] if SAG in unseen else [])
     names, vector = names_of(like), to_vector(like)
     fitted = set(diagnosis.joint.names) & set(names)
     if all(cause.effect != BATTERY_DRAIN for cause in diagnosis.causes):
@@ -83,6 +86,10 @@ def find_plausible_models(diagnosis: Diagnosis) -> PlausibleModels:
     covariance[np.ix_(indices, indices)] = diagnosis.joint.covariance[np.ix_(rows, rows)]
     if SPREAD in names:
         covariance[names.index(SPREAD), names.index(SPREAD)] = 1.0
+    if SAG in unseen and SAG_FIELD not in fitted:
+        # The log shows what is larger: two standard deviations.
+        std_v = min(0.5 * unseen[SAG], UNKNOWN_V)
+        covariance[names.index(SAG_FIELD), names.index(SAG_FIELD)] = std_v**2
     known, targets = _known_before(diagnosis, names)
     spread = covariance @ known.T
     gain = spread @ np.linalg.inv(np.eye(len(known)) + known @ spread)
@@ -90,6 +97,8 @@ def find_plausible_models(diagnosis: Diagnosis) -> PlausibleModels:
     mean = vector + gain @ (targets - known @ vector)
     ranges = [range_of(name) for name in names]
     low, high = (np.array([getattr(one, end) for one in ranges]) for end in ("low", "high"))
+    if SAG_FIELD in names:  # a load takes voltage, and gives none
+        low[names.index(SAG_FIELD)] = min(0.0, mean[names.index(SAG_FIELD)])
     return PlausibleModels(like, np.clip(mean, low, high), _root(covariance), low, high)
 
 
@@ -103,9 +112,9 @@ def _known_before(diagnosis: Diagnosis, names: tuple[str, ...]) -> tuple[np.ndar
     rows = np.zeros((len(shapes) + 1, len(names)))
     targets = np.zeros(len(rows))
     rows[:-1, [names.index(name) for name in THRUST_COEFFS]] = shapes
-    if SAG in names:
-        rows[-1, names.index(SAG)] = 1.0 / SAG_STD
-        targets[-1] = float(diagnosis.nominal.effect("voltage_sag").at_full_v) / SAG_STD
+    if SAG_FIELD in names:
+        rows[-1, names.index(SAG_FIELD)] = 1.0 / SAG_STD
+        targets[-1] = float(diagnosis.nominal.effect(SAG).at_full_v) / SAG_STD
     return rows, targets
 
 

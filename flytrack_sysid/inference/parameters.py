@@ -153,6 +153,12 @@ def with_values(model: ModelParameters, values: Mapping[str, float]) -> ModelPar
     return jax.tree.map(np.asarray, from_vector(vector, model))
 
 
+def without_neutral_effects(model: ModelParameters) -> ModelParameters:
+    """Return the same model without effects that do nothing."""
+    acting = (one for one in model.effects if not all(map(np.array_equal, one, type(one)())))
+    return model._replace(effects=tuple(acting))
+
+
 def with_neutral_effects(model: ModelParameters, effects: Iterable[str]) -> ModelParameters:
     """Return the model with effects added where it lacks them, at their neutral values.
 

@@ -23,9 +23,13 @@ from flytrack_loop.adapt import Adapted, FlightResults, Settings, adapt, describ
 from flytrack_sysid import LogError
 from flytrack_sysid.diagnosis import Cause, Diagnosis, Unexplained
 from flytrack_sysid.diagnosis.plausible import find_plausible_models
-from flytrack_sysid.diagnosis.result import Joint
+from flytrack_sysid.diagnosis.result import Joint, NotIdentifiable
 from flytrack_sysid.importing.betaflight_settings import GENERIC
-from flytrack_sysid.inference.parameters import THRUST_COEFFS, names_of
+from flytrack_sysid.inference.parameters import (
+    THRUST_COEFFS,
+    names_of,
+    without_neutral_effects,
+)
 from flytrack_sysid.inference.problem import split_blocks
 from tests.support.evaluated import write_checkpoint
 from tests.support.handout_plant import HandoutPlant, excited
@@ -46,6 +50,12 @@ def thrust(coeffs, stick):
 def diagnosis(extended, joint=Joint(), causes=(CAUSE,), unexplained=Unexplained()):  # noqa: B008
     rest = (NOMINAL, NOMINAL, extended, {}, "log.npz", "0" * 64)
     return Diagnosis("causes_found", causes, unexplained, (), {}, *rest, joint=joint)
+
+
+def with_unseen_sag(found, smallest_v):
+    """Return a diagnosis whose log shows a sag of some volts at least; None if any."""
+    limits = [] if smallest_v is None else [NotIdentifiable("voltage_sag", smallest_v, "V", (), "")]
+    return replace(found, not_identifiable=tuple(limits))
 
 
 def seen_at(sticks, std_n):
@@ -101,6 +111,29 @@ def test_a_drain_that_no_cause_names_is_that_of_the_model(cause, drain):
     assert models.model.battery_drain_v_per_min == drain
     drawn = drawn_by(models.draw, 50)
     assert (np.std(drawn.battery_drain_v_per_min) > 0.1) == (cause == "battery_drain")
+
+
+@pytest.mark.parametrize("smallest_v, most_v", [(None, 0.0), (0.4, 0.9), (np.inf, 2.5)])
+def test_a_sag_that_the_log_could_not_show_is_drawn(smallest_v, most_v):
+    models = find_plausible_models(with_unseen_sag(diagnosis(DRAG), smallest_v))
+    drawn = drawn_by(models.draw, 400)
+    if smallest_v is None:
+        assert [type(one) for one in drawn.effects] == [LinearDrag]
+        return
+    sags_v = drawn.effect("voltage_sag").at_full_v
+    assert_allclose((sags_v == 0.0).mean(), 0.5, atol=0.1)  # a load gives no voltage
+    assert 0.4 * most_v < sags_v.max() < most_v
+    assert_allclose(without_neutral_effects(models.model).effects, DRAG.effects, rtol=1e-6)
+
+
+def test_the_log_says_how_thrust_goes_with_a_sag_that_was_taken_out():
+    names = ("c0", "voltage_sag.at_full_v")
+    joint = Joint(names, np.array([[0.04, 0.19], [0.19, 1.0]]))
+    models = find_plausible_models(with_unseen_sag(diagnosis(DRAG, joint), 0.4))
+    drawn = drawn_by(models.draw, 400)
+    sags_v, thrusts = drawn.effect("voltage_sag").at_full_v, drawn.thrust_coeffs[:, 0]
+    is_sagging = sags_v > 0.0
+    assert np.corrcoef(sags_v[is_sagging], thrusts[is_sagging])[0, 1] > 0.5
 
 
 def test_a_model_in_the_structure_of_another_flies_as_it_did():
