@@ -305,14 +305,15 @@ def crafts_table(lines: list[Line]) -> str:
     """Return a row for each craft that the policy was not made for."""
     rows = []
     for line in sorted(lines, key=lambda line: line["number"]):
-        entries, named = line["entries"], ", ".join(line.get("named", ())) or "nothing"
+        entries, named = line["entries"], line.get("named")
         flown_s = entries.get("adapted", {}).get("flying_lap_s")
         simulated_s = line.get("simulated_lap_s")
         gap = f"{flown_s / simulated_s - 1.0:+.2%}" if flown_s and simulated_s else "-"
         verdict = line.get("refused") or line["verdict"]
         laps = [format_lap(entries.get(name)) for name in ("nothing", "adapted")]
         cpu_s = str(line.get("cpu_s", "-"))
-        rows.append([line["hidden"], verdict, named, *laps, gap, cpu_s, line["commit"]])
+        names = "-" if named is None else ", ".join(named) or "nothing"
+        rows.append([line["hidden"], verdict, names, *laps, gap, cpu_s, line["commit"]])
     header = "craft | verdict | named | nothing | adapted | gap to its simulator | CPU s | commit"
     return report.table(header, rows)
 

@@ -81,7 +81,7 @@ def test_firmware_and_other_lengths_have_tables_of_their_own(written):
     assert "| 10 | 1 | 1 of 1 | 1 of 1 | 0 | 40 | abc |" in page
     assert "| 0.0%, - | 100.0%, 4.000 s | +1.01% | 40.0 |" in page
     assert "| 12.6 V | causes_found | wind, rotor_drag |" in page
-    assert "| curved | a hover | nothing | 0.0%, - | - | - | - |" in page
+    assert "| curved | a hover | - | 0.0%, - | - | - | - |" in page
 
 
 def test_rivals_are_compared_by_races_a_second():

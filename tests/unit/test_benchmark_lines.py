@@ -4,7 +4,7 @@ import subprocess
 
 import pytest
 
-from benchmarks import report
+from benchmarks import diagnosis, report
 
 
 @pytest.fixture
@@ -28,6 +28,10 @@ def commit_of(tmp_path, monkeypatch):
 
     git("init")
     return commit
+
+
+def test_the_measured_code_is_where_it_says():
+    assert [path for path in diagnosis.CODE if not (report.ROOT / path).exists()] == []
 
 
 def test_lines_of_a_commit_with_the_same_code_count(commit_of, tmp_path):
