@@ -254,6 +254,7 @@ def _likelihoods_of_thrust(changes: np.ndarray, axes: np.ndarray) -> np.ndarray:
     total = np.sum(changes**2) + floor
     values = np.empty((len(DIRECTIONS), len(FRAMES), len(FRAMES)))
     for direction in DIRECTIONS:  # of the thrust, in the attitude's body
+        is_along = np.all(FRAMES[:, :, 2] == direction, axis=1)
         thrust = axes @ direction
         thrust /= np.maximum(np.linalg.norm(thrust, axis=1, keepdims=True), STILL)
         along = np.einsum("wni,ni->wn", moved, thrust)
@@ -266,6 +267,5 @@ def _likelihoods_of_thrust(changes: np.ndarray, axes: np.ndarray) -> np.ndarray:
             upward = along + scale[:, None] * (thrust @ up)
             is_flying = upward.mean(axis=1) > upward.std(axis=1)  # it mostly holds the weight
             likelihood = -count * np.log((residual + floor) / total)
-            is_along = np.array([np.allclose(frame[:, 2], direction) for frame in FRAMES])
             values[up_number][:, is_along] = np.where(is_flying, likelihood, NOT_FLYING)[:, None]
     return values

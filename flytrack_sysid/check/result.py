@@ -124,14 +124,14 @@ def command_changes(log: FlightLog, model: ModelParameters | None) -> list[tuple
         return [(curve,) for curve in curves]
     expected = np.zeros(3) if model is None else np.asarray(model.tau, float)[:3]
     delay_s = mean_delay(log, found, expected)
-    if delay_s:  # a late command is as late in both halves
-        half = np.arange(len(log)) < len(log) // 2
-        halves = [log.select(half), log.select(~half)]
-        by_half = [mean_delay(part, responses(part), expected) for part in halves]
-        delay_s *= all(abs(one - delay_s) < max(LATE_S, 0.3 * abs(delay_s)) for one in by_half)
-    is_late = delay_s > (LATEST_S if model is None else LATER_S) or -delay_s > LATE_S
-    late = [Change("u", "delay", -delay_s)] * is_late
-    return [tuple(late)]
+    if -LATE_S <= delay_s <= (LATEST_S if model is None else LATER_S):
+        return [()]
+    half = np.arange(len(log)) < len(log) // 2
+    halves = [log.select(half), log.select(~half)]
+    by_half = [mean_delay(part, responses(part), expected) for part in halves]
+    # A late command is as late in both halves.
+    is_late = all(abs(one - delay_s) < max(LATE_S, 0.3 * abs(delay_s)) for one in by_half)
+    return [(Change("u", "delay", -delay_s),) if is_late else ()]
 
 
 def check_log(
