@@ -8,7 +8,7 @@ import numpy as np
 
 from flytrack.flags import Check, Collect, Diagnose, Fit, Import, Plan, Validate
 from flytrack_env import Motion, blackbox, load_model, load_provenance, save_model
-from flytrack_env.dynamics import nominal_parameters
+from flytrack_env.dynamics import ModelParameters, nominal_parameters
 from flytrack_env.extras import import_object
 from flytrack_env.files import write_atomically
 from flytrack_env.model_file import ModelFileError
@@ -187,14 +187,33 @@ def run_validate(flags: Validate) -> None:
     """Validate the model and write the report."""
     model = load_model(flags.model)
     log = load_log(flags.log)
-    check_plausible(log, flags.accept, model)
     rows, note = judged_rows(flags.model, log)
+    check_plausible(log, flags.accept, model)
     with waiting("fly the model beside the log"):
         found = validate(model, log, rows)
     found = found._replace(notes=(note, *found.notes))
     written = write_validation(flags.out, found, flags.model.name, log)
     print(text_of(found, flags.model.name, log))
     print_written(written)
+
+
+def read_logs(
+    flags: Diagnose, model: ModelParameters | None
+) -> tuple[list[FlightLog], list[FlightLog], np.ndarray | None]:
+    """Read and describe the logs of a diagnosis.
+
+    Returns:
+        The logs to diagnose, those of earlier flights, and which rows of the former are held out
+        (None if none was given for that).
+    """
+    train, test, before = (
+        [load_log(path) for path in paths] for paths in (flags.logs, flags.hold_out, flags.before)
+    )
+    for one in train + test + before:
+        check_plausible(one, flags.accept, model)
+        print(describe(one), flush=True)  # what follows takes a while
+    rows = np.arange(sum(map(len, train + test)))
+    return train + test, before, rows >= sum(map(len, train)) if test else None
 
 
 def run_diagnose(flags: Diagnose) -> None:
@@ -204,26 +223,20 @@ def run_diagnose(flags: Diagnose) -> None:
     if flags.fleet:
         run_fleet(flags)
         return
-    train, test, before = (
-        [load_log(path) for path in paths] for paths in (flags.logs, flags.hold_out, flags.before)
-    )
-    logs = train + test
     model = None if flags.model is None else load_model(flags.model)
-    for one in logs + before:
-        check_plausible(one, flags.accept, model)
-        print(describe(one), flush=True)  # what follows takes a while
-    log = joined(logs)
-    held_out = np.arange(len(log)) >= sum(map(len, train)) if test else None
     motion = None if flags.motion == "auto" else Motion(flags.motion)
     if flags.quick:
-        if before:
+        if flags.before:
             raise ValueError("--quick: found beside --before, expected one of the two")
+        logs, _, held_out = read_logs(flags, model)
         with waiting("first look"):
             look = first_look(logs, model, held_out, motion)
         print(f"{look.text()}\n{NOT_CHECKED}")
         return
     if flags.out is None:
         raise ValueError("--out: missing, expected a folder for the report, or --quick")
+    logs, before, held_out = read_logs(flags, model)
+    log = joined(logs)
     bar = ProgressBar("stages")
     if before:
         diagnosis = diagnose_change(logs, before, model, held_out, bar, motion)

@@ -263,7 +263,6 @@ def what_is_fitted(
 
     Arguments and exceptions are those of ``fit``, which calls this first.
     """
-    check_plausible(log, accept, start)
     fixed, effects = dict(fixed or {}), tuple(effects)
     try:
         model = with_neutral_effects(nominal_parameters() if start is None else start, effects)
@@ -278,6 +277,7 @@ def what_is_fitted(
             raise FitError(
                 f"effects: {name}: acts on sticks, and the model's commands are those of motors"
             )
+    check_plausible(log, accept, start)
     check_commands(log, model)
     free = _free_names(model, log, fixed)
     model = with_values(model, fixed)

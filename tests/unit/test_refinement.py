@@ -164,6 +164,7 @@ def test_a_parameter_is_superfluous_beside_others_at_a_bound_or_where_all_may_be
     assert (superfluous(problem, fit, DELAY) or "") == expected
 
 
+@pytest.mark.slow
 def test_flights_without_velocity_leave_the_thrust_of_single_steps():
     """Torque over inertia is all that rates show: a map and radii of gyration trade off."""
     weak = crafts(thrust=[4.8] * 4)
