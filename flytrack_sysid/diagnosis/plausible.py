@@ -4,7 +4,7 @@ A log says little about thrust at sticks that it does not hold, and a fit leaves
 anywhere there. There the model that was diagnosed decides: a curve is the less likely, the more it
 differs from a multiple of that model's. Nor do seconds of flight show how fast a battery drains:
 unless a cause names it, the drain is that model's, too. The voltage that a load takes is about that
-model's; where a log could not have shown it, drawn models have it all the same.
+model's; drawn models have as much of it as a log may fail to show.
 """
 
 from typing import NamedTuple
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from flytrack_env.dynamics import ModelParameters
+from flytrack_env.effects import BY_NAME
 from flytrack_env.thrust import collective_thrust
 from flytrack_sysid.diagnosis.result import Diagnosis
 from flytrack_sysid.inference.parameters import (
@@ -73,9 +74,9 @@ class PlausibleModels(NamedTuple):
 
 def find_plausible_models(diagnosis: Diagnosis) -> PlausibleModels:
     """Return the models that a diagnosed log leaves possible."""
-    unseen = {limit.effect: limit.smallest for limit in diagnosis.not_identifiable}
-    like = with_neutral_effects(diagnosis.extended, [SAG] if SAG in unseen else [])
+    like = with_neutral_effects(diagnosis.extended, [SAG])
     names, vector = names_of(like), to_vector(like)
+    sag = names.index(SAG_FIELD)
     fitted = set(diagnosis.joint.names) & set(names)
     if all(cause.effect != BATTERY_DRAIN for cause in diagnosis.causes):
         vector[names.index(DRAIN)] = float(diagnosis.nominal.battery_drain_v_per_min)
@@ -86,10 +87,11 @@ def find_plausible_models(diagnosis: Diagnosis) -> PlausibleModels:
     covariance[np.ix_(indices, indices)] = diagnosis.joint.covariance[np.ix_(rows, rows)]
     if SPREAD in names:
         covariance[names.index(SPREAD), names.index(SPREAD)] = 1.0
-    if SAG in unseen and SAG_FIELD not in fitted:
-        # The log shows what is larger: two standard deviations.
-        std_v = min(0.5 * unseen[SAG], UNKNOWN_V)
-        covariance[names.index(SAG_FIELD), names.index(SAG_FIELD)] = std_v**2
+    if SAG_FIELD not in fitted:
+        # A larger one would have been named: two standard deviations.
+        smallest = {limit.effect: limit.smallest for limit in diagnosis.not_identifiable}
+        shown_v = smallest.get(SAG, BY_NAME[SAG].notable["at_full_v"])
+        covariance[sag, sag] = min(0.5 * shown_v, UNKNOWN_V) ** 2
     known, targets = _known_before(diagnosis, names)
     spread = covariance @ known.T
     gain = spread @ np.linalg.inv(np.eye(len(known)) + known @ spread)
@@ -97,8 +99,8 @@ def find_plausible_models(diagnosis: Diagnosis) -> PlausibleModels:
     mean = vector + gain @ (targets - known @ vector)
     ranges = [range_of(name) for name in names]
     low, high = (np.array([getattr(one, end) for one in ranges]) for end in ("low", "high"))
-    if SAG_FIELD in names:  # a load takes voltage, and gives none
-        low[names.index(SAG_FIELD)] = min(0.0, mean[names.index(SAG_FIELD)])
+    # A load takes voltage, and gives none.
+    low[sag] = min(0.0, mean[sag])
     return PlausibleModels(like, np.clip(mean, low, high), _root(covariance), low, high)
 
 
@@ -112,9 +114,8 @@ def _known_before(diagnosis: Diagnosis, names: tuple[str, ...]) -> tuple[np.ndar
     rows = np.zeros((len(shapes) + 1, len(names)))
     targets = np.zeros(len(rows))
     rows[:-1, [names.index(name) for name in THRUST_COEFFS]] = shapes
-    if SAG_FIELD in names:
-        rows[-1, names.index(SAG_FIELD)] = 1.0 / SAG_STD
-        targets[-1] = float(diagnosis.nominal.effect(SAG).at_full_v) / SAG_STD
+    rows[-1, names.index(SAG_FIELD)] = 1.0 / SAG_STD
+    targets[-1] = float(diagnosis.nominal.effect(SAG).at_full_v) / SAG_STD
     return rows, targets
 
 

@@ -53,7 +53,7 @@ def diagnosis(extended, joint=Joint(), causes=(CAUSE,), unexplained=Unexplained(
 
 
 def with_unseen_sag(found, smallest_v):
-    """Return a diagnosis whose log shows a sag of some volts at least; None if any."""
+    """Return a diagnosis whose log shows a sag of some volts at least; None: a notable one."""
     limits = [] if smallest_v is None else [NotIdentifiable("voltage_sag", smallest_v, "V", (), "")]
     return replace(found, not_identifiable=tuple(limits))
 
@@ -113,13 +113,10 @@ def test_a_drain_that_no_cause_names_is_that_of_the_model(cause, drain):
     assert (np.std(drawn.battery_drain_v_per_min) > 0.1) == (cause == "battery_drain")
 
 
-@pytest.mark.parametrize("smallest_v, most_v", [(None, 0.0), (0.4, 0.9), (np.inf, 2.5)])
-def test_a_sag_that_the_log_could_not_show_is_drawn(smallest_v, most_v):
+@pytest.mark.parametrize("smallest_v, most_v", [(None, 0.7), (0.8, 1.6), (np.inf, 2.5)])
+def test_a_sag_that_the_log_need_not_have_shown_is_drawn(smallest_v, most_v):
     models = find_plausible_models(with_unseen_sag(diagnosis(DRAG), smallest_v))
     drawn = drawn_by(models.draw, 400)
-    if smallest_v is None:
-        assert [type(one) for one in drawn.effects] == [LinearDrag]
-        return
     sags_v = drawn.effect("voltage_sag").at_full_v
     assert_allclose((sags_v == 0.0).mean(), 0.5, atol=0.1)  # a load gives no voltage
     assert 0.4 * most_v < sags_v.max() < most_v
