@@ -81,7 +81,7 @@ class ModelParameters(NamedTuple):
 
         Its thrust over weight is the same at the same fractions of the highest voltage. So thrust
         scales with the mass, and its dependence on the voltage with the inverse of that voltage.
-        Effects stay as they are.
+        Voltages of effects scale with it, and all else of them stays.
 
         Args:
             mass: kg.
@@ -95,6 +95,7 @@ class ModelParameters(NamedTuple):
             m=mass,
             battery_drain_v_per_min=float(self.battery_drain_v_per_min) / per_volt,
             battery=battery,
+            effects=tuple(effects.with_voltages_times(1.0 / per_volt, one) for one in self.effects),
         )
 
     def effect(self, name: str) -> Any:

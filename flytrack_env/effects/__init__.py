@@ -108,6 +108,12 @@ BY_NAME = {effect.name: effect for effect in ORDER}
 _BY_CLASS = {effect.parameters: effect for effect in ORDER}
 
 
+def with_voltages_times(factor: float, parameters: Any) -> Any:
+    """Return the parameters of an effect with those in volts times a factor."""
+    volts = [name for name, one in effect_of(parameters).ranges.items() if one.unit == "V"]
+    return parameters._replace(**{name: getattr(parameters, name) * factor for name in volts})
+
+
 def effect_of(parameters: Any) -> Effect:
     """Return the effect that parameters belong to.
 

@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from flytrack_env import Battery, BatteryWarning, FlyTrack
-from flytrack_env.state import unpack_action
+from flytrack_env import Battery, BatteryWarning, FlyTrack, nominal_parameters
+from flytrack_env.dynamics import step
+from flytrack_env.effects import LinearDrag, VoltageSag
+from flytrack_env.state import BATTERY, STATE_SIZE, unpack_action
 from flytrack_sysid.importing.flight import Craft
 from tests.support.coasting import Coasting
 from tests.support.slow import slow_but
@@ -37,6 +39,25 @@ def test_episodes_stay_within_the_battery_of_the_craft(cells):
     assert model.battery.full_v - 0.1 * cells < volts.max() <= model.battery.full_v + 1e-5
     expected = (volts - 3.8 * cells) / (0.4 * cells)
     np.testing.assert_allclose(observations[:, BATTERY_ROW], expected, atol=2e-5)
+
+
+def test_a_craft_of_another_size_flies_alike_and_sags_alike():
+    model = nominal_parameters().with_effects(VoltageSag(0.6), LinearDrag(0.3, 0.2, 0.1))
+    half = Battery(*(0.5 * volts for volts in model.battery))
+    small = model.resized(0.25, half)
+    states = [np.zeros(STATE_SIZE, np.float32) for _ in range(2)]
+    for state, one in zip(states, (model, small), strict=True):
+        state[[2, 3, 9, BATTERY]] = 5.0, 4.0, 1.0, one.battery.full_v
+    for stick in (0.9, -0.2, 0.5):
+        command = jnp.array([0.3, -0.2, 0.1, stick])
+        states = [
+            np.asarray(step(state, command, 0.01, one))
+            for state, one in zip(states, (model, small), strict=True)
+        ]
+    large, small_one = states
+    assert large[BATTERY] < model.battery.full_v - 0.05
+    np.testing.assert_allclose(2.0 * small_one[BATTERY], large[BATTERY], rtol=1e-6)
+    np.testing.assert_allclose(small_one[:BATTERY], large[:BATTERY], rtol=1e-5, atol=1e-5)
 
 
 def test_an_episode_ends_at_the_empty_voltage_of_its_craft():
