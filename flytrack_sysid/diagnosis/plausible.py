@@ -16,7 +16,7 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME
 from flytrack_env.thrust import collective_thrust
-from flytrack_sysid.diagnosis.result import Diagnosis
+from flytrack_sysid.diagnosis.result import TWO_SIDED_95, Diagnosis
 from flytrack_sysid.inference.parameters import (
     DRAIN,
     THRUST_COEFFS,
@@ -92,6 +92,13 @@ def find_plausible_models(diagnosis: Diagnosis) -> PlausibleModels:
         smallest = {limit.effect: limit.smallest for limit in diagnosis.not_identifiable}
         shown_v = smallest.get(SAG, BY_NAME[SAG].notable["at_full_v"])
         covariance[sag, sag] = min(0.5 * shown_v, UNKNOWN_V) ** 2
+    for cause in diagnosis.causes:
+        if cause.effect == SAG:
+            # As uncertain as reported, which counts how much parts of the log disagree.
+            told = cause.parameters["at_full_v"]
+            more = ((told.value - told.ci95[0]) / TWO_SIDED_95) ** 2 - covariance[sag, sag]
+            along = covariance[:, sag] / covariance[sag, sag]  # what changes with a volt of it
+            covariance += max(more, 0.0) * np.outer(along, along)
     known, targets = _known_before(diagnosis, names)
     spread = covariance @ known.T
     gain = spread @ np.linalg.inv(np.eye(len(known)) + known @ spread)

@@ -13,7 +13,7 @@ from baselines.purejaxrl_ppo.checkpoint import SHIPPED
 from flytrack_env import nominal_parameters
 from flytrack_env.battery import Battery
 from flytrack_env.dynamics import step
-from flytrack_env.effects import WIND, CommandDelay, LinearDrag, Motors, QuadraticDrag
+from flytrack_env.effects import WIND, CommandDelay, LinearDrag, Motors, QuadraticDrag, VoltageSag
 from flytrack_env.effects.actual_rates import ActualRates
 from flytrack_env.effects.betaflight_rates import BetaflightRates
 from flytrack_env.motion import Motion
@@ -23,7 +23,7 @@ from flytrack_loop.adapt import Adapted, FlightResults, Settings, adapt, describ
 from flytrack_sysid import LogError
 from flytrack_sysid.diagnosis import Cause, Diagnosis, Unexplained
 from flytrack_sysid.diagnosis.plausible import find_plausible_models
-from flytrack_sysid.diagnosis.result import Joint, NotIdentifiable
+from flytrack_sysid.diagnosis.result import Estimated, Joint, NotIdentifiable
 from flytrack_sysid.importing.betaflight_settings import GENERIC
 from flytrack_sysid.inference.parameters import (
     THRUST_COEFFS,
@@ -121,6 +121,25 @@ def test_a_sag_that_the_log_need_not_have_shown_is_drawn(smallest_v, most_v):
     assert_allclose((sags_v == 0.0).mean(), 0.5, atol=0.1)  # a load gives no voltage
     assert 0.4 * most_v < sags_v.max() < most_v
     assert_allclose(without_neutral_effects(models.model).effects, DRAG.effects, rtol=1e-6)
+
+
+def test_a_named_sag_is_as_uncertain_as_told():
+    """The joint covariance says 0.1 V, the interval of the cause 0.5 V, as does the prior."""
+    names = ("linear_drag.d_x", "voltage_sag.at_full_v")
+    joint = Joint(names, np.array([[1e-4, 5e-4], [5e-4, 0.01]]))
+    told = Estimated.around(1.0, 1.96 * 0.5, "V")
+    cause = replace(CAUSE, effect="voltage_sag", parameters={"at_full_v": told})
+    models = find_plausible_models(
+        diagnosis(DRAG.with_effects(VoltageSag(1.0)), joint, (CAUSE, cause))
+    )
+    drawn = drawn_by(models.draw_vector, 4000)
+    order = names_of(models.like)
+    drag, sag = (np.asarray(drawn, float)[:, order.index(name)] for name in names)
+    assert_allclose(models.mean[order.index(names[1])], 0.5, atol=0.01)
+    is_inside = (sag > 0.0) & (drag > 0.0)
+    slope = np.polyfit(sag[is_inside], drag[is_inside], 1)[0]
+    assert_allclose(slope, 0.05, atol=0.005)  # the drag goes with the sag as the log says
+    assert_allclose(np.percentile(sag, [50.0, 84.0]), [0.5, 0.85], atol=0.05)
 
 
 def test_the_log_says_how_thrust_goes_with_a_sag_that_was_taken_out():
