@@ -96,7 +96,8 @@ def find_plausible_models(diagnosis: Diagnosis) -> PlausibleModels:
         if cause.effect == SAG:
             # As uncertain as reported, which counts how much parts of the log disagree.
             told = cause.parameters["at_full_v"]
-            more = ((told.value - told.ci95[0]) / TWO_SIDED_95) ** 2 - covariance[sag, sag]
+            std_v = min((told.value - told.ci95[0]) / TWO_SIDED_95, UNKNOWN_V)
+            more = std_v**2 - covariance[sag, sag]
             along = covariance[:, sag] / covariance[sag, sag]  # what changes with a volt of it
             covariance += max(more, 0.0) * np.outer(along, along)
     known, targets = _known_before(diagnosis, names)

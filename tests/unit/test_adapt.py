@@ -123,6 +123,16 @@ def test_a_sag_that_the_log_need_not_have_shown_is_drawn(smallest_v, most_v):
     assert_allclose(without_neutral_effects(models.model).effects, DRAG.effects, rtol=1e-6)
 
 
+def test_a_named_sag_without_limits_is_about_the_models():
+    joint = Joint(("voltage_sag.at_full_v",), np.array([[0.01]]))
+    told = Estimated(5.0, (-np.inf, np.inf), "V")
+    cause = replace(CAUSE, effect="voltage_sag", parameters={"at_full_v": told})
+    models = find_plausible_models(
+        diagnosis(DRAG.with_effects(VoltageSag(5.0)), joint, (CAUSE, cause))
+    )
+    assert abs(models.model.effect("voltage_sag").at_full_v) < 0.05
+
+
 def test_a_named_sag_is_as_uncertain_as_told():
     """The joint covariance says 0.1 V, the interval of the cause 0.5 V, as does the prior."""
     names = ("linear_drag.d_x", "voltage_sag.at_full_v")
