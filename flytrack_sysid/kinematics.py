@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from flytrack_env.dynamics import nominal_parameters
-from flytrack_sysid.log import FlightLog, time_in_line
+from flytrack_sysid.log import FlightLog
 
 GRAVITY = float(nominal_parameters().g)  # m/s^2
 WEIGHT_W = np.array([0.0, 0.0, GRAVITY])  # specific force at rest, world frame
@@ -125,10 +125,12 @@ def derivative(log: FlightLog, values: np.ndarray) -> np.ndarray:
 
 def read_at(log: FlightLog, values: np.ndarray, later_s: float) -> np.ndarray:
     """Return values, (num_rows, n), read some seconds later within each segment; ends are held."""
-    time, edges = time_in_line(log), np.append(np.flatnonzero(log.is_start()), len(log))
-    first, last = (np.repeat(time[ends], np.diff(edges)) for ends in (edges[:-1], edges[1:] - 1))
-    later = np.clip(time + later_s, first, last)
-    return np.stack([np.interp(later, time, column) for column in values.T], axis=1)
+    result = np.empty_like(values)
+    for rows in segments_of(log):
+        time = log.time[rows]
+        for column in range(values.shape[1]):
+            result[rows, column] = np.interp(time + later_s, time, values[rows, column])
+    return result
 
 
 def jackknife_error(estimates: np.ndarray) -> float:
