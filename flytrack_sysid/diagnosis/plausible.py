@@ -37,7 +37,7 @@ BATTERY_DRAIN = "battery_drain"  # the cause
 # Flights at full thrust show the voltage that a load takes at their start only: 10 s of two hidden
 # plants (suite v1, plants 2 and 5) left 2.4 +- 0.5 V of 0.44 V, and 0.9 +- 0.2 V of 0.25 V.
 SAG, SAG_FIELD, SAG_STD = "voltage_sag", "voltage_sag.at_full_v", 0.5  # V
-UNKNOWN_V = 10.0  # standard deviation where the log shows no sag at all
+UNKNOWN_V = 10.0  # where the log sets no limit; what is far above SAG_STD does the same
 SPREAD = "learned_law.spread"  # in standard errors of a learnt law's coefficients
 
 
