@@ -1,13 +1,11 @@
 """FlyTrack: a drone-racing environment in JAX. Importing it registers its ids with gymnax."""
 
-from importlib.metadata import version
-
 from flytrack_env.battery import Battery, BatteryWarning
 from flytrack_env.compile_cache import keep_compiled_programs
 from flytrack_env.dynamics import ModelParameters, nominal_parameters
-from flytrack_env.extras import check_gymnax
+from flytrack_env.extras import import_gymnax
 
-check_gymnax(version("gymnax"))  # before what imports it
+import_gymnax()  # before what needs it
 
 from flytrack_env.env import EnvParams, EnvState, FlyTrack
 from flytrack_env.gymnasium_adapter import register_with_gymnasium

@@ -2,9 +2,11 @@
 
 import importlib
 import sys
+from importlib.metadata import version
 from importlib.util import find_spec
 from operator import attrgetter
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 PACKAGES = {
@@ -13,6 +15,7 @@ PACKAGES = {
     "rerun": "rerun-sdk",
 }  # where the module's name differs
 OLDEST_GYMNAX = 1
+DRAWS = "seaborn"  # imported by gymnax for its own pictures
 
 
 def is_installed(module: str) -> bool:
@@ -27,6 +30,26 @@ def check_gymnax(found: str) -> None:
         raise ImportError(
             f"gymnax: found version {found}, expected {OLDEST_GYMNAX}.0 or newer: {how}"
         )
+
+
+def import_gymnax() -> None:
+    """Import gymnax without seaborn, which is imported once gymnax draws with it.
+
+    seaborn imports pandas and scipy.stats: longer than all the rest of FlyTrack together.
+
+    Raises:
+        ImportError: gymnax is too old.
+    """
+    check_gymnax(version("gymnax"))
+    if DRAWS in sys.modules:
+        return
+    stand_in = ModuleType(DRAWS)
+    stand_in.__dict__["__getattr__"] = lambda name: getattr(importlib.import_module(DRAWS), name)
+    sys.modules[DRAWS] = stand_in
+    try:
+        importlib.import_module("gymnax")
+    finally:
+        del sys.modules[DRAWS]
 
 
 def check_installed(extra: str, who: str, *modules: str) -> None:

@@ -1,6 +1,8 @@
 """Every registered id: made, reproducible, differentiable."""
 
 import importlib
+import subprocess
+import sys
 from functools import partial
 
 import chex
@@ -118,6 +120,22 @@ WRONG_CALLS = {
 def test_wrong_calls_are_refused_in_a_sentence_that_says_what_to_do(message):
     with pytest.raises((ValueError, TypeError, ImportError), match=message):
         WRONG_CALLS[message]()
+
+
+SEABORN_WHERE_IT_DRAWS = """
+import sys
+import flytrack_env
+from gymnax.environments.misc import pong
+assert "seaborn" not in sys.modules
+assert pong.sns.color_palette()
+import seaborn
+assert seaborn.color_palette is pong.sns.color_palette
+"""
+
+
+@pytest.mark.slow
+def test_what_only_gymnaxs_pictures_need_is_imported_for_them():
+    subprocess.run([sys.executable, "-c", SEABORN_WHERE_IT_DRAWS], check=True)
 
 
 # --- Gradients ----------------------------------------------------------------------------------
