@@ -40,14 +40,13 @@ def as_type(dtype, leaf):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("env_id", KINDS[1:])
-def test_with_x64_a_flight_is_the_same(env_id):
-    env = gymnax.make(env_id)[0]
+def test_with_x64_a_flight_is_the_same():
+    env = gymnax.make(EVERY_WRAPPER)[0]
     keys, actions, params = inputs(env)
     with jax.enable_x64(True):
         flight_in_x64 = jax.jit(flight(env))(keys, actions.astype(float), params)
     for leaf, expected_leaf in zip(
-        *map(jax.tree.leaves, (flight_in_x64, flown(env_id))), strict=True
+        *map(jax.tree.leaves, (flight_in_x64, flown(EVERY_WRAPPER))), strict=True
     ):
         np.testing.assert_allclose(leaf, expected_leaf, rtol=1e-5, atol=1e-5)
 
@@ -67,7 +66,8 @@ def flown(env_id):
         return jax.block_until_ready(fly(env_id))
 
 
-@OVER_KINDS
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", KINDS)
 def test_identical_seeds_fly_identically_in_another_process_and_without_nan(env_id):
     code = f"from tests.support.stepping import digest, fly; print(digest(fly({env_id!r})))"
     elsewhere = subprocess.run(
@@ -77,16 +77,15 @@ def test_identical_seeds_fly_identically_in_another_process_and_without_nan(env_
 
 
 # JAX's maps run the whole program on each device, so that they do not depend on the environment.
-SHARDED = (PLAIN, "sharding")
 DIVIDED = (
-    SHARDED,
-    (PLAIN, "explicit", "shard_map", "pmap"),
-    (EVERY_WRAPPER, "sharding", "explicit"),
+    (PLAIN, "sharding", "explicit", "shard_map", "pmap"),
+    (EVERY_WRAPPER, "sharding"),
     (SEVERAL_DRONES, "sharding"),
 )
 
 
-@pytest.mark.parametrize("case", slow_but([SHARDED], DIVIDED), ids="-".join)
+@pytest.mark.slow
+@pytest.mark.parametrize("case", DIVIDED, ids="-".join)
 def test_flights_on_four_devices_are_those_on_one(case, tmp_path):
     env_id, *ways = case
     np.savez(tmp_path / "expected.npz", *jax.tree.leaves(flown(env_id)))

@@ -42,6 +42,7 @@ def test_the_suite_is_what_its_seed_draws(tmp_path):
     assert sum(task.craft is not None for task in suite.tasks) == 8 and len(suite.tasks) == 12
 
 
+@pytest.mark.slow
 def test_a_result_repeats_and_is_verified_and_a_forged_one_is_not(small, tmp_path, capsys):
     out, command = tmp_path / "result.json", ["bench", "--policy", CENTRED, "--suite", small]
     run(*command, "--out", out)

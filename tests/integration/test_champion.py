@@ -67,6 +67,7 @@ def first_lap_s(env, network, params):
     return result.first_lap_s if result.success == 1.0 else np.nan
 
 
+@pytest.mark.slow
 def test_a_policy_gets_faster_and_is_not_changed_itself():
     champion = load_checkpoint(CHAMPION)
     env, reports = simulated_env(champion), []
@@ -112,6 +113,7 @@ def test_a_policy_that_does_not_race_is_refused():
         polish(simulated_env(champion), Policy(champion.network, lost), 0, SHORT)
 
 
+@pytest.mark.slow
 def test_models_move_as_far_as_the_policy_follows():
     """With three times the mass nobody takes off, so that models go back and forth before that."""
     champion = load_checkpoint(CHAMPION)

@@ -30,6 +30,7 @@ def folder(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_artifact_of_other_parameters_is_identified_and_flies(folder):
     model = load_model(folder / "model.json")
     np.testing.assert_allclose(model.tau, TAUS, rtol=1e-4)
@@ -47,6 +48,7 @@ def test_artifact_of_other_parameters_is_identified_and_flies(folder):
     assert np.shape(provenance["correlation"]["matrix"]) == (11, 11)
 
 
+@pytest.mark.slow
 def test_report_is_of_the_held_out_part_or_of_all_of_another_log(folder, capsys, tmp_path):
     log, report = (
         load_log(folder / "data.npz"),

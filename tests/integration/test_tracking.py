@@ -39,6 +39,7 @@ def reports_of(caplog):
     return [record.getMessage() for record in caplog.records if record.name == tracking.__name__]
 
 
+@pytest.mark.slow
 def test_everything_is_recorded_once_though_the_run_was_cut_off(
     trainer, tmp_path, monkeypatch, capsys
 ):

@@ -96,6 +96,7 @@ def test_another_machine_or_software_is_a_warning(whole, caplog):
         assert message in caplog.text
 
 
+@pytest.mark.slow
 def test_a_complete_run_is_extended(whole, tmp_path, capsys):
     """The first 7 updates are those of the shorter run; a cut in what follows changes no bit."""
     longer = Trainer(dataclasses.replace(CONFIG, total_timesteps=10 * BATCH), ENV_ID)

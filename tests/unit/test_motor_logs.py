@@ -224,6 +224,7 @@ def test_motors_of_measured_flights_are_doubted(log, origin):
     assert DOUBTFUL_MOTORS not in motion_notes(of_sticks, None, None, "chosen")
 
 
+@pytest.mark.slow
 def test_a_log_that_hardly_shows_torque_is_told_and_names_no_motor(log):
     """As NanoBench, whose motors were logged at 100 Hz and resampled."""
     model, rng = model_of(crafts()), np.random.default_rng(0)

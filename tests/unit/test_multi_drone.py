@@ -191,6 +191,7 @@ def duel():
     return gymnax.make("FlyTrackDuel-v0")[0]
 
 
+@pytest.mark.slow
 def test_a_ghost_flies_its_line_and_stops_for_nobody(duel):
     env, ghost = duel, duel.race.ghosts[1]
     ghost_w, progress = np.stack(ghost.pos_w, axis=-1), np.asarray(ghost.progress)
