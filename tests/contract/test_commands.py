@@ -9,13 +9,10 @@ import sys
 import time
 from functools import cache
 from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
 
 from flytrack.cli import COMMANDS, SHELLS, main
-from flytrack.flags import Fit
-from flytrack_sysid.split import HELD_OUT_EVERY
 from tests.support.pages import ROOT, commands
 from tests.support.slow import slow_but
 
@@ -96,9 +93,7 @@ def test_every_flag_says_what_it_does(name):
 
 @pytest.mark.parametrize(
     "name",
-    slow_but(
-        ["demo", "train", "collect"], [name for name, command in COMMANDS.items() if command.extra]
-    ),
+    slow_but(["collect"], [name for name, command in COMMANDS.items() if command.extra]),
 )
 def test_without_its_extra_a_command_helps_and_says_what_to_install(name, tmp_path):
     words = {
@@ -140,7 +135,6 @@ def test_the_list_of_commands_is_quick_and_the_version_that_of_the_package(capsy
         main(["land"])
     refusal = capsys.readouterr().err
     assert all(name in refusal for name in ("land", *COMMANDS))
-    assert Fit(Path(), Path()).hold_out_every == HELD_OUT_EVERY
 
 
 @pytest.mark.parametrize("shell", SHELLS)

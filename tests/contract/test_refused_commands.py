@@ -56,6 +56,7 @@ def folder(tmp_path_factory):
     save_rollout(folder / "flight.npy", *make_flight(3))
     np.save(folder / "pickled.npy", np.array([[None, None]] * 3, object), allow_pickle=True)
     log = excited(HandoutPlant())
+    log = log.select(log.segment < 8)
     wrong = with_channels(log, w=np.rad2deg(log["w"]))
     for name, content in (("log", log), ("degrees", wrong), ("short", log.select(slice(50)))):
         save_log(folder / f"{name}.npz", content)

@@ -32,13 +32,10 @@ def made(*names):
     return build_script(flights_of(names or MANOEUVRES, HOVER))
 
 
-def test_every_manoeuvre_can_be_flown_and_says_how():
+def test_every_manoeuvre_can_be_flown():
     script = made()
     check_script(script)
     assert script.kinds == tuple(name for name in MANOEUVRES for _ in range(FLIGHTS_PER_MANOEUVRE))
-    assert all(
-        manoeuvre.how.endswith(".") and len(manoeuvre.how) > 20 for manoeuvre in MANOEUVRES.values()
-    )
     assert FLIGHTS_PER_MANOEUVRE * FLIGHT_STEPS * DT_S == CHUNKS_PER_MANOEUVRE * CHUNK_S
     flights = script.commands.reshape(-1, FLIGHT_STEPS * 4)
     assert len(np.unique(np.hstack([script.starts, flights]), axis=0)) == len(flights), (

@@ -17,7 +17,7 @@ from flytrack_env.dynamics import nominal_parameters
 from flytrack_env.effects import BetaflightLoop, effect_of
 from flytrack_env.plants import Simulator
 from flytrack_env.state import ACCELERATION, BATTERY, RATES, Action, pack, unpack, unpack_action
-from flytrack_sysid import CollectError, collect, diagnose_change, import_log, load_log, save_log
+from flytrack_sysid import CollectError, collect, diagnose_change, import_log
 from flytrack_sysid.excitation import script, start_state
 from flytrack_sysid.manoeuvres import hover_action
 from flytrack_sysid.script_file import build_script
@@ -156,11 +156,7 @@ def test_collected_log_and_blackbox_are_the_same_flight(tmp_path):
     with Betaflight({"blackbox_high_resolution": True}, body, blackbox=tmp_path / "box") as plant:
         log = collect(plant, minutes=1.0, seed=0)
         directory = plant.firmware.folder
-    assert not directory.exists()
-    save_log(tmp_path / "log.npz", log)
-    again = load_log(tmp_path / "log.npz")
-    np.testing.assert_array_equal(again["w"], log["w"])
-    assert len(log) > 4000 and again.channels.keys() == log.channels.keys()
+    assert not directory.exists() and len(log) > 4000
     boxes = sorted((tmp_path / "box").iterdir())
     assert len(boxes) == 24  # of the excitation; the search for hover is too short
     (tmp_path / "all.toml").write_text("[rows]\nevery = 1\n")
@@ -265,7 +261,7 @@ def test_what_was_changed_is_named_and_a_matched_set_up_has_no_name():
     for number, body in enumerate((Body(), Body(), weak)):
         with Betaflight(body=body) as flown:
             log = collect(flown, 1.0, number, 1.0)
-            logs.append(log.select(log.segment % 2 == 0))  # enough to tell
+            logs.append(log.select(log.segment % 3 == 0))  # enough to tell
             model = known_model(flown)
     before, same, changed = logs
     assert diagnose_change(same, before, model, motion=model.motion).causes == ()

@@ -151,17 +151,15 @@ def crazyflie():
     return diagnose(found.log, found.nominal_model())
 
 
-def test_what_the_nominal_crazyflie_certainly_lacks_is_named(crazyflie):
+def test_what_the_nominal_crazyflie_certainly_lacks_is_named_and_no_more(crazyflie):
     assert crazyflie.verdict.startswith("causes_found")
     causes = {cause.effect: cause for cause in crazyflie.causes}
     thrust = causes.get("thrust_curve", causes.get("thrust_scale"))
-    assert (
-        thrust is not None and thrust.heldout_gain > 0.0
-    )  # the nominal one hovers at another stick
+    assert thrust is not None and thrust.heldout_gain > 0.0  # it hovers at another stick
     assert not NEEDS_ACCELEROMETER & set(causes)
-    assert (
-        json.loads(json.dumps(crazyflie.as_json(), allow_nan=False))["verdict"] == crazyflie.verdict
-    )
+    unseen = {one.effect for one in crazyflie.not_identifiable}
+    assert {"ground_effect", "translational_lift"} <= unseen  # at 1 m, below 2 m/s
+    json.dumps(crazyflie.as_json(), allow_nan=False)
 
 
 def test_the_extended_crazyflie_flies_better_where_it_was_not_fitted(crazyflie):
@@ -170,15 +168,7 @@ def test_the_extended_crazyflie_flies_better_where_it_was_not_fitted(crazyflie):
         assert extended.one_step_nrmse[channel] < nominal.one_step_nrmse[channel]
     for horizon in ("0.5", "1", "2"):  # before, the noise of the start decides
         assert extended.position_m[horizon] < 0.5 * nominal.position_m[horizon]
-
-
-def test_no_horizon_is_predicted_worse_than_by_the_refitted_base(crazyflie):
     base, extended = (crazyflie.prediction.errors[name] for name in ("refitted_base", "extended"))
     for quantity, by_horizon in extended.items():
         for horizon, error in by_horizon.items():
             assert error <= AS_GOOD * base[quantity][horizon]
-
-
-def test_a_crazyflie_on_its_slow_circle_cannot_show_everything(crazyflie):
-    unseen = {one.effect for one in crazyflie.not_identifiable}
-    assert {"ground_effect", "translational_lift"} <= unseen  # at 1 m, below 2 m/s

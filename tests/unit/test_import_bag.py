@@ -43,10 +43,10 @@ def motion(time):
 
 
 def messages():
-    """Return stamp, ns, topic and message at 50, 200 and 100 Hz over 5 s, in order of time."""
+    """Return stamp, ns, topic and message at 50, 200 and 100 Hz over 2 s, in order of time."""
     stamped = []
     for topic, (kind, step_ns) in KINDS.items():
-        for stamp_ns in range(START_NS, START_NS + 5 * 10**9, step_ns):
+        for stamp_ns in range(START_NS, START_NS + 2 * 10**9, step_ns):
             time = (stamp_ns - START_NS) * 1e-9
             zero = made("Vector3", 0.0, 0.0, 0.0)
             if topic == "/sticks":
@@ -109,14 +109,14 @@ def test_the_command_named_for_a_bag_compressed_as_a_whole_makes_it_readable(tmp
         import_log(tmp_path / "bag", "bag", mapping)
     program, *arguments = str(error.value).rpartition("first: ")[2].split()
     subprocess.run([Path(sys.executable).with_name(program), *arguments], check=True)
-    assert len(import_log(tmp_path / "bag_plain", "bag", mapping).log) >= 990
+    assert len(import_log(tmp_path / "bag_plain", "bag", mapping).log) >= 390
 
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_what_was_written_is_read_back(tmp_path, mapping, kind):
     imported = import_log(WRITERS[kind](tmp_path), "bag", mapping, align=False)
     log, time = imported.log, imported.log.time
-    assert len(log) >= 990
+    assert len(log) >= 390
     assert np.diff(time) == pytest.approx(0.005, abs=1e-6)  # the rates' own rows
     assert_allclose(log["w"][:, 0], 0.5 * np.cos(time), atol=1e-6)
     assert_allclose(log["p"][:, 0], time, atol=1e-6)  # interpolated

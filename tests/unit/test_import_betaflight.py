@@ -94,33 +94,17 @@ def test_rates_at_full_stick_are_the_firmwares(rates_type, rc_rate, super_rate, 
     assert full_stick_rate(rates_type, rc_rate, super_rate, 1998.0) == pytest.approx(deg_s)
 
 
-def of_firmware(rates_type, stick, rc_rate, rate, expo):
-    """Return the setpoint, deg/s, as the firmware computes it."""
-    size, expo = abs(stick), expo / 100
-    if rates_type == "ACTUAL":
-        late = size * (stick**5 * expo + stick * (1 - expo))
-        return stick * 10 * rc_rate + max(0, 10 * rate - 10 * rc_rate) * late
-    if rates_type == "QUICK":
-        slope, most = 2 * rc_rate, max(10 * rate, 2 * rc_rate)
-        factor = (most / slope - 1) / (most / slope)
-        return stick * slope / (1 - (size**3 * expo + size * (1 - expo)) * factor)
-    curved = stick * size**3 * expo + stick * (1 - expo)
-    return 200 * rc_rate / 100 * curved / min(max(1 - size * rate / 100, 0.01), 1)
+AXES = [(30, 67, 40), (70, 70, 0), (100, 40, 100)]  # rc rate, rate and expo of the table
 
 
-@pytest.mark.parametrize("rates_type", ["ACTUAL", "BETAFLIGHT", "QUICK"])
-def test_stick_curves_are_the_firmwares(rates_type):
-    axes = [(30, 67, 40), (70, 70, 0), (100, 40, 100)]
-    curve, sticks = stick_curve(rates_type, axes), np.linspace(-1, 1, 21)
-    full = [full_stick_rate(rates_type, rc, rate, 1998.0) for rc, rate, _ in axes]
-    for stick in sticks:
-        bent = effect_of(curve).hooks["command"](
-            curve, None, Action(stick, stick, stick, 0.3), None
-        )
-        expected = [of_firmware(rates_type, stick, *axis) for axis in axes]
-        assert_allclose(bent[:3], np.divide(expected, full), atol=1e-6)
-        assert bent.thrust == 0.3
-    straight = {"ACTUAL": 62, "BETAFLIGHT": 0, "QUICK": 12}[rates_type]
+@pytest.mark.parametrize(("rates_type", "straight", "deg_s"), CASES["curves"])
+def test_stick_curves_are_the_firmwares(rates_type, straight, deg_s):
+    curve = stick_curve(rates_type, AXES)
+    full = [full_stick_rate(rates_type, rc, rate, 1998.0) for rc, rate, _ in AXES]
+    for stick, expected in zip((-0.9, -0.3, 0.6, 1.0), deg_s, strict=True):
+        sticks = Action(stick, stick, stick, 0.3)
+        bent = effect_of(curve).hooks["command"](curve, None, sticks, None)
+        assert_allclose(bent, [*np.divide(expected, full), 0.3], atol=1e-6)
     assert stick_curve(rates_type, [(62, straight, 0)] * 3) is None
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.spatial.transform import Rotation
 
 from flytrack_env import load_model, nominal_parameters
 from flytrack_env.thrust import collective_thrust
@@ -22,6 +21,7 @@ from tests.support.written_logs import read_mapping
 
 HEADER = "ms,n,e,d,vn,ve,vd,ax,ay,az,p,q,r,qx,qy,qz,qw,ail,ele,rud,thr,mv"
 MAPPING = read_mapping("every_unit")
+CASES = table("csv_mappings")
 
 
 def write_csv(path, log):
@@ -62,16 +62,6 @@ def test_units_and_frames_come_out_ours(folder, truth):
     assert imported.problems == ()
 
 
-def test_world_to_body_is_inverted(folder, tmp_path):
-    direction = 'order = "xyzw"\ndirection = "world_to_body"'
-    (tmp_path / "map.toml").write_text(MAPPING.replace('order = "xyzw"', direction))
-    straight = import_log(folder / "flight.csv", "csv", folder / "map.toml", align=False).log
-    inverted = import_log(folder / "flight.csv", "csv", tmp_path / "map.toml", align=False)
-    turned = [Rotation.from_quat(log["q"], scalar_first=True) for log in (straight, inverted.log)]
-    assert np.max((turned[0] * turned[1]).magnitude()) < 1e-6
-    assert "world to body" in " ".join(inverted.problems)
-
-
 def test_rows_are_chosen_and_files_become_segments(folder, tmp_path):
     for name in ("one.csv", "two.csv"):
         (tmp_path / name).write_bytes((folder / "flight.csv").read_bytes())
@@ -89,7 +79,7 @@ def test_rows_are_chosen_and_files_become_segments(folder, tmp_path):
         import_log(*arguments)
 
 
-@pytest.mark.parametrize(("old", "new", "message"), table("csv_mappings")["refused"])
+@pytest.mark.parametrize(("old", "new", "message"), CASES["refused"])
 def test_wrong_mappings_are_refused(folder, tmp_path, old, new, message):
     assert old in MAPPING
     (tmp_path / "map.toml").write_text(MAPPING.replace(old, new, 1))
@@ -97,13 +87,7 @@ def test_wrong_mappings_are_refused(folder, tmp_path, old, new, message):
         import_log(folder / "flight.csv", "csv", tmp_path / "map.toml")
 
 
-@pytest.mark.parametrize(
-    ("line", "column", "value", "message"),
-    [
-        (4, 3, "", r"row 3 \(line 5\), column d: found an empty cell"),
-        (0, 1, "ms", "column n: found .*|column ms: found 2 times"),
-    ],
-)
+@pytest.mark.parametrize(("line", "column", "value", "message"), CASES["cells"])
 def test_wrong_cells_are_refused(folder, tmp_path, line, column, value, message):
     rows = [text.split(",") for text in (folder / "flight.csv").read_text().splitlines()]
     rows[line][column] = value
@@ -112,21 +96,13 @@ def test_wrong_cells_are_refused(folder, tmp_path, line, column, value, message)
         import_log(tmp_path / "bad.csv", "csv", folder / "map.toml")
 
 
-@pytest.mark.parametrize(
-    ("files", "form", "mapping", "message"),
-    [
-        (["flight.csv"], "csv", "no.toml", r"no\.toml: found no such .*crazyflie_phoenix"),
-        (["flight.csv"], "csv", None, r"flight\.csv: no mapping names no columns"),
-        (["flight.csv"], "mat", None, "format: found 'mat'"),
-        ([], "csv", "map.toml", "found no files"),
-    ],
-)
+@pytest.mark.parametrize(("files", "form", "mapping", "message"), CASES["absent"])
 def test_missing_and_unmapped_files_are_refused(folder, files, form, mapping, message):
     with pytest.raises(LogError, match=message):
-        import_log([folder / file for file in files], form, mapping and folder / mapping)
+        import_log([folder / file for file in files], form, folder / mapping if mapping else None)
 
 
-@pytest.mark.parametrize(("old", "new", "message"), table("csv_mappings")["refused_files"])
+@pytest.mark.parametrize(("old", "new", "message"), CASES["refused_files"])
 def test_wrong_mappings_of_several_files_are_refused(tmp_path, old, new, message):
     path, mapping = write_csv_files(tmp_path, flying(200, start_s=100.0))
     mapping.write_text(mapping.read_text().replace(old, new, 1))
@@ -162,25 +138,17 @@ def test_nominal_model_hovers_where_the_nominal_craft_does():
     assert craft.max_rate.tolist() == [60.0, 50.0, 40.0] and craft.m == 0.03
 
 
-def test_command_writes_log_details_and_model(folder, tmp_path, capsys):
-    out, model = tmp_path / "log.npz", tmp_path / "model.json"
-    flags = ["--format", "csv", "--map", folder / "map.toml", "--out", out, "--model-out", model]
-    run("import", folder / "flight.csv", *flags)
+def test_command_writes_log_details_and_model_and_keeps_clocks_if_asked(folder, tmp_path, capsys):
+    late, out = write_csv(tmp_path / "late.csv", flight(TIME_S, 0.02)), tmp_path / "log.npz"
+    flags = ["--format", "csv", "--map", folder / "map.toml", "--out", out]
+    run("import", late, *flags, "--model-out", tmp_path / "model.json")
     output = capsys.readouterr().out
     assert "segment 0:" in output and "full stick 700, 600, 500 deg/s; mass 0.5 kg" in output
+    assert re.search(r"clock of q.*\+20\..*corrected", output) and len(load_log(out)) < 2000
     details = json.loads((tmp_path / "log.import.json").read_text())
     assert details["sha256"] == load_log(out).sha256
-    assert [Path(source).name for source in details["sources"]] == ["flight.csv"]
-    assert load_model(model).m == 0.5
-
-
-def test_command_keeps_clocks_if_asked(folder, tmp_path, capsys):
-    late, out = write_csv(tmp_path / "late.csv", flight(TIME_S, 0.02)), tmp_path / "a.npz"
-    flags = ["--format", "csv", "--map", folder / "map.toml", "--out", out]
-    for options, verdict, num_rows in (
-        ([], "corrected", 1998),
-        (["--keep-clocks"], "left as asked", 2000),
-    ):
-        run("import", late, *flags, *options)
-        assert re.search(rf"clock of q.*\+20\..*{verdict}", capsys.readouterr().out)
-        assert abs(len(load_log(out)) - num_rows) <= 1
+    assert [Path(source).name for source in details["sources"]] == ["late.csv"]
+    assert load_model(tmp_path / "model.json").m == 0.5
+    run("import", late, *flags, "--keep-clocks")
+    assert re.search(r"clock of q.*\+20\..*left as asked", capsys.readouterr().out)
+    assert len(load_log(out)) == 2000

@@ -17,12 +17,14 @@ from tests.support.foreign_logs import (
     ulog_message,
     ulog_topics,
 )
+from tests.support.tables import table
 
 pytest.importorskip("pyulog", reason="pyulog is not installed: pip install 'flytrack[logs]'")
 
 STEP_S, NUM_ROWS = 0.004, 200
 RATES, ATTITUDE = "vehicle_angular_velocity", "vehicle_attitude"
 SETPOINT, BATTERY = "vehicle_rates_setpoint", "battery_status"
+CASES = table("ulog")
 
 
 @pytest.fixture
@@ -85,21 +87,17 @@ def test_unknown_full_stick_is_refused_unless_the_mapping_states_it(topics, read
     assert read(topics, known, advice).log["u"][0, 0] == pytest.approx(1.0, abs=0.005)
 
 
-@pytest.mark.parametrize(
-    ("first_v", "second_v", "used_v"),
-    [(16.25, 15.0, 16.25), (0.0, 15.0, 15.0), (np.nan, 15.0, 15.0), (0.0, 0.0, None)],
-)
+@pytest.mark.parametrize(("first_v", "second_v", "used_v"), CASES["batteries"])
 def test_the_battery_that_is_measured_is_used(topics, read, first_v, second_v, used_v):
     fields, rows = topics[BATTERY]
     packs = [[(row[0], volts) for row in rows] for volts in (first_v, second_v)]
     topics[BATTERY] = (fields, *packs)
     imported = read(topics)
-    if used_v is None:
-        assert "v_bat" not in imported.log
-    else:
-        assert imported.log["v_bat"][:, 0] == pytest.approx(used_v)
+    assert ("v_bat" in imported.log) == bool(used_v)
+    for volts in used_v:
+        assert imported.log["v_bat"][:, 0] == pytest.approx(volts)
     is_choice = "instance 0 of battery_status is used, not 1" in " ".join(imported.notes)
-    assert is_choice == (used_v == first_v)
+    assert is_choice == (used_v == [first_v])
 
 
 def test_samples_from_before_the_estimator_runs_are_left_out(topics, read):
@@ -149,14 +147,7 @@ def test_slow_topics_and_another_craft_are_noted(topics, read):
     assert "found a hexacopter (MAV_TYPE 13), not a quadcopter" in notes
 
 
-@pytest.mark.parametrize(
-    ("mav_type", "message"),
-    [
-        (1, r"found a log of a plane \(MAV_TYPE\), expected one of a multi"),
-        (10, r"found a log of a rover \(MAV_TYPE\), expected one of a multi"),
-        (4, r"full stick is unknown; found a helicopter \(MAV_TYPE 4\), not a quad"),
-    ],
-)
+@pytest.mark.parametrize(("mav_type", "message"), CASES["vehicles"])
 def test_other_vehicles_are_refused_for_what_they_are(topics, read, mav_type, message):
     """Not for the rate parameters of a multicopter alone, which they lack."""
     with pytest.raises(LogError, match=message):
@@ -207,9 +198,11 @@ def test_motors_are_commands_in_our_order(topics, read, parameters, shares):
     assert_allclose(log["u"][0], 2.0 * np.array(shares) - 1.0, atol=3e-3)
 
 
-def test_sticks_are_kept_beside_motors(topics, read):
+def test_sticks_are_kept_beside_motors_which_must_be_there(topics, read):
     of_motors = read(with_motors(topics), mapping=OF_MOTORS).log
     assert_allclose(of_motors["sticks"], read(topics).log["u"])
+    with pytest.raises(LogError, match=r"topic actuator_motors .*: missing or empty"):
+        read(topics, mapping=OF_MOTORS)
 
 
 @pytest.mark.parametrize("rates_are_stated", [True, False])
@@ -233,18 +226,7 @@ def test_sticks_of_a_part_of_a_flight_are_left_out_and_no_row_is(topics, read):
     assert any("sticks are left out: topic vehicle_rates" in note for note in flight.notes)
 
 
-@pytest.mark.parametrize(
-    ("every", "parameters", "frame", "message"),
-    [
-        (25, {}, "", r"topic actuator_motors: found motors at 10 Hz, expected 40 Hz or more"),
-        (1, {"CA_ROTOR_COUNT": 6.0}, "", "found 6 rotors .CA_ROTOR_COUNT., expected a quad"),
-        (1, {"MAV_TYPE": 13.0}, "", "found a hexa.*MAV_TYPE 13., expected a quadcopter"),
-        (1, {"CA_ROTOR0_PX": 0.1}, "", "found no rotor in each quadrant, expected an X"),
-        (1, {"CA_ROTOR0_KM": -0.05}, '[frame]\ncraft = "iris"', 'expected "out" as the log'),
-    ],
-)
+@pytest.mark.parametrize(("every", "parameters", "frame", "message"), CASES["refused"])
 def test_motors_that_do_not_suit_are_refused(topics, read, every, parameters, frame, message):
     with pytest.raises(LogError, match=message):
         read(with_motors(topics, every), parameters, mapping=OF_MOTORS + frame)
-    with pytest.raises(LogError, match=r"topic actuator_motors .*: missing or empty"):
-        read(topics, mapping=OF_MOTORS)

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flytrack_env import Battery, Motion, blackbox, load_model, nominal_parameters, save_model
+from flytrack_env import Battery, Motion, load_model, nominal_parameters, save_model
 from flytrack_env.dynamics import collective_thrust
-from flytrack_sysid import collect, fit, load_log, save_log, validate
+from flytrack_sysid import fit, load_log, save_log, validate
 from flytrack_sysid.clocks import align_clocks, on_one_clock
 from flytrack_sysid.diagnosis import diagnose_change, joined, motion_of
 from flytrack_sysid.diagnosis.diagnose import split
@@ -106,12 +106,6 @@ def test_unmarked_logs_get_no_columns(tmp_path):
     assert not set(STATED) & set(header)
 
 
-def test_what_a_simulator_flew_is_marked():
-    flown = collect(blackbox.load(blackbox.SHIPPED), 1.0)
-    noisy = measure(flown, 1.0, 9.81, np.random.default_rng(0))
-    assert flown.origin == noisy.origin == "simulated"
-
-
 # --- How a log is replayed -----------------------------------------------------------------------
 
 
@@ -141,9 +135,18 @@ def test_measured_logs_are_replayed_continuously(truth):
     assert "the model says euler" in " ".join(parts.warnings)
     errors, continuous = validate(NOMINAL, log), validate(CONTINUOUS, log)
     assert errors.one_step == continuous.one_step
-    assert errors.one_step != validate(NOMINAL, replace(log, origin="simulated")).one_step
     notes = [note for note in errors.notes if note not in continuous.notes]
     assert notes == motion_notes(log, NOMINAL, None, "")
+    (outside,) = voltage_notes(log, NOMINAL.battery)
+    assert outside in parts.warnings and outside in errors.notes
+    assert parts.train.like.battery == fitted_battery(log, NOMINAL.battery)
+
+
+def test_a_model_of_another_mass_than_is_stated_is_doubted():
+    log = replace(make_log(), origin="measured", source="log", stated_mass_kg=0.8)
+    assert not motion_notes(log, CONTINUOUS._replace(m=0.8), None, "")
+    (note,) = motion_notes(log, CONTINUOUS._replace(m=0.9), None, "")
+    assert "log states 0.8 kg, and the model 0.9 kg, which is used" in note
 
 
 def test_logs_of_different_origin_are_refused():
@@ -169,15 +172,13 @@ def test_logs_of_different_origin_are_refused():
 # --- Voltage --------------------------------------------------------------------------------------
 
 
-def four_cells(battery_v=None):
-    """Return flights of a 4S craft that was fed 15.4 V; the log has another voltage or none."""
+def four_cells():
+    """Return flights of a 4S craft that was fed 15.4 V; the log has no voltage."""
     half = 0.5 * FORCE_PER_VOLT * MIDDLE_V
     plant = HandoutPlant(coeffs=(half, half, 0.0, 0.0, 0.0, 0.0), max_rate=CRAFT.max_rate_deg_s)
     flown = measure(excited(plant), 1.0, GRAVITY, np.random.default_rng(3))
-    channels, stated = {name: flown[name] for name in "uwf"}, FOUR_CELLS
-    if battery_v is not None:
-        channels["v_bat"], stated = np.full((len(flown), 1), battery_v), None
-    return replace(flown, channels=channels, origin="measured", stated_voltage_v=stated)
+    channels = {name: flown[name] for name in "uwf"}
+    return replace(flown, channels=channels, origin="measured", stated_voltage_v=FOUR_CELLS)
 
 
 def test_a_log_without_voltage_is_fitted_at_what_is_stated(tmp_path):
@@ -196,16 +197,6 @@ def test_a_log_without_voltage_is_fitted_at_what_is_stated(tmp_path):
     other = fit(log, nominal._replace(battery=Battery()))
     assert other.model.battery == fitted.model.battery
     assert "is outside the model's battery, 22 to 24 V" in " ".join(other.warnings)
-
-
-def test_validation_and_diagnosis_name_both_ranges():
-    log = four_cells(15.0)
-    expected = "was flown at 15 to 15 V, which is outside the model's battery, 22 to 24 V"
-    assert expected in " ".join(validate(CONTINUOUS, log).notes)
-    parts = split(log, CONTINUOUS, None, None)
-    assert expected in " ".join(parts.warnings)
-    assert parts.train.like.battery == Battery(15.0, 13.75, 15.0, 15.0)
-    assert not voltage_notes(log, CRAFT.nominal_model("a log").battery)
 
 
 @pytest.mark.parametrize(

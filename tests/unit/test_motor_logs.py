@@ -30,6 +30,8 @@ from tests.support.motor_models import crafts, model_of
 from tests.support.tables import table
 from tests.support.written_logs import through_file, with_channels
 
+MAPPINGS = table("motor_mappings")
+
 
 @pytest.fixture(scope="module")
 def log():
@@ -45,6 +47,7 @@ def imported(log, tmp_path_factory):
 
 def test_motors_of_a_table_become_commands_of_a_craft(log, imported, tmp_path):
     assert imported.log.has_motors and not imported.problems
+    assert imported.log.stated_mass_kg == 0.8
     np.testing.assert_allclose(imported.log["u"], log["u"], atol=1e-9)
     again = through_file(imported.log, tmp_path / "log.npz")
     assert again.has_motors and again.sha256 == imported.log.sha256
@@ -116,27 +119,7 @@ def test_a_known_crafts_mass_and_inertia_are_not_replaced_in_silence(log, tmp_pa
     assert not warnings()
 
 
-def test_a_model_of_another_mass_than_the_mapping_states_is_doubted(imported):
-    def doubts(model):
-        return [note for note in validate(model, imported.log).notes if note.startswith("mass:")]
-
-    model = imported.nominal_model()
-    assert imported.log.stated_mass_kg == 0.8 and not doubts(model)
-    (note,) = doubts(model._replace(m=0.9))
-    assert "states 0.8 kg, and the model 0.9 kg, which is used" in note
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        ({"effects": ["rate_scale"]}, "effects: rate_scale: acts on sticks"),
-        ({"fixed": {"tau_roll": 0.05}}, r"fixed: tau_roll: found 0\.05, expected none"),
-        (
-            {"effects": ["command_delay"], "fixed": {"command_delay.yaw_extra_s": 0.0}},
-            r"fixed: command_delay\.yaw_extra_s: found 0, expected none",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "expected"), MAPPINGS["fits"])
 def test_a_fit_of_motors_refuses_what_acts_on_sticks(log, arguments, expected):
     with pytest.raises(FitError, match=expected):
         fit(log, model_of(crafts()), accept=True, **arguments)
@@ -148,7 +131,7 @@ def test_a_fit_of_motors_frees_their_common_delay_alone_and_the_health_of_none(l
     assert not {f"motors.{name}" for name in NAMES} & {*free}
 
 
-@pytest.mark.parametrize(("old", "new", "expected"), table("motor_mappings")["refused"])
+@pytest.mark.parametrize(("old", "new", "expected"), MAPPINGS["refused"])
 def test_mappings_of_no_quadcopter_or_of_two_are_refused(log, tmp_path, old, new, expected):
     path, map_file = write_csv(tmp_path, log)
     text = map_file.read_text()

@@ -9,7 +9,6 @@ import pytest
 
 from flytrack_env import nominal_parameters
 from flytrack_env.effects.betaflight_rates import BetaflightRates
-from flytrack_sysid.check import check_log
 from flytrack_sysid.kinematics import GRAVITY
 from flytrack_sysid.log import CHANNELS, LogError
 from flytrack_sysid.plausibility import MIN_ROWS, check_plausible, find_problems
@@ -86,22 +85,22 @@ def test_right_logs_are_plausible(logs, name):
     check_plausible(logs[name])
 
 
-@pytest.mark.parametrize("name", ["clean", "noisy"])
-def test_too_little_is_no_log(logs, name):
-    short = logs[name].select(logs[name].time < 0.06)
-    for log, found in (
-        (short, r"found \d+ rows and \d\.\d+ s, "),
-        (logs[name].select(slice(0, MIN_ROWS - 1)), "found 99 rows"),
+def test_too_little_is_no_log(logs):
+    whole = logs["noisy"]
+    for rows, found in (
+        (whole.time < 0.06, r"found \d+ rows and \d\.\d+ s, "),
+        (slice(0, MIN_ROWS - 1), "found 99 rows"),
     ):
+        log = whole.select(rows)
         (problem,) = find_problems(log)
         assert re.search(f": t: {found}", problem)
 
 
 @pytest.mark.slow
 def test_right_logs_of_any_noise_contradict_nothing(truth):
-    """210 logs of 10 s: 7 parts of a flight with 30 noises each, of 0.1 to 10 times the usual."""
+    """70 logs of 10 s: 7 parts of a flight with 10 noises each, of 0.1 to 10 times the usual."""
     rng = np.random.default_rng(5)
-    for seed in range(210):
+    for seed in range(70):
         start = 150 * (seed % 7)
         log = truth.select(slice(start, start + 1000))
         assert find_problems(noisy(log, seed, 10.0 ** rng.uniform(-1.0, 1.0))) == [], seed
@@ -138,7 +137,6 @@ def test_a_rate_curve_that_the_model_has_contradicts_nothing(logs):
     (problem,) = find_problems(log)
     assert "before a rate curve (Betaflight's betaflight)" in problem
     assert find_problems(log, model=model) == []
-    assert not check_log(log, model).contradicts
 
 
 def test_batteries_of_one_to_fourteen_cells_raise_no_problem(logs):

@@ -5,9 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.seams.craft import GRAVITY
-from benchmarks.seams.faults import FAULTS, Change, draw_pair, inject, is_shown
-from benchmarks.seams.flight import KINDS, make_flight
-from benchmarks.seams.simulators import SIMULATORS
+from benchmarks.seams.faults import FAULTS, inject
+from benchmarks.seams.flight import make_flight
 
 SEED = 2  # at 100 Hz
 
@@ -25,16 +24,12 @@ def means(values):
     return 0.5 * (values[1:] + values[:-1])
 
 
-def test_rates_integrate_to_attitude(flight):
+def test_rates_and_specific_force_integrate_to_attitude_and_velocity(flight):
     truth, dt = flight.truth, flight.truth.time[1]
     q = attitude(truth)
     steps = (q[:-1].inv() * q[1:]).as_rotvec()
     assert np.abs(steps - dt * means(truth["w"])).mean() < 1e-4
-
-
-def test_specific_force_integrates_to_velocity(flight):
-    truth, dt = flight.truth, flight.truth.time[1]
-    a = attitude(truth).apply(truth["f"]) - [0.0, 0.0, GRAVITY]
+    a = q.apply(truth["f"]) - [0.0, 0.0, GRAVITY]
     flown = truth["v"][0] + np.cumsum(dt * means(a), axis=0)
     assert np.abs(flown - truth["v"][1:]).max() < 0.1
 
@@ -55,15 +50,8 @@ def test_sensors_have_noise_of_stated_size(flight):
 
 
 def test_seeds_reproduce():
-    flights = [make_flight(seed, seconds=2.0) for seed in (5, 5, 6)]
+    flights = [make_flight(seed, seconds=1.0) for seed in (5, 5, 6)]
     assert flights[0].log.sha256 == flights[1].log.sha256 != flights[2].log.sha256
-    assert flights[0].kind in KINDS
-
-
-def test_hover_shows_little():
-    hover = make_flight(SEED, seconds=5.0, kind="hover")
-    assert not is_shown(hover, frozenset({Change("w", "axes", "x -y z")}))
-    assert is_shown(hover, frozenset({Change("v_bat", "scale", 1000.0)}))
 
 
 @pytest.mark.parametrize("name", FAULTS)
@@ -79,34 +67,3 @@ def test_fault_changes_only_its_channels(flight, name):
     if "u_rates" in named and "u_thrust" not in named:
         np.testing.assert_array_equal(faulty.log["u"][:, 3], flight.log["u"][:, 3])
     np.testing.assert_array_equal(faulty.log.time, flight.log.time)
-    assert isinstance(is_shown(flight, truth), bool)
-
-
-def test_pairs_have_two_faults():
-    rng = np.random.default_rng(1)
-    for _ in range(30):
-        name, truth = draw_pair(rng, 0.01)
-        assert len(name.split(", ")) == 2
-        assert len(truth) >= 2
-
-
-@pytest.mark.parametrize("simulator", SIMULATORS, ids=lambda simulator: simulator.name)
-def test_simulators_fly_the_same_way(simulator):
-    layout, reference = simulator.layout, SIMULATORS[-1]
-    assert reference.expected == frozenset()
-    x = layout["x0"]
-    hover = 3.0**-0.5  # of thrust-to-weight 3
-    rates = np.array([0.2, -0.1, 0.3])
-    signs = [1 - 2 * ("-" in axis) for axis in simulator.sticks.split()]
-    u = np.append(rates * signs, hover if simulator.throttle == "0..1" else 2.0 * hover - 1.0)
-    for _ in range(round(0.3 / layout["dt"])):
-        x = simulator.step(x, u)
-    p, v, q, w, _ = simulator._read(x)
-    expected = reference.layout["x0"]
-    for _ in range(30):
-        expected = reference.step(expected, np.append(rates, 2.0 * hover - 1.0))
-    true_p, true_v, true_q, true_w, _ = reference._read(expected)
-    for values, true in ((p, true_p), (v, true_v), (w, true_w)):
-        np.testing.assert_allclose(values, true, atol=0.02)
-    assert (q.inv() * true_q).magnitude() < 0.02
-    assert sorted(index for block in "pvqw" for index in layout[block]) == list(range(len(x) - 1))
