@@ -2,11 +2,11 @@
 
 import pytest
 
-from benchmarks.seams.flight import make_flight
 from benchmarks.seams.mapped import MAPPING, import_csv, is_equal, write_csv
 from flytrack_sysid.check import Change, check_log
 from flytrack_sysid.check.fix import fix_mapping
 from flytrack_sysid.log import LogError
+from tests.support.seam_flights import seam_flight
 from tests.support.slow import slow_but
 from tests.support.tables import table
 
@@ -17,7 +17,7 @@ WRONG = table("wrong_mappings")
 def csv_file(tmp_path_factory):
     """A flight as a CSV file."""
     path = tmp_path_factory.mktemp("flight") / "flight.csv"
-    write_csv(path, make_flight(0, 15.0, "race").log)
+    write_csv(path, seam_flight("race").log.select(slice(1500)))
     return path
 
 

@@ -7,13 +7,12 @@ from scipy.spatial.transform import Rotation
 from benchmarks.seams.craft import GRAVITY
 from benchmarks.seams.faults import FAULTS, inject
 from benchmarks.seams.flight import make_flight
-
-SEED = 2  # at 100 Hz
+from tests.support.seam_flights import seam_flight
 
 
 @pytest.fixture(scope="module")
 def flight():
-    return make_flight(SEED, seconds=20.0, kind="race")
+    return seam_flight("race")
 
 
 def attitude(log):
