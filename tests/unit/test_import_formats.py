@@ -17,6 +17,7 @@ from tests.support.grounded_flights import (
     TAKE_OFF_S,
     stands_flies_and_lands,
 )
+from tests.support.slow import slow_but
 from tests.support.tables import table
 from tests.support.written_logs import npz_bytes
 
@@ -49,7 +50,7 @@ def test_a_flight_comes_back(kind, truth, tmp_path):
         assert imported.craft.max_rate_deg_s == (500.0, 500.0, 500.0)
 
 
-@pytest.mark.parametrize("kind", ["ULog", "CSV"])  # one function finds it in all formats
+@pytest.mark.parametrize("kind", slow_but(["ULog", "CSV"], WRITERS))
 def test_ground_is_left_out_and_counted(kind, tmp_path):
     truth = stands_flies_and_lands()
     form, write = WRITERS[kind]
