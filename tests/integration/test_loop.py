@@ -17,7 +17,7 @@ from flytrack_bench import load_suite
 from flytrack_bench.hidden import HiddenPlant
 from flytrack_env import BatteryWarning, nominal_parameters
 from flytrack_env.model_file import save_model
-from flytrack_loop import Gap, errors_of, fly_log, race
+from flytrack_loop import Gap, fly_log, race
 from flytrack_loop.stages import log_of_flights, measure_gap
 from flytrack_sysid import save_log
 from tests.support.handout_plant import states_of
@@ -60,12 +60,6 @@ def test_flights_that_end_at_once_are_no_log(flights):
     short = flights._replace(is_flying=np.arange(450) < np.full((4, 1), 49))
     with pytest.raises(ValueError, match="found 4 flights of at most 49 steps, expected one of 50"):
         log_of_flights(short, 0.01, 3, 12.0, 0.0)
-
-
-def test_errors_are_those_of_the_model(log):
-    errors = errors_of(nominal_parameters(), log)
-    assert errors.one_step_nrmse["v"] > 0.01 and errors.position_m["1"] > 0.1
-    assert errors.position_m["0.1"] < errors.position_m["1"]
 
 
 @pytest.mark.slow

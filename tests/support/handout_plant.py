@@ -74,17 +74,17 @@ def states_of(log):
     return np.concatenate([log[name] for name in names], axis=1)
 
 
-def excited(plant, skip=1, repeat=1, jitter=0.0):
+def excited(plant, repeat=1, jitter=0.0):
     """Return the log of the excitation on a plant, float64, without noise.
 
     Args:
-        skip, repeat: of commands, for steps of 0.01 s times skip over repeat.
+        repeat: of commands, for steps of 0.01 s over repeat.
         jitter: of steps, relative.
     """
     rng = np.random.default_rng(5)
     planned = script(24, HOVER, rng)
-    commands = np.stack([flight.command for flight in planned])[:, ::skip].repeat(repeat, axis=1)
-    step_s = 0.01 * skip / repeat
+    commands = np.stack([flight.command for flight in planned]).repeat(repeat, axis=1)
+    step_s = 0.01 / repeat
     steps_s = step_s * (1.0 + rng.uniform(-jitter, jitter, commands.shape[1]))
     states = [np.stack([flight.start for flight in planned]).astype(float)]
     for number, held_s in enumerate(steps_s[:-1]):

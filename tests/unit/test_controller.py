@@ -156,17 +156,3 @@ def test_an_axis_that_does_not_move_is_not_examined(log, channel):
     assert [loop.axis for loop in controller.loops] == ["roll", "yaw"]
     text = describe_side(SimpleNamespace(verdict="consistent", controller=controller))
     assert text.endswith("wrong: neither. Of the controller, only roll and yaw showed.")
-
-
-@pytest.mark.parametrize(
-    ("verdict", "stated_deg_s", "expected"),
-    [
-        ("consistent", (700.0, 600.0, 400.0), "wrong: neither."),
-        ("causes_found", (700.0, 600.0, 400.0), "wrong: the body."),
-        ("consistent", (900.0, 600.0, 400.0), "wrong: the controller. roll: full stick asks for"),
-        ("unexplained", (900.0, 600.0, 400.0), "wrong: the body and the controller. roll: "),
-    ],
-)
-def test_the_report_says_which_side_of_the_motors_is_wrong(log, verdict, stated_deg_s, expected):
-    diagnosis = SimpleNamespace(verdict=verdict, controller=examined(log, stated_deg_s))
-    assert expected in describe_side(diagnosis)

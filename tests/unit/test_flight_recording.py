@@ -41,18 +41,31 @@ def flown():
     )
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small_programs():
+    """All models have the same few effects: a program of all effects takes longer to compile."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(trajectories, "with_neutral_effects", lambda model, _: model)
+        yield
+
+
 @pytest.fixture(scope="module")
 def models(flown):
-    """Without what the plant has, and with it; and one that flies off."""
-    base = flown[0]
-    strong = base._replace(thrust_coeffs=50.0 * base.thrust_coeffs)
-    return {"nominal": base, "true": base.with_effects(DRAG), "strong": strong}
+    """Without what the plant has, and with it; one that flies off, and one with late poses."""
+    base = flown[0].with_effects(LinearDrag(0.0, 0.0, 0.0), MocapLatency(0.0))
+    return {
+        "nominal": base,
+        "true": base.with_effects(DRAG),
+        "strong": base._replace(thrust_coeffs=50.0 * base.thrust_coeffs),
+        "late": base.with_effects(MocapLatency(0.03)),
+    }
 
 
 @pytest.fixture(scope="module")
 def flights(flown, models):
     """What is shown, by name."""
-    return {flight.name: flight for flight in trajectories.measure_trajectories(flown[1], models)}
+    log, shown = flown[1], {name: models[name] for name in ("nominal", "true", "strong")}
+    return {flight.name: flight for flight in trajectories.measure_trajectories(log, shown)}
 
 
 def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, models, tmp_path):
@@ -85,8 +98,7 @@ def test_arrows_are_the_force_that_the_model_lacks_along_the_world(flown, models
 
 def test_ends_of_late_poses_have_no_force(flown, models):
     """Where the true pose of a row was never logged; all other rows keep their places."""
-    late = models["nominal"].with_effects(MocapLatency(0.03))
-    shown, *_ = trajectories.measure_trajectories(flown[1], {"late": late})
+    shown, *_ = trajectories.measure_trajectories(flown[1], {"late": models["late"]})
     known = np.isfinite(shown.residuals_w["late"]).all(axis=1)
     assert len(known) == len(flown[1]) and not known[[-1, SECOND - 1]].any()
     assert known[SETTLED : SECOND - 5].all() and known[SECOND + SETTLED : -5].all()
@@ -148,7 +160,8 @@ def test_of_a_long_log_rows_are_left_out_but_no_start(monkeypatch, made):
 def test_diagnose_writes_the_recording_or_says_why_not(
     flown, models, tmp_path, monkeypatch, capsys
 ):
-    shown = {"nominal": flown[0], "base": flown[0], "extended": models["true"]}
+    nominal = models["nominal"]
+    shown = {"nominal": nominal, "base": nominal, "extended": models["true"]}
     rest = {"noise": {}, "source": "log", "sha256": ""}
     diagnosis = Diagnosis(CONSISTENT, (), Unexplained(), (), {}, **shown, **rest)
     monkeypatch.setattr(identification, "diagnose", lambda *_: diagnosis)  # the rest is real

@@ -63,7 +63,7 @@ def test_jobs_on_a_cluster_end_as_they_do_here():
     }
 
 
-@pytest.mark.parametrize("address", ["127.0.0.1:9", "127.0.0.1:port", "nowhere.invalid:6379"])
+@pytest.mark.parametrize("address", ["127.0.0.1:9", "127.0.0.1:port"])
 def test_a_cluster_that_is_none_is_refused(address):
     with pytest.raises(ClusterError, match=f"--address {address}: no Ray cluster") as error:
         list(run_jobs(end_as, {"a": ("a",)}, 9.0, address))
