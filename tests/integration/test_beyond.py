@@ -6,8 +6,6 @@ import pytest
 from benchmarks import beyond, hidden
 from benchmarks.diagnosis import model_of
 from benchmarks.hidden.oracle import removed
-from flytrack_env.effects import LearnedLaw
-from flytrack_env.effects.grammar import Factor, Law, Term
 from flytrack_env.model_file import load_model
 from flytrack_sysid.diagnosis import diagnose, text_of, write_diagnosis
 from tests.support.hidden_flights import scripted
@@ -60,16 +58,6 @@ def test_a_law_is_found_with_its_numbers(tmp_path):
     _, model, report = write_diagnosis(tmp_path, found, log)
     assert load_model(model).effects == found.extended.effects
     assert "What was learnt" in report.read_text() or "bump(airspeed" in report.read_text()
-
-
-def test_nothing_is_learnt_beside_a_law_of_another_log():
-    truth, log, _ = flights(71, seconds=SHORT_S)
-    too_small = Term(
-        "force", "air", (Factor("airspeed", "bump", (BUMP_MS, WIDTH_MS)),), (-0.1,), (0.0,)
-    )
-    found = diagnose(log, model_of(truth).with_effects(LearnedLaw(1.0, 0.0, Law((too_small,)))))
-    assert found.verdict == "unexplained" and found.learned is None
-    assert any("learned_law from another log" in warning for warning in found.warnings)
 
 
 def test_a_thermal_that_held_out_rows_do_not_pass_is_found():

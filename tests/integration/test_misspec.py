@@ -1,7 +1,6 @@
 """misspec-v1: frozen logs, a sealed truth, a door that survives its methods, and the scores."""
 
 import json
-from collections import Counter
 from dataclasses import replace
 
 import msgspec
@@ -9,10 +8,9 @@ import numpy as np
 import pytest
 
 from benchmarks.misspec.replay import fly
-from benchmarks.misspec.rivals import forward, random_distortion
-from flytrack_bench.hidden.draws import NAMES
+from benchmarks.misspec.rivals import random_distortion
 from flytrack_bench.misspec import Answer, AnswerError, Flights, load_log_suite, run_method, scores
-from flytrack_bench.misspec.answer import diagnose_log, fly_model, log_of
+from flytrack_bench.misspec.answer import diagnose_log, log_of
 from flytrack_bench.misspec.door import show
 from flytrack_bench.misspec.suite import LogSuite, draw_all
 from flytrack_env.motion import Motion
@@ -49,20 +47,6 @@ def test_a_log_drawn_again_is_the_frozen_one(drag):
     assert others[0] == others[1] != others[2]
 
 
-def test_the_suite_has_every_motion_noise_and_kind():
-    assert Counter(one.row for one in DRAWN) == {
-        "clean": 16, "one": 22, "two": 10, "outside": 8, "onset": 4,
-    }  # fmt: skip
-    singles = [one.names[0] for one in DRAWN if one.row == "one"]
-    assert len(set(singles)) == 22 and set(singles) <= set(NAMES)
-    assert len({one.names for one in DRAWN if one.row == "outside"}) == 8
-    for row in ("clean", "one", "two"):
-        motions = Counter(one.motion for one in DRAWN if one.row == row)
-        assert len(motions) == 3 and max(motions.values()) - min(motions.values()) <= 1
-        assert len({one.noise for one in DRAWN if one.row == row}) == 4
-    assert [one.number for one in DRAWN] != sorted(one.number for one in DRAWN)
-
-
 def test_what_a_method_is_given_does_not_hold_the_truth(drag, tmp_path):
     show(drag, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"log.npz", "model.json", "flights.npz"}
@@ -90,13 +74,6 @@ def test_flights_of_clean_plants_end_where_the_nominal_model_flies():
         assert moved.max() > 0.05
 
 
-@pytest.mark.slow
-def test_the_packages_free_flight_agrees_and_does_not_see_the_end():
-    plant = SHORT.plant(first_id(row="clean", motion="fine"))
-    ends_w = fly_model(plant.model._replace(motion=Motion.CONTINUOUS), plant.flights)
-    assert np.abs(ends_w - plant.ends_w).max() < 1e-3
-
-
 def test_the_distortion_test_flags_drag_and_no_clean_flight(drag):
     clean = SUITE.plant(first_id(row="clean", noise="sensors"))
     assert random_distortion(drag.log, drag.model).flagged
@@ -104,16 +81,10 @@ def test_the_distortion_test_flags_drag_and_no_clean_flight(drag):
 
 
 @pytest.mark.slow
-def test_ours_and_two_rivals_name_drag(drag):
-    for method in (diagnose_log, forward):
-        answer = method(drag.log, drag.model)
-        line = scores.score(drag, answer.as_json(drag.flights))
-        assert line["exact"] and line["error_m"] < 0.03, method
-        assert {name.partition(".")[0] for name in line["intervals"]} == {*drag.drawn.names}
-    pytest.importorskip("pysindy")
-    from benchmarks.misspec.rivals import sparse
-
-    assert "linear_drag" in sparse(drag.log, drag.model).names
+def test_ours_names_drag(drag):
+    line = scores.score(drag, diagnose_log(drag.log, drag.model).as_json(drag.flights))
+    assert line["exact"] and line["error_m"] < 0.03
+    assert {name.partition(".")[0] for name in line["intervals"]} == {*drag.drawn.names}
 
 
 def test_a_method_that_crashes_invents_or_ends_scores_zero_and_the_result_goes_on(tmp_path):
@@ -134,14 +105,6 @@ def test_a_method_that_crashes_invents_or_ends_scores_zero_and_the_result_goes_o
     out.write_text(json.dumps(found | {"code": "other"}))
     with pytest.raises(AnswerError, match="code: found other"):
         run_method(SHORT, ids, MOODY, out, 60.0)
-
-
-@pytest.mark.slow
-def test_a_method_that_hangs_is_ended_and_begun_again():
-    found = run_method(SHORT, ["00", "01"], MOODY.replace("moody", "hang"), None, 3.0)
-    assert [line["reason"] for line in found["logs"].values()] == [
-        "found no result after 3 s, the limit of a job"
-    ] * 2
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """Plants whose diagnosis was wrong once, each with what is right of it.
 
-The drawn ones were found by drawing plants that no rule was made on. Logs 52 and 57 are those of
-the suite misspec-v1. Each chose a rule since.
+The drawn ones were found by drawing plants that no rule was made on. Each chose a rule since.
 """
 
 import numpy as np
@@ -44,13 +43,7 @@ SEED = 6101
         ),
         # An expo and a saturation from then on did what this scale does alone.
         (Trial("onset", 2, 6106, "handout"), {"rate_scale"}, True),
-        # The shortest disturbance passed for the noise of the gyro, which is then next to nothing.
-        (
-            Trial("two", 1, 6104, "handout"),
-            {"rate_slew_limit", "thrust_lag_asymmetry"},
-            True,
-        ),
-        # And the time of one axis came ever nearer to 0 s without touching it.
+        # The time of one axis came ever nearer to 0 s without touching it.
         (
             Trial("three", 4, 6106, "handout"),
             {"rate_slew_limit", "linear_drag", "thrust_lag_asymmetry"},
@@ -65,20 +58,10 @@ def test_drawn_plants(trial: Trial, names: set[str], is_explained: bool) -> None
     assert found.unexplained.flagged != is_explained
 
 
-@pytest.mark.parametrize(
-    ("log", "names"),
-    [
-        # Thrust that was free on the side of rates explained the motor imbalance.
-        ("52", {"rate_slew_limit", "motor_imbalance"}),
-        # A wind that began and ended stood in for a thermal that the drone passes.
-        ("57", set()),
-    ],
-)
-def test_logs_of_the_suite(log: str, names: set[str]) -> None:
-    plant = load_log_suite("misspec-v1").plant(log)
+def test_a_wind_that_begins_and_ends_does_not_stand_in_for_a_thermal() -> None:
+    plant = load_log_suite("misspec-v1").plant("57")
     found = diagnose(plant.log, plant.model)
-    assert {cause.effect for cause in found.causes} == names
-    assert found.unexplained.flagged  # gusts, or the thermal
+    assert found.causes == () and found.unexplained.flagged
 
 
 @pytest.mark.parametrize(

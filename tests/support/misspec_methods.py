@@ -1,7 +1,6 @@
 """Methods for the door of misspec-v1 that misbehave."""
 
 import os
-import time
 
 from flytrack_bench.misspec import Answer
 
@@ -20,7 +19,3 @@ def moody(log, model):
     if calls == 4:
         os._exit(3)
     return Answer(names=("linear_drag",), flagged=True)
-
-
-def hang(log, model):
-    time.sleep(1e6)
