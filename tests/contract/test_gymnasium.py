@@ -29,14 +29,12 @@ APPLIED_ROLL = 18  # row of the observation
 BASE = "FlyTrack-v0"
 
 IDS = sorted(ENVIRONMENTS)
-MISSING = ((), ("pygame",), ("pygame", "PIL"))
 # An id, and packages that are not installed.
 CHECKED = [
-    *((BASE, missing) for missing in MISSING),
-    *(
-        pytest.param(f"FlyTrack{name}-v0", (), marks=pytest.mark.slow)
-        for name in ("Robust", "CornersRobust", "Mask")
-    ),
+    (BASE, ()),
+    (BASE, ("pygame", "PIL")),
+    pytest.param("FlyTrackCornersRobust-v0", (), marks=pytest.mark.slow),
+    pytest.param("FlyTrackMask-v0", (), marks=pytest.mark.slow),
 ]
 CRASH = np.full(4, np.nan, np.float32)  # an action that ends the episode
 
@@ -80,10 +78,7 @@ def test_ids_are_registered_once_and_without_a_second_time_limit(env_id):
     while isinstance(env, gymnasium.Wrapper):
         assert not isinstance(env, TimeLimit)
         env = env.env
-    assert (
-        np.isfinite(env.observation_space.low).all()
-        and np.isfinite(env.observation_space.high).all()
-    )
+    assert env.observation_space.is_bounded()
 
 
 @pytest.mark.parametrize("is_inline", [True, False])
@@ -142,7 +137,6 @@ NEXT_STEP, SAME_STEP = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP
 @pytest.mark.parametrize(
     ("mode", "wrapper"),
     [
-        *((mode, lambda env: env) for mode in (NEXT_STEP, SAME_STEP)),
         *((mode, wrappers.RecordEpisodeStatistics) for mode in (NEXT_STEP, SAME_STEP)),
         (SAME_STEP, wrappers.NormalizeReward),
         (NEXT_STEP, wrappers.NormalizeObservation),
@@ -242,18 +236,8 @@ def test_options_set_the_start_of_one_episode(is_vector):
     env = make_vector() if is_vector else gymnasium.make(BASE)
     observation = np.atleast_2d(env.reset(seed=0, options=POSE)[0])
     # Gate 0 at (12.5, 2, 1.35) is flown towards -x.
-    expected = [
-        -2.5 / 3,
-        -0.5 / 3,
-        -0.15 / 3,
-        9 / 5,
-        0.0,
-        1 / 5,
-        *np.eye(3).ravel(),
-        *[0.0] * 6,
-        -1.0,
-        -0.5,
-    ]
+    place, velocity = np.array([-2.5, -0.5, -0.15]) / 3, np.array([9.0, 0.0, 1.0]) / 5
+    expected = [*place, *velocity, *np.eye(3).ravel(), *[0.0] * 6, -1.0, -0.5]
     assert_allclose(observation[:, :23], [expected] * len(observation), atol=1e-5)
     following = np.atleast_2d(env.reset()[0])
     assert (abs(following[:, 22] + 0.5) > 1e-3).all()
@@ -275,10 +259,8 @@ def test_bad_options_are_refused_and_change_nothing(options, message):
 
 
 def test_arguments_reach_the_environment(params):
-    beside = {
-        "position": (-0.05, 4.0, 2.0),
-        "velocity": (10.0, 0.0, 0.0),
-    }  # past a gate, outside its frame
+    # Past a gate, outside its frame.
+    beside = {"position": (-0.05, 4.0, 2.0), "velocity": (10.0, 0.0, 0.0)}
     beside["track"] = track_of_row([10.0 * index for index in range(8)])
     for arguments, is_end in (({"missed_gate": "fly_on"}, False), ({}, True)):
         env = gymnasium.make(BASE, **arguments)
