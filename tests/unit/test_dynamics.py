@@ -24,7 +24,7 @@ def test_nominal_drone_has_no_thrust_at_minus_one_and_the_stated_maximum():
         assert full == pytest.approx(ratio, abs=0.1)
 
 
-@pytest.mark.parametrize("dt", [0.0005, 0.002, 0.01, 0.05])
+@pytest.mark.parametrize("dt", [0.0005, 0.05])
 def test_agrees_with_the_handouts_equations(dt):
     x, u = (rows.astype(float) for rows in random_inputs(64))
     x[:, 9:13] /= np.linalg.norm(x[:, 9:13], axis=1, keepdims=True)

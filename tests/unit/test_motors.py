@@ -47,8 +47,14 @@ def compiled_flight(model, start, commands, dt):
 
 
 def simulate(model, start, commands, dt=DT):
-    """Return a flight's states, (num_steps, 21)."""
+    """Return a flight's states, (num_steps, 21); every model is flown by one program."""
+    model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model)
     return np.asarray(compiled_flight(model, start, padded(commands), dt))[: len(commands)]
+
+
+def late_model(craft, delay_s=0.0):
+    """Return the model of a craft whose commands are late."""
+    return model_of(craft).with_effects(effects.CommandDelay(delay_s))
 
 
 def begun(model, state):
@@ -66,7 +72,7 @@ def begun(model, state):
     )
     drone = jax.tree.map(jnp.asarray, drone)
     memories = tuple(
-        Spinning(tuple(map(jnp.asarray, first.speeds))) if memory is not None else None
+        Spinning(tuple(map(jnp.asarray, first.speeds))) if isinstance(memory, Spinning) else memory
         for memory in effects.start_memories(model.effects, drone)
     )
     return drone, memories
@@ -74,7 +80,7 @@ def begun(model, state):
 
 def both(craft, state, commands, dt=DT):
     """Return the states after each command of the NumPy craft, (n, 15 + 3), and of the model."""
-    model = jax.tree.map(lambda leaf: np.asarray(leaf, float), model_of(craft))
+    model = late_model(craft)
     flown = simulate(model, begun(model, state), 2.0 * commands - 1.0, dt)
     step_s, rows = (1e-4 if len(commands) < 10 else 1e-3), []
     for command in commands:
@@ -98,9 +104,8 @@ HOVER = float(speed_for(crafts(), 0.8 * 9.80665 / (4 * 6.0) * np.ones(1))[0])
 
 
 def test_a_hover_with_delayed_commands_stays_level():
-    model, start = model_of(BALANCED), hovering(BALANCED)
-    model = model.with_effects(effects.CommandDelay(0.02))
-    drone, _ = begun(model_of(BALANCED), start)
+    model = late_model(BALANCED, 0.02)
+    drone, _ = begun(model, hovering(BALANCED))
     memories = effects.start_memories(model.effects, drone)
     flown = simulate(model, (drone, memories), 2.0 * held(*[HOVER] * 4, steps=20) - 1.0)
     assert_allclose(flown[:, 13:16], 0.0, atol=1e-9)
@@ -154,7 +159,7 @@ def test_a_body_without_torque_keeps_momentum_and_energy():
 
 
 def test_motors_are_slower_down_than_up():
-    model = model_of(crafts(up_s=0.02, down_s=0.08))
+    model = late_model(crafts(up_s=0.02, down_s=0.08))
     start = begun(model, hovering(crafts()))
     up, down = (
         simulate(model, start, 2.0 * held(*[end] * 4) - 1.0)[-1, 19]

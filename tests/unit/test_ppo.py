@@ -1,5 +1,7 @@
 """PPO's parts against closed forms, and the whole on tiny problems."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -110,35 +112,41 @@ def test_memory_tells_what_no_observation_shows():
     network, params = train(env, ProbeParams(max_steps_in_episode=3), memory_size=8)
     unseen, first = jnp.zeros((1, 6, 2)), network.first_memory((1, 6))
     done = jnp.array([[False, False, True] * 2])
-    values = network.apply(params, first, unseen, done, method="unroll")[1][0]
+    unroll, value_of = (
+        quick_jit(partial(network.apply, method=method)) for method in ("unroll", "value_of")
+    )
+    values = unroll(params, first, unseen, done)[1][0]
     assert_allclose(values, [0.81, 0.9, 1.0] * 2, atol=0.04)
     memory = network.first_memory()
     for value in values[:3]:
-        assert_allclose(
-            network.apply(params, memory, unseen[0, 0], method="value_of"), value, atol=1e-5
-        )
+        assert_allclose(value_of(params, memory, unseen[0, 0]), value, atol=1e-5)
         memory, _ = network.act(params, memory, unseen[0, 0])
 
 
 def test_a_critic_sees_the_state_and_the_policy_does_not():
     config = tiny(memory_size=8, encoder_sizes=(8,), critic_sees_state=True, state_coef=1.0)
     network = make_network(config)
-    size = OBSERVATION_SIZE + 3
-    rows = jax.random.normal(jax.random.key(1), (5, size))
-    params = network.init(jax.random.key(0), rows)
+    rows = jax.random.normal(jax.random.key(1), (5, OBSERVATION_SIZE + 3))
     memory = network.first_memory((5,))
-    _, policy, value = network.apply(params, memory, rows, method="step")
-    _, action = network.act(params, memory, rows[:, :3])
-    assert_allclose(jnp.clip(policy.mode(), -1.0, 1.0), action, atol=1e-6)
     moved = rows.at[:, 3:].add(1.0)
-    _, same_policy, other_value = network.apply(params, memory, moved, method="step")
-    assert_array_equal(same_policy.mode(), policy.mode())
+
+    @quick_jit
+    def seen(key):
+        """Return what is done and valued, also of other states, and what errors teach."""
+        params = network.init(key, rows)
+        _, policy, value = network.apply(params, memory, rows, method="step")
+        _, action = network.act(params, memory, rows[:, :3])
+        _, same_policy, other_value = network.apply(params, memory, moved, method="step")
+        arguments = memory[:, None], rows[:, None], jnp.zeros((5, 1), bool)
+        gradient = jax.grad(lambda p: network.apply(p, *arguments, method="unroll")[2])(params)
+        return policy.mode(), action, same_policy.mode(), value, other_value, gradient["params"]
+
+    mode, action, same_mode, value, other_value, gradient = seen(jax.random.key(0))
+    assert_allclose(jnp.clip(mode, -1.0, 1.0), action, atol=1e-6)
+    assert_array_equal(same_mode, mode)
     assert (np.abs(other_value - value) > 1e-3).all()
     # The error of the state's estimate teaches what the memory is made of.
-    steps, done = rows[:, None], jnp.zeros((5, 1), bool)
-    arguments = memory[:, None], steps, done
-    gradient = jax.grad(lambda p: network.apply(p, *arguments, method="unroll")[2])(params)
-    kernels = [gradient["params"][part] for part in ("encoder", "estimator")]
+    kernels = [gradient[part] for part in ("encoder", "estimator")]
     assert all(np.abs(leaf).max() > 0.0 for leaf in jax.tree.leaves(kernels))
 
 
@@ -146,15 +154,17 @@ def test_an_image_is_seen_by_convolutions_and_flown_by_what_is_stored(tmp_path):
     env = GateMask(FlyTrack(plant=Coasting()), size=(16, 16))
     config = Config(hidden_sizes=(8,), memory_size=4)
     network = ppo.make_network_for(env, env.default_params, config)
-    image, _ = env.reset(jax.random.key(0))
-    params = network.init(jax.random.key(0), image[None])
+    image = np.random.default_rng(0).choice(np.uint8([0, 255]), env.image_shape)
+    params = quick_jit(network.init)(jax.random.key(0), image[None])
     description = {"env_id": "FlyTrackMask-v0", "track": "flytrack", "missed_gate": "terminate"}
     shapes = {"observation_size": 16, "image_shape": (16, 16, 1)}
     save_checkpoint(tmp_path / "a.safetensors", params, config, description | shapes)
     checkpoint = load_checkpoint(tmp_path / "a.safetensors")
     checkpoint.check_fits(env)
-    memory, action = network.act(params, network.first_memory(), image)
-    again = checkpoint.network.act(checkpoint.params, checkpoint.network.first_memory(), image)
+    act = quick_jit(network.act)
+    memory, action = act(params, network.first_memory(), image)
+    again = act(checkpoint.params, checkpoint.network.first_memory(), image)
+    assert checkpoint.network == network
     assert_array_equal(memory, again[0])
     assert action.shape == (4,) and (np.asarray(action) == again[1]).all()
 
