@@ -47,11 +47,9 @@ def test_settings_are_fixed_or_drawn(tmp_path):
         ("[speed]\nchoice = [1]", "speed: unknown; expected one of total_timesteps"),
         ("[gamma]\nguess = [1]", "gamma: found .*, expected one of choice, grid_search"),
         ("[gamma]\nuniform = [1]", "uniform: found .*, expected lowest and highest value"),
-        ("[gamma]\nchoice = ['a']", "gamma"),
         ("[num_envs]\nuniform = [16, 64]", "expected randint or lograndint for this setting"),
         ("[gamma]\nrandint = [0, 2]", "expected uniform or the like"),
         ("[num_envs]\nrandint = [64, 16]", "expected lowest < highest"),
-        ("[num_envs]\nrandint = [0, 16]", "num_envs"),
         ("[gamma]\nquniform = [0.9, 1]", "expected lowest and highest value, and a step"),
         ("[gamma]\nuniform = [0.9, 1.5]", "gamma"),
     ],
@@ -127,7 +125,7 @@ def test_a_sweep_that_was_killed_goes_on(tmp_path):
     client = MlflowClient(tracking_uri=f"sqlite:///{out / 'mlflow.db'}")
     runs = client.search_runs([client.get_experiment_by_name("flytrack").experiment_id])
     (sweep,) = [run for run in runs if "mlflow.parentRunId" not in run.data.tags]
-    trials = [run for run in runs if run.data.tags.get("mlflow.parentRunId") == sweep.info.run_id]
-    assert len(runs) == 3
+    trials = [run for run in runs if run is not sweep]
+    assert {run.data.tags["mlflow.parentRunId"] for run in trials} == {sweep.info.run_id}
     assert sorted(run.data.params["config.learning_rate"] for run in trials) == ["0.001", "0.003"]
     assert {run.info.status for run in runs} <= {"FINISHED", "KILLED"}

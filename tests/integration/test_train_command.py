@@ -51,10 +51,7 @@ def test_a_device_chooses_the_recipe(monkeypatch, whole):
     assert read("--device", "gpu", "--resume", whole[0])[0].hyperparameters == CONFIG
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    table("resumed")["flags"],
-)
+@pytest.mark.parametrize(("arguments", "message"), table("resumed")["flags"])
 def test_what_does_not_fit_a_run_is_refused(
     whole, tmp_path, monkeypatch, capsys, arguments, message
 ):
@@ -74,10 +71,7 @@ def test_resuming_takes_from_the_checkpoint_what_is_not_given(whole):
     assert make_trainer(settings, start).env.default_params.reward.off_centre == -0.25
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    table("resumed")["changes"],
-)
+@pytest.mark.parametrize(("changes", "message"), table("resumed")["changes"])
 def test_a_checkpoint_that_cannot_be_resumed_is_named(whole, tmp_path, changes, message):
     path = tmp_path / "final.safetensors"
     old = load_checkpoint(whole[0] / "final.safetensors")
@@ -92,7 +86,6 @@ def test_a_checkpoint_that_cannot_be_resumed_is_named(whole, tmp_path, changes, 
         (DivergedError("training diverged"), 1, "flytrack train: error: training diverged\n"),
         (OSError(28, "No space left on device", "a.safetensors"), 1, "device: 'a.safetensors'\n"),
         (ValueError("out holds a run"), 2, "flytrack train: error: out holds a run\n"),
-        (Stopped("stopped by SIGTERM", signal.SIGTERM), 143, "stopped by SIGTERM\n"),
         (Stopped("stopped by SIGINT", signal.SIGINT), 130, "stopped by SIGINT\n"),
     ],
 )

@@ -62,13 +62,11 @@ def test_round_trip(path, params):
     checkpoint.check_fits(FlyTrack())
 
 
-@pytest.mark.parametrize("trained_in_64", [False, True])
-def test_checkpoints_load_in_the_other_precision(tmp_path, trained_in_64):
-    with jax.enable_x64(trained_in_64):
+def test_a_checkpoint_of_64_bits_loads_in_32(tmp_path):
+    with jax.enable_x64(True):
         params = initial_params()
         save_checkpoint(tmp_path / "a.safetensors", params, CONFIG, DESCRIPTION, TRAINING)
-    with jax.enable_x64(not trained_in_64):
-        loaded = load_checkpoint(tmp_path / "a.safetensors").params
+    loaded = load_checkpoint(tmp_path / "a.safetensors").params
     jax.tree.map(np.testing.assert_allclose, loaded, params)
 
 
@@ -98,21 +96,16 @@ def test_a_run_of_an_older_version_continues(tmp_path, params):
         check_same_run(load_checkpoint(path), other)
 
 
-IDS = {"sticks": "FlyTrack-v0", "motors": "FlyTrackMotors-v0"}
-
-
-@pytest.mark.parametrize(("trained", "other"), [("sticks", "motors"), ("motors", "sticks")])
-def test_policies_of_other_commands_are_refused(tmp_path, params, trained, other):
-    env = make(IDS[trained])
-    model = model_as_json(env.default_params.model)
-    description = {**DESCRIPTION, "env_id": IDS[trained], "model": model}
+def test_policies_of_other_commands_are_refused(tmp_path, params):
+    model = model_as_json(make("FlyTrackMotors-v0").default_params.model)
+    description = {**DESCRIPTION, "env_id": "FlyTrackMotors-v0", "model": model}
     save_checkpoint(tmp_path / "d.safetensors", params, CONFIG, description)
     checkpoint = load_checkpoint(tmp_path / "d.safetensors")
-    checkpoint.check_fits(env)
+    checkpoint.check_fits(make("FlyTrackMotors-v0"))
     with pytest.raises(
-        CheckpointError, match=f"commands {trained} .*, expected one that commands {other}"
+        CheckpointError, match=r"commands motors .*, expected one that commands sticks"
     ):
-        checkpoint.check_fits(make(IDS[other]))
+        checkpoint.check_fits(FlyTrack())
 
 
 @pytest.mark.parametrize(

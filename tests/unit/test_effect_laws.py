@@ -34,8 +34,6 @@ from tests.support.simulated_flights import (
 
 GRAVITY_W = np.array([0.0, 0.0, 9.80665])
 FULL_STICK = np.deg2rad(618.0)
-NO_THRUST = NOMINAL._replace(thrust_coeffs=np.zeros(6, np.float32))
-YAWED = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # 90 degrees: the world's x is the body's -y
 
 # --- Laws that hidden plants have, too ------------------------------------------------------------
 
@@ -92,20 +90,6 @@ def compute_force(parameters, model=NOMINAL, **fields):
     """Return the acceleration without gravity of one step with centred sticks, world, m/s^2."""
     rows = flown(parameters, drone=drone_with(**fields), model=model)
     return rows[0, ACCELERATION] + GRAVITY_W
-
-
-@pytest.mark.parametrize(
-    ("vel_w", "quat", "expected"),
-    [
-        ((3.0, 4.0, 0.0), (1.0, 0.0, 0.0, 0.0), (-1.5, -4.0, 0.0)),
-        ((5.0, 0.0, 0.0), YAWED, (-5.0, 0.0, 0.0)),
-    ],
-)
-def test_quadratic_drag_multiplies_each_axis_by_the_whole_speed(vel_w, quat, expected):
-    force = compute_force(
-        effects.QuadraticDrag(0.1, 0.2, 0.3), model=NO_THRUST, vel_w=vel_w, quat=quat
-    )
-    assert_allclose(force, expected, atol=2e-5)
 
 
 def lift_ratio(parameters, **fields):

@@ -23,7 +23,6 @@ SEED, COUNT = 5, 200
 MAX_ERROR, MAX_LAG_ERROR, MAX_FLOAT64_ERROR = 1e-5, 1e-6, 1e-7
 # Environment id, track, hidden layers, and flags of the ONNX file.
 CASES = {
-    "perfect sensors": ("FlyTrack-v0", "flytrack", (8, 5), []),
     "float64": ("FlyTrack-v0", "flytrack", (8, 5), ["--float64"]),
     "noise and earlier actions": ("FlyTrackRobust-v0", "figure_eight", (8,), []),
 }

@@ -120,7 +120,7 @@ def test_any_segment_meets_any_gate_as_in_the_gates_own_frame(seed):
     assert (offset[np.asarray(crossing.is_pass)] <= 1.0).all()
 
 
-@pytest.mark.parametrize("dt", [0.002, 0.01, 0.05])
+@pytest.mark.parametrize("dt", [0.002, 0.05])
 def test_a_lap_time_does_not_depend_on_the_time_step(dt):
     env = coasting_env(2.0, 4.0, 6.0, 8.0)
     params, step = env.default_params.replace(dt=dt), jax.jit(env.transition)

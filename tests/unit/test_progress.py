@@ -96,12 +96,3 @@ def test_a_bar_is_drawn_while_the_work_says_nothing_and_guesses_no_end(monkeypat
     closed = terminal.getvalue()
     time.sleep(0.2)
     assert terminal.getvalue() == closed
-
-
-def test_the_time_left_of_many_steps_is_drawn(monkeypatch):
-    terminal = open_terminal(monkeypatch)
-    bar = progress_bar("steps", 100, initial=0)
-    bar.update(50)
-    bar.refresh()
-    assert "50/100 [00:00<00:00" in terminal.getvalue()
-    bar.close()

@@ -34,13 +34,6 @@ def record(folder, sequence, gates=GATES, **options):
     return Recording(path)
 
 
-def test_handouts_function_has_its_defaults(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    viz.visualize_state_action_sequence(make_sequence(3), GATES)
-    assert [path.name for path in tmp_path.iterdir()] == ["rollout.rrd"]
-    assert b"flytrack_viz" in (tmp_path / "rollout.rrd").read_bytes()
-
-
 def test_handouts_function_records_the_numbers_that_it_is_given(tmp_path):
     handout = record(tmp_path, make_sequence(100), app_id="test_app")
     x, u = (part.astype(float) for part in make_flight(100))
