@@ -88,27 +88,22 @@ def test_a_changed_suite_is_refused(small):
         load_suite(small)
 
 
-def test_no_more_data_is_flown_than_allowed(small):
-    suite = load_suite(small)
-    data = Data(suite.tasks[1], suite, seconds=1.0)
-    policy = Policy("hover", Function(hover), None, None, "")
-    log = data.fly(policy, 0.6)
-    assert 55 <= len(log) <= 60 and log.time.max() < 0.6  # some rows are lost, as sensors lose them
-    with pytest.raises(DataError, match=r"found 0.6, expected at most the 0.4 s left"):
-        data.fly(policy, 0.6)
-
-
-def test_a_checkpoint_is_adapted_to_all_data_and_a_function_is_refused(small, monkeypatch):
+def test_all_data_and_no_more_are_flown_and_a_checkpoint_is_adapted_to_them(small, monkeypatch):
     suite, robust = load_suite(small), load_policy("robust")
     logs = []
-    monkeypatch.setattr(
-        retrain,
-        "adapt",
-        lambda log, checkpoint: logs.append(log) or Adapted(None, checkpoint, False),
-    )
-    data = Data(suite.tasks[1], suite, seconds=0.8)
+
+    def note(log, checkpoint):
+        logs.append(log)
+        return Adapted(None, checkpoint, False)
+
+    monkeypatch.setattr(retrain, "adapt", note)
+    data = Data(suite.tasks[1], suite, seconds=0.6)
+    with pytest.raises(DataError, match=r"found 0.7, expected at most the 0.6 s left"):
+        data.fly(robust, 0.7)
     adapted = retrain.adapt_to_flight(data, robust)
-    assert data.seconds_left == 0.0 and 75 <= len(logs[0]) <= 80
+    (log,) = logs
+    assert 55 <= len(log) <= 60 and log.time.max() < 0.6  # some rows are lost, as sensors lose them
+    assert data.seconds_left == 0.0
     assert adapted.checkpoint is robust.checkpoint and adapted.name == "robust, adapted"
     with pytest.raises(PolicyError, match="found hover, expected a checkpoint"):
         retrain.adapt_to_flight(data, Policy("hover", Function(hover), None, None, ""))

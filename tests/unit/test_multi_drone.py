@@ -79,7 +79,7 @@ def test_one_drone_flies_bit_for_bit_as_in_the_single_environment():
     assert num_ended > 5
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(st.permutations(range(DRONES)), st.integers(0, 2**31))
 def test_the_order_of_drones_does_not_matter(order, seed):
     order = np.array(order)
@@ -93,22 +93,17 @@ def test_the_order_of_drones_does_not_matter(order, seed):
         jax.tree.map(assert_array_equal, reordered(raced, order), raced_moved)
 
 
-def test_drones_far_apart_fly_as_alone():
-    size = RACE.env.observation_space().shape[0]
-    _, states = starts(5)
-    drone = states.inner.plant.drone
-    far = drone.pos_w._replace(y=drone.pos_w.y + jnp.array([0.0, 4.0, -4.0]))
-    states = with_drones(states, drone._replace(pos_w=far))
-    alone = states._replace(is_out=jnp.zeros((RACES, DRONES), bool).at[:, 1:].set(True))
-    for n in range(40):
-        actions = sticks(n, RACES, DRONES)
-        together, apart = step_all(states, actions), step_all(alone, actions)
-        states, alone = together[1], apart[1]
-        assert_array_equal(together[0][:, 0, :size], apart[0][:, 0, :size])
-        assert_array_equal(together[2][:, 0], apart[2][:, 0])
+def test_a_race_begins_with_given_drones_unless_two_are_in_one_place():
+    observations, states = jax.tree.map(lambda leaf: leaf[0], starts(8))
+    drones, gates = states.inner.plant.drone, states.inner.race.gate_index
+    assert_allclose(observations, RACE.begin(drones, gates, PARAMS)[0], atol=2e-5)
+    assert observations.shape == (DRONES, *RACE.observation_space().shape)
+    together = jax.tree.map(lambda leaf: leaf.at[1].set(leaf[0]), drones)
+    with pytest.raises(ValueError, match="drones 0 and 1: found starts 0 m apart"):
+        RACE.begin(together, gates, PARAMS)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(vector, vector, vector, st.floats(0.0, 1.0))
 def test_no_collision_passes_between_two_steps(direction, other_direction, offset, moment):
     """Two drones at 30 m/s that touch at some moment of the step do not get past each other."""
@@ -242,12 +237,6 @@ def make_view(count, size, over="first"):
     return Versus(MultiDroneRace(RACE.env, 2, over), opponents)
 
 
-def begin_two_in_one_place():
-    _, states = RACE.reset(jax.random.key(0))
-    drones = jax.tree.map(lambda leaf: leaf.at[1].set(leaf[0]), states.inner.plant.drone)
-    RACE.begin(drones, jnp.zeros(DRONES, jnp.int32), PARAMS)
-
-
 REFUSALS = {
     "opponents: found 2, expected 1": lambda: make_view(2, 29),
     "found 30, expected 29 or 36": lambda: make_view(1, 30),
@@ -262,7 +251,6 @@ REFUSALS = {
     "blame": lambda: check_rules(RaceRules(blame=2), 2),
     "slot of 0 to 1": lambda: check_rules(RaceRules(first_slot=2), 2),
     "more than 0 m": lambda: check_rules(RaceRules(collision_radius=0.0), 2),
-    "drones 0 and 1: found starts 0 m apart": begin_two_in_one_place,
 }
 
 
@@ -298,8 +286,8 @@ def test_pettingzoo_accepts_the_race():
 
     from flytrack_env.multi_drone.pettingzoo_api import ParallelRace
 
-    race = ParallelRace(flytrack_env.make_race("FlyTrackRace-v0", DRONES))
-    parallel_api_test(race, num_cycles=150)
+    race = ParallelRace(flytrack_env.make_race("FlyTrackRace-v0", 2))
+    parallel_api_test(race, num_cycles=60)
     race.reset(seed=1)
     with pytest.raises(ValueError, match=r"found \['drone_0'\], expected"):
         race.step({"drone_0": np.zeros(4)})
@@ -323,10 +311,3 @@ def test_a_race_begins_on_the_grid_and_is_over_for_all_at_once():
         states = flown[1]
         num_over += over[:, 0].sum()
     assert num_over >= RACES
-
-
-def test_observations_at_the_start_are_those_of_the_drones_that_begin():
-    observations, states = RACE.reset(jax.random.key(8))
-    drones, gates = states.inner.plant.drone, states.inner.race.gate_index
-    assert_allclose(observations, RACE.begin(drones, gates, PARAMS)[0], atol=2e-5)
-    assert observations.shape == (DRONES, *RACE.observation_space().shape)
