@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from flytrack_env import rewards
-from flytrack_env.env import FlyTrack
 from flytrack_env.quaternion import Vec3
 from flytrack_env.rewards import TERMS, RewardWeights, Transition, total_reward
 from tests.support.coasting import coasting_env, drone_at
@@ -35,12 +34,6 @@ def test_every_weight_is_named_after_a_term_and_every_term_is_tested():
     names = [term.__name__ for term in TERMS]
     assert len(set(names)) == len(names)
     assert set(RewardWeights._fields) == set(names) == {case[0] for case in CASES}
-
-
-def test_weights_that_are_given_replace_the_defaults():
-    weights = FlyTrack(reward={"off_centre": -0.5, "gate_pass": 2}).default_params.reward
-    assert weights == RewardWeights(off_centre=-0.5, gate_pass=2.0)
-    assert FlyTrack(reward={}).default_params.reward == RewardWeights()
 
 
 def test_gradient_is_finite_at_the_gates_centre():
