@@ -121,13 +121,11 @@ def test_two_processes_and_two_devices_train_as_one(tmp_path, start):
     assert names == sorted(path.name for path in (tmp_path / "pair").iterdir())
     for name in ("shared", "pair"):
         assert largest_difference(tmp_path / name / FINAL, tmp_path / "alone" / FINAL) < 1e-5
-    # What two devices stored continues on one, and the other way round.
-    for source, own in (("shared", ()), ("alone", ("--devices", 2))):
-        step = tmp_path / source / f"step_{8 * BATCH}.safetensors"
-        out = tmp_path / f"from_{source}"
-        status, _, errors = end_of(start(out, "--resume", step, *own))
-        assert status == 0, errors
-        assert largest_difference(out / FINAL, tmp_path / "alone" / FINAL) < 1e-5
+    # What one device stored continues on two; the other way round is tested below.
+    out, step = tmp_path / "longer", tmp_path / "alone" / f"step_{8 * BATCH}.safetensors"
+    status, _, errors = end_of(start(out, "--resume", step, "--devices", 2))
+    assert status == 0, errors
+    assert largest_difference(out / FINAL, tmp_path / "alone" / FINAL) < 1e-5
     # Other settings in one of two processes are named there.
     jobs = pair_flags()
     pair = [start(tmp_path / "x", *flags, "--seed", seed, *jobs[seed]) for seed in (0, 1)]
@@ -153,6 +151,9 @@ def test_a_killed_process_ends_the_other_and_nothing_stored_is_lost(tmp_path, st
     assert status == 1, errors
     assert f"process {1 - victim} of 2 has lost another; continue with --resume {out}" in errors
     assert "Traceback" not in errors
+    assert not list(out.glob(".*.safetensors*")), "no part of a file is left"
+    if victim == 0:
+        return
     # One device restores the state that both stored, to the bit, and goes on.
     copied, longer = tmp_path / "alone", tmp_path / "longer"
     for folder, updates in ((copied, 50), (longer, 51)):
@@ -162,4 +163,3 @@ def test_a_killed_process_ends_the_other_and_nothing_stored_is_lost(tmp_path, st
     stored, restored = arrays_of(out / step), arrays_of(copied / FINAL)
     assert stored.keys() == restored.keys()
     assert all(stored[name].tobytes() == restored[name].tobytes() for name in stored)
-    assert not list(out.glob(".*.safetensors*")), "no part of a file is left"
