@@ -34,7 +34,15 @@ OVER_KINDS = pytest.mark.parametrize("env_id", slow_but([BASE], [BASE, EVERY_WRA
 OVER_IDS = pytest.mark.parametrize("env_id", ENVIRONMENTS)
 
 
-@OVER_IDS
+# The others are parts of these.
+WHOLE = [
+    BASE,
+    EVERY_WRAPPER,
+    *(f"FlyTrack{name}-v0" for name in ("CornersRobust", "Mask", "Motors")),
+]
+
+
+@pytest.mark.parametrize("env_id", slow_but(WHOLE, ENVIRONMENTS))
 def test_every_id_follows_gymnaxs_protocol(env_id):
     first, first_params = gymnax.make(env_id)
     importlib.reload(flytrack_env)
