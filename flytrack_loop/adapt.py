@@ -24,7 +24,7 @@ from baselines.purejaxrl_ppo.polish import LostError, polish
 from baselines.purejaxrl_ppo.polish import Settings as Polishing
 from baselines.purejaxrl_ppo.report import describe_share, share
 from flytrack_env import ModelParameters
-from flytrack_env.effects import effect_of, takes_motors
+from flytrack_env.effects import LearnedLaw, effect_of, takes_motors
 from flytrack_env.episodes import EpisodicEnvironment
 from flytrack_env.model_file import model_as_json, model_from_json
 from flytrack_sysid import Diagnosis, FlightLog, LogError, diagnose
@@ -213,7 +213,10 @@ def with_rate_loop(model: ModelParameters, craft: ModelParameters) -> ModelParam
 
 
 def read_policy_model(checkpoint: Checkpoint) -> ModelParameters:
-    """Return the model that a policy was made for; raise CheckpointError as ``adapt`` does."""
+    """Return the model that a policy was made for; raise CheckpointError as ``adapt`` does.
+
+    What an earlier adaptation learnt, beyond the list, is of the log of that time, and left out.
+    """
     if "model" not in checkpoint.meta:
         raise CheckpointError(
             f"{checkpoint.path}: model: found none, expected the one it was trained on"
@@ -226,7 +229,8 @@ def read_policy_model(checkpoint: Checkpoint) -> ModelParameters:
             f"{checkpoint.path}: found a policy of {checkpoint.env_id}, expected one that observes "
             f"what {ENV_ID} shows: {error}"
         ) from error
-    return model
+    listed = tuple(one for one in model.effects if not isinstance(one, LearnedLaw))
+    return model._replace(effects=listed)
 
 
 def check_inputs(log: FlightLog, model: ModelParameters, accept: bool) -> None:

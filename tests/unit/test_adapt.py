@@ -13,9 +13,19 @@ from baselines.purejaxrl_ppo.checkpoint import SHIPPED
 from flytrack_env import nominal_parameters
 from flytrack_env.battery import Battery
 from flytrack_env.dynamics import step
-from flytrack_env.effects import WIND, CommandDelay, LinearDrag, Motors, QuadraticDrag, VoltageSag
+from flytrack_env.effects import (
+    WIND,
+    CommandDelay,
+    LearnedLaw,
+    LinearDrag,
+    Motors,
+    QuadraticDrag,
+    VoltageSag,
+)
 from flytrack_env.effects.actual_rates import ActualRates
 from flytrack_env.effects.betaflight_rates import BetaflightRates
+from flytrack_env.effects.grammar import Factor, Law, Term
+from flytrack_env.model_file import model_as_json
 from flytrack_env.motion import Motion
 from flytrack_env.thrust import collective_thrust
 from flytrack_loop import adapt as adapting
@@ -226,6 +236,15 @@ def test_a_log_that_agrees_leaves_the_policy_as_it_is(log, monkeypatch):
     adapted = adapt(log, champion, accept=True)
     assert adapted.checkpoint is champion and not adapted.is_new
     assert "Nothing to adapt to" in describe_adapted(adapted)
+
+
+def test_what_was_learnt_from_an_earlier_log_is_forgotten():
+    champion = load_checkpoint("champion")
+    square = Factor("airspeed", "power", (2.0, 0.0))
+    law = Law((Term("force", "air", (square,), (0.01, 0.0, 0.0), (0.001, 0.0, 0.0)),))
+    learnt = model_as_json(DRAG.with_effects(LearnedLaw(1.0, 0.0, law)))
+    policy = champion._replace(meta={**champion.meta, "model": learnt})
+    assert [type(one) for one in adapting.read_policy_model(policy).effects] == [LinearDrag]
 
 
 def test_another_motion_within_a_step_is_a_difference():
