@@ -174,17 +174,19 @@ def _state_like(model: ModelParameters) -> ReplayState:
 
 
 @cache
-def _no_state(
-    structure: jax.tree_util.PyTreeDef, shapes: tuple[tuple[int, ...], ...]
-) -> np.ndarray:
+def _no_state(structure: jax.tree_util.PyTreeDef, shapes: tuple[tuple[int, ...], ...]) -> jax.Array:
     """Return a state to begin with, where every chunk begins a flight, so that it is not read.
+
+    It is bound to its device, as states that a program returns are: otherwise JAX would compile the
+    program once for the first rows and once for all others.
 
     Args:
         structure: of a model.
         shapes: of its leaves.
     """
     like = jax.tree.unflatten(structure, [_numbers(*shape) for shape in shapes])
-    return np.zeros((_count_numbers(_state_like(like)), NUM_PAIRS))
+    zeros = jnp.zeros((_count_numbers(_state_like(like)), NUM_PAIRS))
+    return jax.device_put(zeros, zeros.sharding)
 
 
 @keep_trace
