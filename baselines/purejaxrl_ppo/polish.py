@@ -52,7 +52,7 @@ class Settings(NamedTuple):
         offset_limit: of a pass, over the free half opening, from which it is penalised.
         penalty_s: seconds for the square of an offset beyond the limit.
         widened_m: by which half openings are widened.
-        largest_gradient: norm at which the gradient of an update is clipped.
+        largest_gradient: norm at which the gradient of a flight is clipped.
         gradient_decay: share of a state's gradient that is passed on to the step before; below 1 it
             looks ahead for 1 / (1 - share) steps and cannot overflow.
     """
@@ -194,14 +194,13 @@ def polish(
         gradients, is_complete = jax.vmap(jax.grad(compute_cost, has_aux=True), (None, 0, None))(
             policy_params, keys, way
         )
-        num_complete = is_complete.sum()
-        gradient = jax.tree.map(
-            lambda leaf: leaf.sum(axis=0) / jnp.maximum(num_complete, 1), gradients
-        )
-        gradient = projection_l2_ball(gradient, scale=settings.largest_gradient)
+        # Each flight's, not their mean: one that is hard to control has a gradient a thousand times
+        # as large as the others.
+        clip = partial(projection_l2_ball, scale=settings.largest_gradient)
+        gradient = jax.tree.map(partial(jnp.mean, axis=0), jax.vmap(clip)(gradients))
         change, optimizer_state = optimizer.update(gradient, optimizer_state)
         change = jax.tree.map(lambda leaf: -learning_rate(done) * leaf, change)
-        return optax.apply_updates(policy_params, change), optimizer_state, num_complete
+        return optax.apply_updates(policy_params, change), optimizer_state, is_complete.sum()
 
     policy_params = jax.tree.map(
         jnp.array, policy.params
