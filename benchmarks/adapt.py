@@ -65,6 +65,7 @@ SIZES = ((12.6, 0.12), (16.8, 0.3), (21.0, 0.5), (25.2, 0.75), (50.4, 4.0))  # f
 CONFIGURATIONS = (*SETUPS, "P and D term", "a weak motor", "drag", "mass", "bent thrust")
 NUM_PLANTS, NUM_UNCHANGED = 8, 20
 LIMIT, NETWORK = "limit", "residual network"
+FIRST = "adapted to the first of two logs"
 ENTRIES = ("nothing", *POLICIES, NETWORK, "refitted base", "adapted", LIMIT)
 LIMIT_SETTINGS = Settings().polishing._replace(updates=300, curriculum_steps=0, offset_limit=0.95)
 # XLA does not compile the gradient of parts of 1 ms within eight minutes.
@@ -304,18 +305,20 @@ def are_as_expected(plants: list[Line]) -> list[bool]:
 def crafts_table(lines: list[Line]) -> str:
     """Return a row for each craft that the policy was not made for."""
     rows = []
+    has_two_logs = any(FIRST in line["entries"] for line in lines)
+    entered = ["nothing", FIRST, "adapted"] if has_two_logs else ["nothing", "adapted"]
     for line in sorted(lines, key=lambda line: line["number"]):
         entries, named = line["entries"], line.get("named")
         flown_s = entries.get("adapted", {}).get("flying_lap_s")
         simulated_s = line.get("simulated_lap_s")
         gap = f"{flown_s / simulated_s - 1.0:+.2%}" if flown_s and simulated_s else "-"
         verdict = line.get("refused") or line["verdict"]
-        laps = [format_lap(entries.get(name)) for name in ("nothing", "adapted")]
+        laps = [format_lap(entries.get(name)) for name in entered]
         cpu_s = str(line.get("cpu_s", "-"))
         names = "-" if named is None else ", ".join(named) or "nothing"
         rows.append([line["hidden"], verdict, names, *laps, gap, cpu_s, line["commit"]])
-    header = "craft | verdict | named | nothing | adapted | gap to its simulator | CPU s | commit"
-    return report.table(header, rows)
+    last = ("gap to its simulator", "CPU s", "commit")
+    return report.table(("craft", "verdict", "named", *entered, *last), rows)
 
 
 def describe_not_flown(lines: list[Line]) -> str:
@@ -490,18 +493,32 @@ def measure_firmware(trial: Trial) -> Line:
     if name in KINDS:
         changes |= KINDS[name].draw(np.random.default_rng([trial.seed, trial.number]))
     settings, body = of_settings_and_body(changes)
+    policy = load_checkpoint(POLICY)
     with Betaflight(settings, Body(**body), seed=trial.seed) as plant:
-        result, _ = measure_adapted(
-            trial, plant, load_checkpoint(POLICY), craft=plant.nominal_model()
-        )
+        craft = plant.nominal_model()
+        result, adapted = measure_adapted(trial, plant, policy, craft)
+        if adapted is not None and not all(does_finish([result], "adapted")):
+            again, _ = measure_adapted(trial, plant, policy, craft, adapted.checkpoint)
+            if "refused" not in again:
+                again["entries"][FIRST] = result["entries"]["adapted"]
+                again["cpu_s"] += result["cpu_s"]
+                result = again
     return {**result, "hidden": name}
 
 
 def measure_adapted(
-    trial: Trial, plant: Plant, policy: Checkpoint, craft: ModelParameters | None = None
+    trial: Trial,
+    plant: Plant,
+    policy: Checkpoint,
+    craft: ModelParameters | None = None,
+    flown: Checkpoint | None = None,
 ) -> tuple[Line, Adapted | None]:
-    """Return what is made of a plant's log, and the adapted policy; None if the log is refused."""
-    log = fly(plant, trial.motion, policy, trial.seconds, trial.seed)
+    """Return what is made of a plant's log, and the adapted policy; None if the log is refused.
+
+    Args:
+        flown: the policy whose flights are logged; None for the one that is adapted.
+    """
+    log = fly(plant, trial.motion, policy if flown is None else flown, trial.seconds, trial.seed)
     result: Line = {"flights": len(np.unique(log.segment))}
     entries = result["entries"] = {"nothing": raced(policy, plant)}
     begun_s = time.process_time()
