@@ -35,7 +35,7 @@ def check_gymnax(found: str) -> None:
 def import_gymnax() -> None:
     """Import gymnax without seaborn, which is imported once gymnax draws with it.
 
-    seaborn imports pandas and scipy.stats: longer than all the rest of FlyTrack together.
+    seaborn imports pandas and scipy.stats, which takes as long as importing all else.
 
     Raises:
         ImportError: gymnax is too old.

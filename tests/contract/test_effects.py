@@ -172,8 +172,8 @@ def final_and_slope(effects, change):
 def only(parameters, effect, name):
     """Return a change of one parameter by 1, all others by 0."""
     zeros = list(jax.tree.map(np.zeros_like, parameters))
-    place = [type(values) for values in parameters].index(effect.parameters)
-    zeros[place] = zeros[place]._replace(**{name: np.float32(1.0)})
+    index = list(map(type, parameters)).index(effect.parameters)
+    zeros[index] = zeros[index]._replace(**{name: np.float32(1.0)})
     return tuple(zeros)
 
 

@@ -39,9 +39,9 @@ def test_what_changed_is_named_by_the_command(tmp_path, capsys):
     flags = ["--model", str(files[2]), "--before", str(files[1]), "--out", str(tmp_path / "report")]
     main(["diagnose", str(files[0]), *flags])
     assert "linear_drag: d_x" in capsys.readouterr().out
-    found = json.loads((tmp_path / "report" / "diagnosis.json").read_text())
-    assert found["verdict"] == "causes_found" and not found["unexplained"]["flagged"]
-    assert [cause["effect"] for cause in found["causes"]] == ["linear_drag"]
+    diagnosis = json.loads((tmp_path / "report" / "diagnosis.json").read_text())
+    assert diagnosis["verdict"] == "causes_found" and not diagnosis["unexplained"]["flagged"]
+    assert [cause["effect"] for cause in diagnosis["causes"]] == ["linear_drag"]
     assert (tmp_path / "report" / "extended_model.json").exists()
 
 

@@ -67,9 +67,9 @@ def test_quaternions_drift_a_little_and_may_flip_and_full_stick_is_rounded(tmp_p
     factors = np.array([1.0, -1.0, 1.005, -0.995, 1.0, 1.0])[:, None]
     log["u"][:, 0] = 1.0 + 5e-7
     write(tmp_path / "flight.csv", columns_of(with_channels(log, q=factors * log["q"])))
-    found = load_log(tmp_path / "flight.csv")
-    np.testing.assert_allclose(found["q"], np.sign(factors) * log["q"], atol=1e-12)
-    assert (found["u"][:, 0] == 1.0 + 5e-7).all()
+    loaded = load_log(tmp_path / "flight.csv")
+    np.testing.assert_allclose(loaded["q"], np.sign(factors) * log["q"], atol=1e-12)
+    assert (loaded["u"][:, 0] == 1.0 + 5e-7).all()
 
 
 def test_what_would_be_refused_is_not_written(tmp_path):
