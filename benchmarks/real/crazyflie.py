@@ -116,7 +116,9 @@ def measure_fold(folder: Path, policy: str, seconds: float) -> Line:
     vectors = {"refitted_base": base, "extended": extended}
     if refined.base is not None:
         vectors["refitted_to_flights"] = refined.base
-    errors = flight_errors.errors_at(problem, np.stack(list(vectors.values())), windows).errors
+    errors = (
+        flight_errors.Flights(windows).errors_at(problem, np.stack(list(vectors.values()))).errors
+    )
     results = {
         name: flight_errors.FlightErrors(error[None], windows)
         for name, error in zip(vectors, errors, strict=True)

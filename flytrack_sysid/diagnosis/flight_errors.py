@@ -5,6 +5,7 @@ the state at the start alone. Where it predicts as well as the models, the fligh
 evidence about the response to the commands.
 """
 
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import jax
@@ -104,24 +105,47 @@ def _errors(vectors: jax.Array, like: ModelParameters, windows: Windows) -> jax.
     return jax.vmap(lambda vector: prediction_errors(from_vector(vector, like), windows))(vectors)
 
 
-def errors_at(problem: Problem, vectors: np.ndarray, windows: Windows) -> FlightErrors:
-    """Return the errors of models on windows; all numbers of windows share one compiled program.
+@dataclass(frozen=True, eq=False)
+class Flights:
+    """Free flights on windows; a model that is asked for again does not fly again.
 
-    Args:
-        vectors: parameters of the models, (num_vectors, num_parameters).
+    Fits return to vectors: the best of some steps is where the next ones begin, and eliminations
+    by two rules begin alike. Of 770 models of a log of Betaflight, 542 were different.
     """
 
-    def errors_of_batch(batch_vectors: np.ndarray) -> np.ndarray:
-        by_batch = [
-            np.asarray(_errors(batch_vectors, problem.like, batch))
-            for batch in cut_batches(windows)
-        ]
-        return np.concatenate(by_batch, axis=2)[:, :, : len(windows.start)]
+    windows: Windows
+    # By what a model has beside its vector: that, and the errors by vector.
+    _flown: dict[int, tuple[ModelParameters, dict[bytes, np.ndarray]]] = field(
+        default_factory=dict, repr=False
+    )
 
-    errors = in_batches(errors_of_batch, vectors, BATCH)
-    # A model whose prediction diverges gets a large, finite error.
-    errors = np.nan_to_num(np.clip(errors, -1e6, 1e6), nan=1e6)
-    return FlightErrors(errors.reshape(*errors.shape[:-1], len(QUANTITIES), 3), windows)
+    def errors_at(self, problem: Problem, vectors: np.ndarray) -> FlightErrors:
+        """Return the errors of models; all numbers of windows share one compiled program.
+
+        Args:
+            vectors: parameters of the models, (num_vectors, num_parameters).
+        """
+        _, known = self._flown.setdefault(id(problem.like), (problem.like, {}))
+        new = {vector.tobytes(): vector for vector in vectors if vector.tobytes() not in known}
+        if new:
+            errors = self._fly(problem.like, np.stack(list(new.values())))
+            known.update(zip(new, errors, strict=True))
+        return FlightErrors(np.stack([known[vector.tobytes()] for vector in vectors]), self.windows)
+
+    def _fly(self, like: ModelParameters, vectors: np.ndarray) -> np.ndarray:
+        """Return errors, (num_vectors, horizons, windows, quantities, 3)."""
+
+        def errors_of_batch(batch_vectors: np.ndarray) -> np.ndarray:
+            by_batch = [
+                np.asarray(_errors(batch_vectors, like, batch))
+                for batch in cut_batches(self.windows)
+            ]
+            return np.concatenate(by_batch, axis=2)[:, :, : len(self.windows.start)]
+
+        errors = in_batches(errors_of_batch, vectors, BATCH)
+        # A model whose prediction diverges gets a large, finite error.
+        errors = np.nan_to_num(np.clip(errors, -1e6, 1e6), nan=1e6)
+        return errors.reshape(*errors.shape[:-1], len(QUANTITIES), 3)
 
 
 def _regressors(windows: Windows) -> np.ndarray:
@@ -177,7 +201,7 @@ class FlightTest(NamedTuple):
 
     Attributes:
         problem: the parameters of the models.
-        windows: held-out free flights.
+        flights: held-out free flights.
         base: errors of the refitted base.
         placebo: errors of the placebo.
         scale: RMS errors of the base, (horizons, quantities).
@@ -186,7 +210,7 @@ class FlightTest(NamedTuple):
     """
 
     problem: Problem
-    windows: Windows
+    flights: Flights
     base: FlightErrors
     placebo: FlightErrors
     scale: np.ndarray
@@ -194,14 +218,19 @@ class FlightTest(NamedTuple):
 
     @classmethod
     def of(
-        cls, problem: Problem, learnt: Windows, held_out_windows: Windows, base: np.ndarray
+        cls, problem: Problem, learnt: Windows, held_out: Flights, base: np.ndarray
     ) -> "FlightTest":
         """Build the test of a base model; only that model decides which cells are evidence."""
-        errors = errors_at(problem, base[None], held_out_windows)
-        placebo = FlightErrors(placebo_errors(learnt, held_out_windows), held_out_windows)
+        errors = held_out.errors_at(problem, base[None])
+        placebo = FlightErrors(placebo_errors(learnt, held_out.windows), held_out.windows)
         matters = np.zeros(errors.scale.shape, bool)
-        flight_test = cls(problem, held_out_windows, errors, placebo, errors.scale, matters)
+        flight_test = cls(problem, held_out, errors, placebo, errors.scale, matters)
         return flight_test._with_evidence(errors)
+
+    @property
+    def windows(self) -> Windows:
+        """Those of the flights."""
+        return self.flights.windows
 
     @property
     def is_known(self) -> np.ndarray:
@@ -212,7 +241,7 @@ class FlightTest(NamedTuple):
 
     def tested(self, *vectors: np.ndarray) -> FlightErrors:
         """Return the errors of models on the held-out windows."""
-        return errors_at(self.problem, np.stack(vectors), self.windows)
+        return self.flights.errors_at(self.problem, np.stack(vectors))
 
     def seeing(self, vector: np.ndarray) -> "FlightTest":
         """Return the test with those cells added as evidence where a model beats the placebo."""

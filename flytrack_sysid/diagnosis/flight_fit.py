@@ -8,7 +8,7 @@ import numpy as np
 from scipy import special, stats
 
 from flytrack_env.effects import BY_NAME
-from flytrack_sysid.diagnosis.flight_errors import BATCH, errors_at
+from flytrack_sysid.diagnosis.flight_errors import BATCH, Flights
 from flytrack_sysid.inference.free_flight import Windows
 from flytrack_sysid.inference.problem import Problem
 from flytrack_sysid.inference.score_test import prior_information, solve, step_inside
@@ -83,20 +83,20 @@ class Target(NamedTuple):
 
     Attributes:
         problem: the parameters, their ranges and priors.
-        windows: free flights that are compared with the log.
+        flights: that are compared with the log.
         scale: errors that count as 1, (horizons, quantities).
         is_fitted: cells that the fit takes into account, (horizons, quantities).
     """
 
     problem: Problem
-    windows: Windows
+    flights: Flights
     scale: np.ndarray
     is_fitted: np.ndarray
 
     def residuals(self, vectors: np.ndarray) -> np.ndarray:
         """Return relative errors, (num_vectors, windows, horizons * quantities * 3)."""
         weight = np.where(self.is_fitted, 1.0 / self.scale, 0.0)
-        errors = errors_at(self.problem, vectors, self.windows).errors * weight[:, None, :, None]
+        errors = self.flights.errors_at(self.problem, vectors).errors * weight[:, None, :, None]
         return np.moveaxis(errors, 2, 1).reshape(len(vectors), len(self.windows.start), -1)
 
     def cost(self, residuals: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -164,6 +164,11 @@ class Target(NamedTuple):
         """Return the cost of each block of windows, (num_vectors, blocks)."""
         by_window = huber_loss(self.residuals(np.stack(vectors)))
         return np.stack([self.windows.sums_by_block(one) for one in by_window])
+
+    @property
+    def windows(self) -> Windows:
+        """Those of the flights."""
+        return self.flights.windows
 
     @property
     def step_s(self) -> float:

@@ -15,7 +15,6 @@ from flytrack_sysid.diagnosis.flight_errors import (
     WORSE_ANYWHERE,
     FlightErrors,
     FlightTest,
-    errors_at,
 )
 from flytrack_sysid.diagnosis.law_search import MIN_EXPECTED_GAIN, FittedLaw, Side, find_law
 from flytrack_sysid.diagnosis.unexplained import (
@@ -111,9 +110,9 @@ def _flight_errors(
 ) -> FlightErrors:
     """Return the errors of held-out flights with what was learnt, if anything was."""
     if learned is None:
-        return errors_at(problem, vector[None], flight_test.windows)
-    return errors_at(
-        problem.with_law(learned.effect), learned.beside(vector)[None], flight_test.windows
+        return flight_test.flights.errors_at(problem, vector[None])
+    return flight_test.flights.errors_at(
+        problem.with_law(learned.effect), learned.beside(vector)[None]
     )
 
 

@@ -29,8 +29,8 @@ from flytrack_env.effects import BY_NAME, LearnedLaw
 from flytrack_sysid.diagnosis.flight_errors import (
     LIKELY,
     MAX_FITTED_WINDOWS,
+    Flights,
     FlightTest,
-    errors_at,
     sample_windows,
     sureness,
     tabulate_errors,
@@ -152,15 +152,18 @@ def refine(
             one already, and stands unless it predicts a horizon worse than the base.
         doubted: effects that held-out single steps contradict: flights of these rows decide.
     """
-    learnt, held_out_windows = (
+    learnt_windows, held_out_windows = (
         sample_windows(log, ~held_out, MAX_FITTED_WINDOWS),
         sample_windows(log, held_out),
     )
     problem, candidates, extended = state.problem, model.candidates, model.vector
     unrefined = Refined(candidates, None, None, (), {}, problem, None)
-    if learnt is None or held_out_windows is None:
+    if learnt_windows is None or held_out_windows is None:
         return unrefined
-    flight_test = FlightTest.of(problem, learnt, held_out_windows, base.vector).seeing(extended)
+    learnt = Flights(learnt_windows)
+    flight_test = FlightTest.of(
+        problem, learnt_windows, Flights(held_out_windows), base.vector
+    ).seeing(extended)
     unrefined = unrefined._replace(flight_test=flight_test)
     if not candidates or not flight_test.is_known.any():
         return unrefined
@@ -187,7 +190,7 @@ class _Refinement(NamedTuple):
 
     Attributes:
         flight_test: held-out windows and the errors on them.
-        learnt: windows that the fits use.
+        learnt: flights that the fits use.
         base: the base from one-step residuals, (num_parameters,).
         base_indices: the free parameters of the base.
         acting: the effects that change the predictions. Effects of sensors that windows do not
@@ -197,7 +200,7 @@ class _Refinement(NamedTuple):
     """
 
     flight_test: FlightTest
-    learnt: Windows
+    learnt: Flights
     base: np.ndarray
     base_indices: tuple[int, ...]
     acting: tuple[str, ...]
@@ -215,13 +218,13 @@ class _Refinement(NamedTuple):
 
     def target(self, problem: Problem) -> Target:
         """Return the cost of a fit, over cells that are evidence and over short horizons."""
-        scale = errors_at(problem, self.base[None], self.learnt).scale
+        scale = self.learnt.errors_at(problem, self.base[None]).scale
         is_short = (np.array(HORIZONS_S) <= ALWAYS_FITTED_S)[:, None]
         return Target(problem, self.learnt, scale, self.flight_test.matters | is_short)
 
     def indices(self, problem: Problem, candidates: Sequence[Candidate]) -> list[int]:
         """Return the indices of the free parameters that act on the windows."""
-        unseen = {DRAIN} if shows_force(self.learnt) else {DRAIN, *THRUST_COEFFS}
+        unseen = {DRAIN} if shows_force(self.learnt.windows) else {DRAIN, *THRUST_COEFFS}
         base_indices = [index for index in self.base_indices if problem.names[index] not in unseen]
         return base_indices + problem.parameter_indices(self.fields_of(candidates))
 
@@ -365,7 +368,7 @@ class _Refinement(NamedTuple):
 
     def _losses(self, target: Target, *fits: Fit) -> np.ndarray:
         """Return the cross-validated cost of each block, learnt ones first, (fits, blocks)."""
-        held_out = target._replace(windows=self.flight_test.windows)
+        held_out = target._replace(flights=self.flight_test.flights)
         learnt = np.stack([fit.losses for fit in fits])
         return np.concatenate([learnt, held_out.losses(*(fit.vector for fit in fits))], axis=1)
 
@@ -390,12 +393,12 @@ def shows_force(windows: Windows) -> bool:
 
 
 def acting_effects(
-    problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate], windows: Windows
+    problem: Problem, vector: np.ndarray, candidates: Sequence[Candidate], flights: Flights
 ) -> tuple[str, ...]:
     """Return the effects that change the predictions of a model, by all that they change of it."""
     fields = [field for candidate in candidates for field in candidate.fields]
     without = [problem.at_start(vector, [field]) for field in fields]
-    errors = errors_at(problem, np.stack([vector, *without]), windows).errors
+    errors = flights.errors_at(problem, np.stack([vector, *without])).errors
     changes = np.abs(errors[1:] - errors[0]).max(axis=(1, 2, 3, 4))
     is_neutral = [np.array_equal(one, vector) for one in without]
     unseen = {

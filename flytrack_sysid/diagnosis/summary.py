@@ -8,7 +8,7 @@ import numpy as np
 from flytrack_env.dynamics import ModelParameters
 from flytrack_env.effects import BY_NAME, effect_of
 from flytrack_sysid.diagnosis import vetoes
-from flytrack_sysid.diagnosis.flight_errors import errors_at, tabulate_errors
+from flytrack_sysid.diagnosis.flight_errors import tabulate_errors
 from flytrack_sysid.diagnosis.flight_fit import at_bounds
 from flytrack_sysid.diagnosis.identifiability import advise, unit_of, unseen_effects
 from flytrack_sysid.diagnosis.model_selection import (
@@ -511,7 +511,7 @@ def summarize_prediction(refined: Refined, vectors: Mapping[str, np.ndarray]) ->
     models = dict(vectors)
     if refined.base is not None:
         models["refitted_to_flights"] = refined.base
-    rms = errors_at(refined.problem, np.stack(list(models.values())), flight_test.windows).rms()
+    rms = flight_test.flights.errors_at(refined.problem, np.stack(list(models.values()))).rms()
     errors = {name: tabulate_errors(value) for name, value in zip(models, rms, strict=True)}
     errors["placebo"] = tabulate_errors(flight_test.placebo.rms()[0])
     evidence = {

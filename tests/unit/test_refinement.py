@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
-from flytrack_sysid.diagnosis.flight_errors import errors_at, sample_windows
+from flytrack_sysid.diagnosis.flight_errors import Flights, sample_windows
 from flytrack_sysid.diagnosis.flight_fit import Fit, Target
 from flytrack_sysid.diagnosis.refinement import acting_effects, reduced, refine, superfluous
 from flytrack_sysid.diagnosis.vetoes import Selection
@@ -114,7 +114,7 @@ def test_a_lag_comes_back_when_the_effect_in_its_place_is_gone(dragged):
 def test_slopes_of_a_fit_lead_to_nearly_the_same_fit_without_an_effect(dragged):
     problem, flight_test, fit = dragged[2], dragged[3].flight_test, dragged[3].fit
     is_fitted = np.ones(flight_test.scale.shape, bool)
-    target = Target(problem, flight_test.windows, flight_test.scale, is_fitted)
+    target = Target(problem, flight_test.flights, flight_test.scale, is_fitted)
     fields = problem.parameter_indices(DRAG.fields)
     remaining = [index for index in fit.indices if index not in fields]
     start = problem.at_start(fit.vector, DRAG.fields)
@@ -138,7 +138,7 @@ def test_what_changes_no_flight_at_a_bound_goes_back(dragged):
     vector[indices] = 0.01, problem.low[indices[1]], problem.high[indices[2]]
     fit = dragged[3].fit._replace(vector=vector)
     is_fitted = np.ones(flight_test.scale.shape, bool)
-    target = Target(problem, flight_test.windows, flight_test.scale, is_fitted)
+    target = Target(problem, flight_test.flights, flight_test.scale, is_fitted)
     moved = [target.nearer_nominal(fit, field).vector for field in fields[1:]]
     assert -0.02 < moved[0][indices[1]] <= -0.01 and moved[1][indices[2]] == vector[indices[2]]
 
@@ -164,11 +164,11 @@ def test_flights_without_velocity_leave_the_thrust_of_single_steps():
     problem = Problem.of(cut_chunks(log, ~held_out_rows(log), model), model)
     vector = problem.start.copy()
     vector[problem.names.index("motors.damping_x")] = 0.5
-    windows = sample_windows(log, held_out_rows(log))
+    flights = Flights(sample_windows(log, held_out_rows(log)))
     damping = Candidate("motors", ("motors.load", "motors.damping_x"))
-    assert acting_effects(problem, vector, [damping], windows) == ("motors",)
+    assert acting_effects(problem, vector, [damping], flights) == ("motors",)
     vector[problem.names.index("motors.load")] = 0.1  # acts on force alone
-    assert acting_effects(problem, vector, [damping], windows) == ()
+    assert acting_effects(problem, vector, [damping], flights) == ()
     delay = Candidate("command_delay", ("command_delay.delay_s",))
     base = refined(problem, log, problem.start, (delay,), {delay.fields[0]: 0.01}).base
     thrust = problem.parameter_indices(THRUST_COEFFS)
@@ -184,7 +184,7 @@ def test_a_late_gyro_starts_flights_at_the_rates_of_their_time():
     problem, windows = build_problem(truth, log), sample_windows(log, held_out_rows(log))
     late = problem.start.copy()
     late[problem.names.index("imu_latency.latency_s")] = LATE_S
-    base, corrected = errors_at(problem, np.stack([problem.start, late]), windows).rms()
+    base, corrected = Flights(windows).errors_at(problem, np.stack([problem.start, late])).rms()
     rates = QUANTITIES.index("rates")
     assert np.all(corrected <= 1.05 * base)
     assert np.all(corrected[:4, rates] < 0.8 * base[:4, rates])
