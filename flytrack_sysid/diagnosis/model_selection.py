@@ -223,16 +223,19 @@ def select_effects(
             state, model, linearization, [ablated[effect] for effect in effects]
         )
         swaps = [swap for one in ablations.values() for swap in one.swaps.values()]
-        trials = (
-            *swaps,
-            *with_one_less(state, linearization, model, swaps),
-            *with_lags_anew(state, model),
-            *with_moving_air(state, model),
-        )
-        best = min(trials, key=price, default=model)
-        if price(best) >= price(model) - CLEARLY_CHEAPER:
+        near = (*swaps, *with_one_less(state, linearization, model, swaps))
+        best = min(near, key=price, default=model)
+        if not is_cheaper(best, model):  # fits from other starts take long
+            far = (*with_lags_anew(state, model), *with_moving_air(state, model))
+            best = min(far, key=price, default=model)
+        if not is_cheaper(best, model):
             return state, model, ablations
         model = best
+
+
+def is_cheaper(model: FittedModel, other: FittedModel) -> bool:
+    """Return whether a model costs clearly less than another, with the price of its parameters."""
+    return price(model) < price(other) - CLEARLY_CHEAPER
 
 
 def with_one_less(
