@@ -146,6 +146,20 @@ def decay_gradient(tree: Any, share: float) -> Any:
     return jax.tree.map(decay_leaf, tree)
 
 
+def average_clipped(gradients: Any, largest: float) -> Any:
+    """Return the mean of the gradients of flights, each clipped at a norm.
+
+    Clipping the mean is no substitute: single flights of Betaflight with curved sticks had a norm
+    of 300,000, others of 2.
+
+    Args:
+        gradients: leaves (flights, ...).
+        largest: norm of a flight's gradient.
+    """
+    clipped = jax.vmap(partial(projection_l2_ball, scale=largest))(gradients)
+    return jax.tree.map(partial(jnp.mean, axis=0), clipped)
+
+
 def polish(
     env: EpisodicEnvironment,
     policy: Policy,
@@ -194,10 +208,7 @@ def polish(
         gradients, is_complete = jax.vmap(jax.grad(compute_cost, has_aux=True), (None, 0, None))(
             policy_params, keys, way
         )
-        # Each flight's, not their mean: single flights of Betaflight with curved sticks had a norm
-        # of 300,000, others of 2.
-        clip = partial(projection_l2_ball, scale=settings.largest_gradient)
-        gradient = jax.tree.map(partial(jnp.mean, axis=0), jax.vmap(clip)(gradients))
+        gradient = average_clipped(gradients, settings.largest_gradient)
         change, optimizer_state = optimizer.update(gradient, optimizer_state)
         change = jax.tree.map(lambda leaf: -learning_rate(done) * leaf, change)
         return optax.apply_updates(policy_params, change), optimizer_state, is_complete.sum()

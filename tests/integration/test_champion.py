@@ -11,7 +11,13 @@ from baselines.purejaxrl_ppo import load_checkpoint
 from baselines.purejaxrl_ppo.checkpoint_env import draw_plants, plant_env, simulated_env
 from baselines.purejaxrl_ppo.flights import race_many, score, start_keys
 from baselines.purejaxrl_ppo.networks import Policy
-from baselines.purejaxrl_ppo.polish import LostError, Settings, decay_gradient, polish
+from baselines.purejaxrl_ppo.polish import (
+    LostError,
+    Settings,
+    average_clipped,
+    decay_gradient,
+    polish,
+)
 from benchmarks.champion import CHAMPION, FOLDER, MODEL
 from flytrack_env import load_model, make
 from flytrack_env.model_file import model_from_json
@@ -126,6 +132,13 @@ def test_models_move_as_far_as_the_policy_follows():
     to_do = [total - done for done, total in reports]
     changes = np.diff([11, *to_do])
     assert set(changes) == {-1, 1} and min(to_do) > 1, to_do
+
+
+def test_one_flight_does_not_outweigh_the_others():
+    flights = {"a": jnp.array([[0.3, 0.0], [3e5, 0.0]]), "b": jnp.array([[0.4], [-4e5]])}
+    mean = average_clipped(flights, 1.0)
+    np.testing.assert_allclose(mean["a"], [0.5 * (0.3 + 0.6), 0.0], rtol=1e-6)
+    np.testing.assert_allclose(mean["b"], [0.5 * (0.4 - 0.8)], rtol=1e-6)
 
 
 def test_a_decayed_state_is_the_same_with_less_gradient():
