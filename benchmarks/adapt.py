@@ -270,17 +270,21 @@ def entries_of_rivals(lines: list[Line], plant: Line) -> dict[str, Line]:
 
 
 def logs_table(plants: list[Line]) -> str:
-    """Return a row for each length of the log and each seed."""
+    """Return a row for each length of the log: of each seed, and of all."""
     rows = []
-    for seconds, seed in sorted({(line["seconds"], line["seed"]) for line in plants}):
-        alike = report.select(plants, seconds=seconds, seed=seed)
-        flown = [line for line in alike if "is_new" in line]
-        num_finish = sum(does_finish(flown, "adapted"))
-        inside = are_as_expected(flown)
-        cpu_s = f"{np.median([line['cpu_s'] for line in flown]):.0f}" if flown else "-"
-        refused = f"{len(alike) - len(flown)}"
-        shares = f"{num_finish} of {len(alike)}", f"{sum(inside)} of {len(inside)}"
-        rows.append([f"{seconds:g}", str(seed), *shares, refused, cpu_s, alike[0]["commit"]])
+    for seconds in sorted({line["seconds"] for line in plants}):
+        of_length = report.select(plants, seconds=seconds)
+        seeds = sorted({line["seed"] for line in of_length})
+        alike = {str(seed): report.select(of_length, seed=seed) for seed in seeds}
+        for seed, lines in [*alike.items(), *([("all", of_length)] if len(seeds) > 1 else [])]:
+            flown = [line for line in lines if "is_new" in line]
+            inside = are_as_expected(flown)
+            counts = f"{sum(does_finish(flown, 'adapted'))} of {len(lines)}"
+            expected = f"{sum(inside)} of {len(inside)}"
+            cpu_s = f"{np.median([line['cpu_s'] for line in flown]):.0f}" if flown else "-"
+            commits = lines[0]["commit"] if seed in alike else ""
+            refused = f"{len(lines) - len(flown)}"
+            rows.append([f"{seconds:g}", seed, counts, expected, refused, cpu_s, commits])
     header = (
         "seconds | seed | 99 % finish, adapted | lap as expected | refused | CPU s, median | commit"
     )
