@@ -6,6 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.diagnosis import model_of
+from flytrack_sysid.diagnosis import flight_errors
 from flytrack_sysid.diagnosis.flight_errors import Flights, sample_windows
 from flytrack_sysid.diagnosis.flight_fit import Fit, Target
 from flytrack_sysid.diagnosis.refinement import acting_effects, reduced, refine, superfluous
@@ -188,6 +189,17 @@ def test_a_late_gyro_starts_flights_at_the_rates_of_their_time():
     rates = QUANTITIES.index("rates")
     assert np.all(corrected <= 1.05 * base)
     assert np.all(corrected[:4, rates] < 0.8 * base[:4, rates])
+
+
+def test_a_model_that_flew_does_not_fly_again(monkeypatch):
+    truth, log = scripted(3, SECONDS)
+    flights, problem = Flights(sample_windows(log, held_out_rows(log))), build_problem(truth, log)
+    vectors = np.stack([problem.start, problem.start + 1e-3])
+    errors = flights.errors_at(problem, vectors).errors
+    monkeypatch.setattr(flight_errors, "_errors", None)
+    again = flights.errors_at(problem, vectors[::-1]).errors
+    np.testing.assert_array_equal(again, errors[::-1])
+    assert np.any(errors[0] != errors[1])
 
 
 def circle():
