@@ -48,6 +48,9 @@ NEAR, MAX_NEAR = (
     5,
 )  # of the largest gain: the search chooses among effects with such gains
 CLEAR = 10.0  # of minus twice the log likelihood: an end has to be likelier than an onset by this
+# Of the gain of another dependence. Of 21 true changes (benchmarks.diagnosis, seed 6109) 18 had no
+# other dependence, and three 4.4 to 29 times its gain; a false one 1.6 times (seed 6111).
+MORE_THAN_OTHER = 2.5
 MAX_CHANGES = 3  # of one log: an effect that begins and ends has two
 ALWAYS, NEVER = Window("").start, Window("").end
 RIDGE = 1e-7  # of a column's own information
@@ -465,7 +468,7 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     is_better = (
         misfit_changes[0] + price < -change_threshold(first.num_parameters)
         and misfit_changes[1] < 0.0
-        and -misfit_changes[0] > gain_of_other_dependence(selection)
+        and -misfit_changes[0] > MORE_THAN_OTHER * gain_of_other_dependence(selection)
     )
     return later if is_better else None
 
@@ -498,7 +501,8 @@ def gain_of_other_dependence(selection: Selection) -> float:
     """Return the gain of the clearest dependence of what a selection leaves, other than on time.
 
     A drone that flies through a thermal once sees a wind that begins and ends. Where the place, the
-    airspeed or the like explain more than a change does, that is what the remainder depends on.
+    airspeed or the like explain nearly as much as a change does, that may be what the remainder
+    depends on.
     """
     state, model = selection.state, selection.model
     _, dependences = find_unexplained(state.problem, model, selection.base.vector)

@@ -34,6 +34,8 @@ SEED = 6101
         ),
         # A delay of thrust that ends in flight stood in for a periodic force.
         (Trial("outside", 1, SEED, "handout"), set(), False),
+        # A force that depends on the place was a wind that began in flight.
+        (Trial("outside", 1002, 6111, "semi_implicit"), set(), False),
         # A fit ended where first order promised nothing, far from the best one. No log tells this
         # scale from the true rate_expo.
         (
