@@ -282,9 +282,9 @@ def logs_table(plants: list[Line]) -> str:
             counts = f"{sum(does_finish(flown, 'adapted'))} of {len(lines)}"
             expected = f"{sum(inside)} of {len(inside)}"
             cpu_s = f"{np.median([line['cpu_s'] for line in flown]):.0f}" if flown else "-"
-            commits = lines[0]["commit"] if seed in alike else ""
+            commit = lines[0]["commit"] if seed in alike else ""
             refused = f"{len(lines) - len(flown)}"
-            rows.append([f"{seconds:g}", seed, counts, expected, refused, cpu_s, commits])
+            rows.append([f"{seconds:g}", seed, counts, expected, refused, cpu_s, commit])
     header = (
         "seconds | seed | 99 % finish, adapted | lap as expected | refused | CPU s, median | commit"
     )
