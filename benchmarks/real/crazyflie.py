@@ -98,7 +98,7 @@ def fit_models(log: FlightLog, nominal: ModelParameters) -> tuple[np.ndarray, re
     model = state.fitted(candidates, vector)
     state = state.with_noise(fit_noise(problem.chunks, problem.residuals(model.vector[None])[0]))
     base, model = state.fitted((), base.vector), state.fitted(candidates, model.vector)
-    refined = refinement.refine(state, base, model, log, parts.held_out, is_explained=False)
+    refined = refinement.refine(state, base, model, log, parts.held_out)
     return base.vector, refined
 
 

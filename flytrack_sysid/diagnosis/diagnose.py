@@ -36,8 +36,9 @@ from flytrack_sysid.diagnosis.onset import (
 )
 from flytrack_sysid.diagnosis.outliers import find_outliers, outlier_notes
 from flytrack_sysid.diagnosis.refinement import Refined, reduced, refine, with_effects
-from flytrack_sysid.diagnosis.result import Cause, Diagnosis
+from flytrack_sysid.diagnosis.result import CHANNELS, Cause, Diagnosis
 from flytrack_sysid.diagnosis.size import split_by_size
+from flytrack_sysid.diagnosis.unexplained import SIDES
 from flytrack_sysid.diagnosis.vetoes import (
     CONTRADICTED,
     Selection,
@@ -326,20 +327,42 @@ def refined_by_prediction(
     """
     model, last_model = selection.model, at_end(selection, selection.model)
     since = np.arange(len(parts.log)) >= first_row_as_at_end(selection, parts.test)
-    log, is_explained = parts.log.select(since), not selection.unexplained.flagged
+    log = parts.log.select(since)
     refined = refine(
         selection.state,
         selection.base,
         last_model,
         log,
         parts.held_out[since],
-        is_explained,
+        [name for name in settled_effects(selection) if name not in doubted],
         doubted,
     )
     kept = {candidate.effect: candidate for candidate in refined.kept}
     kept |= {one.effect: one for one in model.candidates if one not in last_model.candidates}
     in_order = [kept[name] for one in model.candidates if (name := one.effect) in kept]
     return refined._replace(kept=tuple(in_order))
+
+
+def settled_effects(selection: Selection) -> list[str]:
+    """Return the effects that act where a model leaves nothing unexplained.
+
+    What disturbs the rates makes the errors of all flights larger, and may hide in these what
+    single steps show of a force.
+    """
+    problem, model = selection.state.problem, selection.model
+    disturbed = {name.partition(":")[0] for name in selection.unexplained.shares}
+    explained = {
+        channel
+        for side, channels in zip(SIDES, CHANNELS, strict=False)
+        if side not in disturbed
+        for channel in channels
+    }
+    return [
+        effect
+        for effect, ablation in selection.ablations.items()
+        if not disturbed
+        or summary.find_channel(problem, ablation.without.vector, model.vector) in explained
+    ]
 
 
 class NamedModel(NamedTuple):

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flytrack_sysid.diagnosis.model_selection import price
 from flytrack_sysid.diagnosis.result import Estimated
 from flytrack_sysid.diagnosis.unexplained import find_unexplained
 from flytrack_sysid.diagnosis.vetoes import Selection, held_out_gain, held_out_under, select
@@ -443,14 +444,9 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     changes = changes_beside(selection, test)
     if not changes or changes[0].margin < 0.0 or changes[0].way == "drift":
         return None
-    first, near = (
-        changes[0],
-        [one for one in changes if one.way != "drift" and one.gain > NEAR * changes[0].gain],
-    )
-    state, model = _likeliest_side(
-        selection, first, [one.candidate.effect for one in near[:MAX_NEAR]]
-    )
-    state, model = with_refitted_noise(at_best_row(state, test, model, first.row), model)
+    near = [one for one in changes if one.way != "drift" and one.gain > NEAR * changes[0].gain]
+    state, model, row = _likeliest_change(selection, near[:MAX_NEAR])
+    state, model = with_refitted_noise(at_best_row(state, test, model, row), model)
     state, base, model = extended(state, state.fitted((), selection.base.vector), model)
     rows = change_rows(windows_of(state, model)) - change_rows(selection.state.problem.windows)
     if rows:
@@ -466,7 +462,7 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
     ]
     price = PER_PARAMETER * (later.model.num_priced - selection.model.num_priced)
     is_better = (
-        misfit_changes[0] + price < -change_threshold(first.num_parameters)
+        misfit_changes[0] + price < -change_threshold(changes[0].num_parameters)
         and misfit_changes[1] < 0.0
         and -misfit_changes[0] > MORE_THAN_OTHER * gain_of_other_dependence(selection)
     )
@@ -524,28 +520,35 @@ def windowed(state: SearchState, windows: Sequence[Window]) -> SearchState:
     return replace(state, problem=problem, linearization=None)
 
 
-def _likeliest_side(
-    selection: Selection, first: Hypothesis, near: Sequence[str]
-) -> tuple[SearchState, FittedModel]:
-    """Return a state in which effects begin, or end, at the row of a change, and a model of it.
+def _likeliest_change(
+    selection: Selection, near: Sequence[Hypothesis]
+) -> tuple[SearchState, FittedModel, int]:
+    """Return a state in which effects begin, or end, at a row, the likeliest model of it, and it.
 
-    The model has the change's effect and those with earlier changes. If both sides are as likely,
-    as with a scale of something that is fitted besides, the effect begins.
+    The model has the effect of one change and those with earlier changes. If both sides are as
+    likely, as with a scale of something that is fitted besides, the effect begins.
+
+    Args:
+        selection: without the change.
+        near: changes that are nearly as likely to first order; the state has all their effects.
     """
     old = {one.effect: one for one in selection.state.problem.windows}
     kept = [one for one in selection.model.candidates if one.effect in old]
-    candidates = tuple({one.effect: one for one in (*kept, first.candidate)}.values())
+    effects = [change.candidate.effect for change in near]
 
-    def trial(start: int, end: int) -> tuple[SearchState, FittedModel]:
+    def trial(change: Hypothesis, start: int, end: int) -> tuple[SearchState, FittedModel, int]:
         windows = dict(old)
-        for effect in near:
+        for effect in effects:
             old_window = old.get(effect, Window(effect))
             windows[effect] = Window(effect, max(start, old_window.start), min(end, old_window.end))
         state = windowed(selection.state, tuple(windows.values()))
-        return state, state.fitted(candidates, selection.base.vector)
+        candidates = tuple({one.effect: one for one in (*kept, change.candidate)}.values())
+        return state, state.fitted(candidates, selection.base.vector), change.row
 
-    begins, ends = trial(first.row, NEVER), trial(ALWAYS, first.row)
-    return begins if begins[1].cost < ends[1].cost + CLEAR else ends
+    begin = [trial(change, change.row, NEVER) for change in near]
+    end = [trial(change, ALWAYS, change.row) for change in near]
+    costs = [price(model) for _, model, _ in begin] + [price(model) + CLEAR for _, model, _ in end]
+    return (begin + end)[int(np.argmin(costs))]
 
 
 def at_best_row(state: SearchState, test: Problem, model: FittedModel, row: int) -> SearchState:

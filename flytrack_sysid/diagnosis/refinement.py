@@ -139,7 +139,7 @@ def refine(
     model: FittedModel,
     log: FlightLog,
     held_out: np.ndarray,
-    is_explained: bool,
+    settled: Sequence[str] = (),
     doubted: Sequence[str] = (),
 ) -> Refined:
     """Select the effects of a model that predict held-out flights better, and fit their values.
@@ -148,8 +148,8 @@ def refine(
         base: the base from one-step residuals.
         model: the extended model from one-step residuals.
         held_out: rows of the log that no fit uses, (num_rows,) bool.
-        is_explained: whether one-step residuals are noise only. The model is then the most likely
-            one already, and stands unless it predicts a horizon worse than the base.
+        settled: effects that act where single steps leave nothing unexplained. The model has their
+            most likely values already. They stand unless it predicts a horizon worse than the base.
         doubted: effects that held-out single steps contradict: flights of these rows decide.
     """
     learnt_windows, held_out_windows = (
@@ -176,11 +176,12 @@ def refine(
         base.vector,
         tuple(state.base_indices),
         acting,
-        is_explained,
+        tuple(settled),
         tuple(doubted),
     )
     is_at_bound = bool(at_bounds(problem, extended, refinement.fields_of(candidates)))
-    if is_explained and not is_at_bound and not flight_test.is_surely_worse(extended):
+    is_settled = all(candidate.effect in settled for candidate in candidates)
+    if is_settled and not is_at_bound and not flight_test.is_surely_worse(extended):
         return unrefined
     return refinement.run(extended, unrefined)
 
@@ -195,7 +196,7 @@ class _Refinement(NamedTuple):
         base_indices: the free parameters of the base.
         acting: the effects that change the predictions. Effects of sensors that windows do not
             contain are not among them; their values stay as they are.
-        is_explained: as in ``refine``.
+        settled: as in ``refine``.
         doubted: as in ``refine``.
     """
 
@@ -204,7 +205,7 @@ class _Refinement(NamedTuple):
     base: np.ndarray
     base_indices: tuple[int, ...]
     acting: tuple[str, ...]
-    is_explained: bool
+    settled: tuple[str, ...]
     doubted: tuple[str, ...]
 
     def fields_of(self, candidates: Sequence[Candidate]) -> list[str]:
@@ -298,8 +299,7 @@ class _Refinement(NamedTuple):
             candidate.effect in self.acting for candidate in kept
         ):  # the base from single steps stands
             return refined._replace(kept=tuple(kept), fit=None, removed=tuple(removed), without={})
-        if not self.is_explained:
-            fit, kept = self._narrowed(target, fit, kept)
+        fit, kept = self._narrowed(target, fit, kept)
         return refined._replace(kept=tuple(kept), fit=fit, removed=tuple(removed), without=without)
 
     def _least_needed(
@@ -322,7 +322,9 @@ class _Refinement(NamedTuple):
         tried = [candidate for candidate in kept if candidate.effect in self.acting]
         fits = [self._without(target, fit, kept, candidate, nearby) for candidate in tried]
         by_effect = {one.effect: reduced for one, reduced in zip(tried, fits, strict=True)}
-        if self.is_explained and not flight_test.is_surely_worse(fit.vector):
+        may_go = np.array([candidate.effect not in self.settled for candidate in tried])
+        may_go |= flight_test.is_surely_worse(fit.vector)
+        if not may_go.any():
             return None, by_effect
         losses = self._losses(target, fit, *fits)
         losses_more = (losses[1:] - losses[0]).T
@@ -333,11 +335,13 @@ class _Refinement(NamedTuple):
         held_out_sure = sureness(losses_more[len(fit.losses) :])
         is_doubted = np.array([candidate.effect in self.doubted for candidate in tried])
         needed[is_doubted & (held_out_sure < LIKELY)] = -np.inf
+        needed[~may_go] = np.inf
         weakest = int(np.argmin(needed))
         if needed[weakest] >= SURE:
             if flight_test.worst_ratio(fit.vector) < 1.0:
                 return None, by_effect
-            weakest = int(np.argmin([flight_test.worst_ratio(one.vector) for one in fits]))
+            ratios = np.array([flight_test.worst_ratio(one.vector) for one in fits])
+            weakest = int(np.argmin(np.where(may_go, ratios, np.inf)))
         return tried[weakest].effect, by_effect
 
     def _narrowed(
@@ -349,7 +353,8 @@ class _Refinement(NamedTuple):
         end at a bound, since nothing in the flights depends on them. They are held at nominal.
         """
         kept = list(kept)
-        for number in range(len(kept)):
+        unsettled = [one.effect not in self.settled for one in kept]
+        for number in np.flatnonzero(unsettled):
             while (field := superfluous(target.problem, fit, kept[number])) is not None:
                 candidate, others = kept[number], [*kept]
                 others[number] = candidate._replace(

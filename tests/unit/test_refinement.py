@@ -54,7 +54,7 @@ def refined(problem, log, vector, candidates, values, doubted=()):
         vector[problem.names.index(name)] = value
     base = FittedModel((), problem.start, 0.0, ())
     model = base._replace(candidates=candidates, vector=vector)
-    return refine(SearchState(problem), base, model, log, held_out_rows(log), False, doubted)
+    return refine(SearchState(problem), base, model, log, held_out_rows(log), (), doubted)
 
 
 @pytest.fixture(scope="module")
