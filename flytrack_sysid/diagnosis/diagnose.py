@@ -16,6 +16,7 @@ from flytrack_env.motion import Motion
 from flytrack_sysid.clocks import on_one_clock, with_causal_commands
 from flytrack_sysid.diagnosis import craft, summary
 from flytrack_sysid.diagnosis.beyond import Learned, with_and_without, with_learned
+from flytrack_sysid.diagnosis.by_flight import notes_on_flights, with_flights
 from flytrack_sysid.diagnosis.controller import controller_notes, examine_controller
 from flytrack_sysid.diagnosis.families import with_families
 from flytrack_sysid.diagnosis.first_look import FirstLook
@@ -32,6 +33,7 @@ from flytrack_sysid.diagnosis.onset import (
     describe_changes,
     find_spans,
     first_row_as_at_end,
+    is_one_flight,
     with_changes,
 )
 from flytrack_sysid.diagnosis.outliers import find_outliers, outlier_notes
@@ -407,6 +409,8 @@ def name_causes(vetted: VettedModel, parts: Split) -> NamedModel:
     neutral = tuple(cause.effect for cause in before if cause.effect not in names)
     spans = find_spans(selection, test, parts.log)
     causes = tuple(replace(named, **spans.get(named.effect, {})) for named in causes)
+    if not is_one_flight(parts.log):
+        causes = with_flights(causes, linearization, model, parts.log)
 
     def without(cause: Cause) -> np.ndarray:
         if fit is None:
@@ -525,6 +529,7 @@ def notes_on(
         *summary.stand_in_notes(selection, flying["extended"]),
         *summary.given_law_notes(problem, selection.unexplained),
         *summary.veto_notes(vetted.rejected),
+        *notes_on_flights(named.found),
         *describe_changes(selection, named.linearization, parts.log),
     ]
 

@@ -103,6 +103,14 @@ def _plus_minus(cause: Cause) -> str:
     )
 
 
+def _by_flight(cause: Cause) -> list[str]:
+    """Return a line for each parameter with its values of several flights."""
+    return [
+        f"{name} by flight: {', '.join(f'{one.value:.3g}' for one in flights)}"
+        for name, flights in cause.by_flight.items()
+    ]
+
+
 def format_span(cause: Cause) -> str:
     """Return when a cause acts, " from 31.2 ± 0.4 s on"; empty if it acts throughout."""
 
@@ -268,7 +276,12 @@ def _causes_part(diagnosis: Diagnosis) -> Part:
     rows = [
         [
             f"{words_of(cause.effect)}{format_span(cause)}\n({cause.effect}, in {cause.channel})",
-            "\n".join(_parameter(name, estimate) for name, estimate in cause.parameters.items()),
+            "\n".join(
+                [
+                    *(_parameter(name, value) for name, value in cause.parameters.items()),
+                    *_by_flight(cause),
+                ]
+            ),
             _number(cause.heldout_gain),
             _confused(cause),
         ]
@@ -657,6 +670,7 @@ def text_of(diagnosis: Diagnosis) -> str:
             f"  {cause.effect}{format_span(cause)}: {values}; held-out gain "
             f"{cause.heldout_gain:.4g}{twins}"
         )
+        lines += [f"    {line}" for line in _by_flight(cause)]
     for cause in diagnosis.beyond:
         lines.append(f"beyond the list: {cause.effect}: {cause.beyond}")
     for cause in diagnosis.negligible:

@@ -74,6 +74,8 @@ class Cause:
             0.04 s": the true cause may be beyond the list.
         family: other laws of the same response, while something in it is unexplained: the log
             shows that the response differs, and not for certain which of its laws.
+        by_flight: of several flights the values of each, by parameter; empty for one flight.
+        spread: by how much the intervals were widened, since the flights differ; 1 if they do not.
         onset_s: when it began, in the log's time (s); None if it acts from the log's first row.
         end_s: when it ended, in the log's time (s); None if it acts until the log's last row.
     """
@@ -89,6 +91,8 @@ class Cause:
     closest: str = ""
     beyond: str = ""
     family: tuple[str, ...] = ()
+    by_flight: Mapping[str, tuple[Estimated, ...]] = field(default_factory=dict)
+    spread: float = 1.0
     onset_s: Estimated | None = None
     end_s: Estimated | None = None
 

@@ -351,6 +351,25 @@ class Linearization:
         narrow.total, narrow.score = self.total[np.ix_(columns, columns)], self.score[columns]
         return narrow
 
+    def of_blocks(self, is_chosen: np.ndarray) -> "Linearization":
+        """Return what some blocks alone tell: their sums, with the residuals of all."""
+        part = copy.copy(self)
+        part.by_block, part.score_by_block = (
+            self.by_block[is_chosen],
+            self.score_by_block[is_chosen],
+        )
+        part.total = part.by_block.sum(axis=0) + np.diag(self.prior)
+        part.score = part.score_by_block.sum(axis=0)
+        return part
+
+    def stepped(self, indices: Sequence[int]) -> tuple[np.ndarray, "Linearization"]:
+        """Return the best step along indices, and what is left after it, to first order."""
+        columns, after = self.columns_at(indices), copy.copy(self)
+        step = self.step(columns)
+        after.score_by_block = self.score_by_block - self.by_block[:, :, columns] @ step
+        after.score = self.score - self.total[:, columns] @ step
+        return step, after
+
     def column(self, name: str) -> int:
         """Return the column of a parameter."""
         return self.indices.index(self.problem.names.index(name))

@@ -1,0 +1,154 @@
+"""Whether several flights agree on the value of a cause.
+
+A value is of the craft only if its other flights give it too. A flight's own estimate is one step
+of Gauss-Newton from the common one, on its own blocks of the linearization: nothing is replayed.
+Where the estimates differ by more than chance (Q of W. Cochran, Biometrics 10, 1954), the interval
+of the common value is wider by the Birge ratio sqrt(Q / degrees of freedom), as those of the
+Particle Data Group are.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from flytrack_sysid.diagnosis.model_selection import Marginal
+from flytrack_sysid.diagnosis.result import Cause, Estimated
+from flytrack_sysid.diagnosis.summary import mean_thrust
+from flytrack_sysid.inference.chunks import CHUNK_S, Chunks, count_lead_in
+from flytrack_sysid.inference.parameters import THRUST_COEFFS
+from flytrack_sysid.inference.score_test import (
+    FALSE_POSITIVE_RATE,
+    Linearization,
+    base_fields,
+    solve,
+)
+from flytrack_sysid.inference.search import FittedModel
+from flytrack_sysid.log import FlightLog
+
+OF_THRUST = ("mean_factor", "factor")  # values of a thrust curve as a whole
+SMALLEST_N = 1e-9  # of a nominal thrust, so that none divides by zero: such a curve has no factor
+
+
+def flight_of_blocks(chunks: Chunks, log: FlightLog) -> np.ndarray:
+    """Return the number of the flight of each block; a flight begins where the time goes back."""
+    number = np.cumsum(np.diff(log.time, prepend=log.time[0]) < 0.0)
+    source = chunks.record.source_row[count_lead_in(len(chunks.row)) :]
+    last = source.reshape(CHUNK_S, -1, source.shape[1]).max(axis=1)
+    return np.asarray(number[np.maximum(last, 0).ravel()])
+
+
+class OfFlights(NamedTuple):
+    """Estimates of some parameters by flight.
+
+    Attributes:
+        values: (flights, parameters).
+        marginals: what each flight tells of the parameters.
+        spread: by which the common interval is too narrow; 1 where the flights differ by chance.
+    """
+
+    values: np.ndarray
+    marginals: Sequence[Marginal]
+    spread: float
+
+
+def compare_flights(
+    linearization: Linearization, model: FittedModel, fields: Sequence[str], flights: np.ndarray
+) -> OfFlights:
+    """Return the estimates of some parameters of a model by flight.
+
+    Args:
+        linearization: of the model.
+        model: with these parameters.
+        fields: the parameters.
+        flights: the number of each block's flight, (blocks,).
+    """
+    indices = list(model.indices)
+    own = [indices.index(index) for index in linearization.problem.parameter_indices(fields)]
+    steps, marginals = [], []
+    for number in np.unique(flights):
+        step, part = linearization.of_blocks(flights == number).stepped(indices)
+        steps.append(step[own])
+        marginals.append(Marginal(part, model, fields))
+    weights = np.stack([one.information / one.inflation for one in marginals])
+    common = solve(weights.sum(axis=0), np.einsum("fpq,fq->p", weights, np.stack(steps)))
+    changes = np.stack(steps) - common
+    q = float(np.einsum("fp,fpq,fq->", changes, weights, changes))
+    freedom = (len(steps) - 1) * len(own)
+    is_chance = stats.chi2.sf(q, freedom) > FALSE_POSITIVE_RATE
+    values = model.vector[np.array(indices)[own]] + np.stack(steps)
+    return OfFlights(values, marginals, 1.0 if is_chance else float(np.sqrt(q / freedom)))
+
+
+def with_flights(
+    causes: Sequence[Cause], linearization: Linearization, model: FittedModel, log: FlightLog
+) -> tuple[Cause, ...]:
+    """Return causes with the values of each flight, and intervals that cover how these differ.
+
+    Args:
+        causes: of several flights.
+        linearization: of the model that single steps select.
+        model: that model.
+        log: of the flights, one after the other.
+    """
+    flights = flight_of_blocks(linearization.problem.chunks, log)
+    return tuple(_with_flights(cause, linearization, model, flights) for cause in causes)
+
+
+def _with_flights(
+    cause: Cause, linearization: Linearization, model: FittedModel, flights: np.ndarray
+) -> Cause:
+    problem = linearization.problem
+    of_base = base_fields(cause.effect)
+    known = of_base or tuple(f"{cause.effect}.{name}" for name in cause.parameters)
+    fields = [field for field in known if problem.names.index(field) in model.indices]
+    if not fields:
+        return cause
+    compared = compare_flights(linearization, model, fields, flights)
+    if tuple(fields) == THRUST_COEFFS:  # single coefficients trade off
+        slopes = mean_thrust(problem)
+        nominal_n = float(slopes @ problem.start[problem.parameter_indices(fields)])
+        weights = dict.fromkeys(OF_THRUST, slopes / max(nominal_n, SMALLEST_N))
+    else:
+        short = [field.split(".")[-1] for field in fields]
+        weights = dict(zip(short, np.eye(len(fields)), strict=True))
+    by_flight = {
+        name: tuple(
+            Estimated.around(
+                float(values @ weights[name]),
+                float(marginal.half_widths(weights[name][None])[0]),
+                one.unit,
+            )
+            for values, marginal in zip(compared.values, compared.marginals, strict=True)
+        )
+        for name, one in cause.parameters.items()
+        if name in weights
+    }
+    parameters = {name: _widened(one, compared.spread) for name, one in cause.parameters.items()}
+    return replace(cause, parameters=parameters, by_flight=by_flight, spread=compared.spread)
+
+
+def _widened(value: Estimated, times: float) -> Estimated:
+    low, high = value.ci95
+    ends = value.value - times * (value.value - low), value.value + times * (high - value.value)
+    return replace(value, ci95=ends)
+
+
+def notes_on_flights(causes: Sequence[Cause]) -> list[str]:
+    """Return a note on each cause whose value differs between flights by more than chance."""
+    notes = []
+    for cause in causes:
+        if cause.spread > 1.0:
+            ranges = (
+                f"{name} {min(values):.3g} to {max(values):.3g}"
+                for name, flights in cause.by_flight.items()
+                for values in [[one.value for one in flights]]
+            )
+            notes.append(
+                f"{cause.effect} differs between the flights by more than chance "
+                f"({', '.join(ranges)}): its values are means, with intervals {cause.spread:.2g} "
+                "times as wide"
+            )
+    return notes
