@@ -2,10 +2,11 @@
 
 Each measured flight is diagnosed alone, with the nominal model that is imported with it. A name is
 a statement about the craft only if another flight of the same craft gives it too. Plants, each with
-an effect of the list and another law outside it, fly twice for a minute, differently. Then flights
-of craft that differ, or do not, are compared by ``diagnose_change`` (``--changes``). Results are
-appended to docs/results/repeatability.jsonl and changes.jsonl, and a later run of the same commit
-resumes there; ``--page`` writes docs/results/repeatability.md from them.
+an effect of the list and another law outside it, fly twice for a minute, differently. Flights of
+one craft are also diagnosed in one go (``--together``): do they agree? Then flights of craft that
+differ, or do not, are compared by ``diagnose_change`` (``--changes``). Results are appended to
+docs/results/repeatability.jsonl, together.jsonl and changes.jsonl, and a later run of the same
+commit resumes there; ``--page`` writes docs/results/repeatability.md from them.
 """
 
 from collections import Counter
@@ -45,6 +46,7 @@ from flytrack_sysid.log import median_step
 from flytrack_sysid.split import held_out_rows
 
 LINES, CHANGE_LINES = RESULTS / "repeatability.jsonl", RESULTS / "changes.jsonl"
+TOGETHER_LINES = RESULTS / "together.jsonl"
 SHORTEST_S = 14.0
 RATE_POLICIES = "Crazyflie, rate policies"
 CRAFT = {  # and the beginnings of its flights' names
@@ -52,6 +54,13 @@ CRAFT = {  # and the beginnings of its flights' names
     "Crazyflie, angle mode, two days": ("cf_utias_angle/",),
     "Crazyflie of ARPL, motors": ("cf_arpl_motors/",),
     "NanoBench, one trajectory twice": ("nanobench/B3_", "nanobench/B9_"),
+}
+TOGETHER = {  # craft or days -> the beginnings of its flights' names
+    "Crazyflie, one policy": ("crazyflie_rate_flights/seed00048_",),
+    "Crazyflie, three policies": tuple(
+        f"crazyflie_rate_flights/seed000{policy}_log1" for policy in (68, 69, 70)
+    ),
+    **{name: CRAFT[name] for name in [*CRAFT][1:]},
 }
 PLANT = "plant "  # begins the name of a simulated craft
 SEED = 57  # no rule was made on it
@@ -79,6 +88,12 @@ class Trial(NamedTuple):
 
     craft: str
     flight: str
+
+
+class TogetherTrial(NamedTuple):
+    """Flights of one craft to diagnose in one go."""
+
+    craft: str
 
 
 class ChangeTrial(NamedTuple):
@@ -196,6 +211,29 @@ def measure(trial: Trial) -> Line:
             stick: [response.time, *response.ci95]
             for stick, response in diagnosis.half_response_s.get("extended", {}).items()
             if response.ci95 is not None and np.isfinite(response.ci95[1])
+        },
+    }
+
+
+def measure_together(trial: TogetherTrial) -> Line:
+    """Diagnose the flights of a craft in one go: do their values agree?"""
+    if trial.craft.startswith(PLANT):
+        of_craft = [simulated(Trial(trial.craft, str(flight))) for flight in range(2)]
+    else:
+        names = [name for name in flights() if name.startswith(TOGETHER[trial.craft])]
+        of_craft = [measured(Trial(trial.craft, name)) for name in names]
+    diagnosis = diagnose([flight.log for flight in of_craft], of_craft[0].model)
+    return {
+        "verdict": diagnosis.verdict,
+        "causes": {
+            cause.effect: {
+                "spread": cause.spread,
+                "by_flight": {
+                    name: [value.value for value in values]
+                    for name, values in cause.by_flight.items()
+                },
+            }
+            for cause in diagnosis.causes
         },
     }
 
@@ -328,6 +366,19 @@ def list_changes(lines: Sequence[Line]) -> str:
     return table(header, rows)
 
 
+def list_together(lines: Sequence[Line]) -> str:
+    """Return a table of flights of one craft that were diagnosed in one go: values by flight."""
+    rows = []
+    for line in lines:
+        for name, cause in line["causes"].items():
+            values = "; ".join(
+                f"{parameter} {', '.join(f'{value:.3g}' for value in of_flights)}"
+                for parameter, of_flights in cause["by_flight"].items()
+            )
+            rows.append([line["craft"], f"`{name}`", values, f"{cause['spread']:.2g}"])
+    return table("flights | cause | values by flight | interval wider by", rows)
+
+
 def is_in_class(line: Line) -> bool:
     """Return whether the effect that a log shows is a cause, an equivalent or negligible."""
     return line["effect"] in named_classes(line).union(line["negligible"])
@@ -341,7 +392,9 @@ def is_coefficient(name: str) -> bool:
 def write_page() -> None:
     """Write docs/results/repeatability.md from the lines of the last commit."""
     lines = good_lines(lines_of_commit(LINES))
-    changes = lines_of_commit(CHANGE_LINES)
+    changes, together = lines_of_commit(CHANGE_LINES), good_lines(lines_of_commit(TOGETHER_LINES))
+    of_plants = [line for line in together if line["craft"].startswith(PLANT)]
+    spreads = [cause["spread"] for line in of_plants for cause in line["causes"].values()]
     by_craft = {craft: select(lines, craft=craft) for craft in CRAFT}
     apart = Counter(
         name
@@ -361,6 +414,10 @@ def write_page() -> None:
         RESULTS / "repeatability.md",
         "repeatability",
         changes=list_changes(changes),
+        together=list_together([line for line in together if line not in of_plants]),
+        agreeing=spreads.count(1.0),
+        compared=len(spreads),
+        commit_together=together[-1]["commit"],
         crafts=table(header, [[craft, *compare(of)] for craft, of in by_craft.items() if of]),
         names=", ".join(f"`{name}` {count}" for name, count in names.most_common()),
         shortest=f"{SHORTEST_S:g}",
@@ -384,6 +441,7 @@ def write_page() -> None:
 def main(
     page: bool = False,
     changes: bool = False,
+    together: bool = False,
     plants: int = 10,
     jobs: JobFlags = IN_THIS_PROCESS,
 ) -> None:
@@ -392,6 +450,7 @@ def main(
     Args:
         page: write the page from the lines instead.
         changes: compare pairs of flights instead.
+        together: diagnose the flights of each craft in one go instead.
         plants: the number of simulated craft.
     """
     if page:
@@ -399,6 +458,9 @@ def main(
     elif changes:
         pairs = [ChangeTrial(*pair) for pair in CHANGES if measured_flights().keys() >= {*pair}]
         record_trials(CHANGE_LINES, pairs, measure_change, jobs=jobs)
+    elif together:
+        crafts = [*(f"{PLANT}{plant}" for plant in range(plants)), *TOGETHER]
+        record_trials(TOGETHER_LINES, map(TogetherTrial, crafts), measure_together, jobs=jobs)
     else:
         record_trials(LINES, trials(plants), measure, jobs=jobs)
 
