@@ -16,7 +16,7 @@ from scipy import stats
 
 from flytrack_sysid.diagnosis.model_selection import Marginal
 from flytrack_sysid.diagnosis.result import Cause, Estimated
-from flytrack_sysid.diagnosis.summary import mean_thrust
+from flytrack_sysid.diagnosis.summary import LOOSE, mean_thrust
 from flytrack_sysid.inference.chunks import CHUNK_S, Chunks, count_lead_in
 from flytrack_sysid.inference.parameters import THRUST_COEFFS
 from flytrack_sysid.inference.score_test import (
@@ -41,15 +41,15 @@ def flight_of_blocks(chunks: Chunks, log: FlightLog) -> np.ndarray:
 
 
 class OfFlights(NamedTuple):
-    """Estimates of some parameters by flight.
+    """Estimates of some parameters by flight, less the common ones.
 
     Attributes:
-        values: (flights, parameters).
+        steps: (flights, parameters).
         marginals: what each flight tells of the parameters.
         spread: by which the common interval is too narrow; 1 where the flights differ by chance.
     """
 
-    values: np.ndarray
+    steps: np.ndarray
     marginals: Sequence[Marginal]
     spread: float
 
@@ -67,19 +67,19 @@ def compare_flights(
     """
     indices = list(model.indices)
     own = [indices.index(index) for index in linearization.problem.parameter_indices(fields)]
-    steps, marginals = [], []
-    for number in np.unique(flights):
-        step, part = linearization.of_blocks(flights == number).stepped(indices)
-        steps.append(step[own])
-        marginals.append(Marginal(part, model, fields))
+    fitted = [
+        linearization.of_blocks(flights == number).stepped(indices)
+        for number in range(int(flights.max()) + 1)
+    ]
+    steps = np.stack([step[own] for step, _ in fitted])
+    marginals = [Marginal(part, model, fields) for _, part in fitted]
     weights = np.stack([one.information / one.inflation for one in marginals])
-    common = solve(weights.sum(axis=0), np.einsum("fpq,fq->p", weights, np.stack(steps)))
-    changes = np.stack(steps) - common
+    common = solve(weights.sum(axis=0), np.einsum("fpq,fq->p", weights, steps))
+    changes = steps - common
     q = float(np.einsum("fp,fpq,fq->", changes, weights, changes))
     freedom = (len(steps) - 1) * len(own)
     is_chance = stats.chi2.sf(q, freedom) > FALSE_POSITIVE_RATE
-    values = model.vector[np.array(indices)[own]] + np.stack(steps)
-    return OfFlights(values, marginals, 1.0 if is_chance else float(np.sqrt(q / freedom)))
+    return OfFlights(steps, marginals, 1.0 if is_chance else float(np.sqrt(q / freedom)))
 
 
 def with_flights(
@@ -112,16 +112,19 @@ def _with_flights(
         nominal_n = float(slopes @ problem.start[problem.parameter_indices(fields)])
         weights = dict.fromkeys(OF_THRUST, slopes / max(nominal_n, SMALLEST_N))
     else:
-        short = [field.split(".")[-1] for field in fields]
-        weights = dict(zip(short, np.eye(len(fields)), strict=True))
+        indices = problem.parameter_indices(fields)
+        loose = LOOSE * (problem.high - problem.low)[indices]
+        is_shown = np.min([one.half_widths() for one in compared.marginals], axis=0) < loose
+        short = np.array([field.split(".")[-1] for field in fields])
+        weights = dict(zip(short[is_shown].tolist(), np.eye(len(fields))[is_shown], strict=True))
     by_flight = {
         name: tuple(
             Estimated.around(
-                float(values @ weights[name]),
+                one.value + float(step @ weights[name]),
                 float(marginal.half_widths(weights[name][None])[0]),
                 one.unit,
             )
-            for values, marginal in zip(compared.values, compared.marginals, strict=True)
+            for step, marginal in zip(compared.steps, compared.marginals, strict=True)
         )
         for name, one in cause.parameters.items()
         if name in weights
