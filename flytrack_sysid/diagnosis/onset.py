@@ -460,10 +460,13 @@ def _with_change(selection: Selection, test: Problem) -> Selection | None:
         misfit(later, problem) - misfit(selection, problem)
         for problem in (selection.state.problem, test)
     ]
-    price = PER_PARAMETER * (later.model.num_priced - selection.model.num_priced)
+    extra = PER_PARAMETER * (later.model.num_priced - selection.model.num_priced)
+    # Held-out rows have to show it as clearly: of 117 true changes the least gains 197 there
+    # (benchmarks.diagnosis, seeds 6106 to 6117), a false one of seed 6117 gained 2.
+    least = change_threshold(changes[0].num_parameters)
     is_better = (
-        misfit_changes[0] + price < -change_threshold(changes[0].num_parameters)
-        and misfit_changes[1] < 0.0
+        misfit_changes[0] + extra < -least
+        and misfit_changes[1] < -least
         and -misfit_changes[0] > MORE_THAN_OTHER * gain_of_other_dependence(selection)
     )
     return later if is_better else None

@@ -39,6 +39,8 @@ SEED = 6101
         ),
         # A delay of thrust that ends in flight stood in for a periodic force.
         (Trial("outside", 1, SEED, "handout"), set(), False),
+        # A force that depends on the airspeed was rotor drag that ended before any held-out row.
+        (Trial("outside", 2000, 6117, "fine"), set(), False),
         # A force that depends on the place was a wind that began in flight.
         (Trial("outside", 1002, 6111, "semi_implicit"), set(), False),
         # A fit ended where first order promised nothing, far from the best one. No log tells this
