@@ -17,7 +17,7 @@ from flytrack_sysid.inference.score_test import CANDIDATES
 from flytrack_sysid.inference.search import SearchState, with_refitted_noise
 
 DRAG = next(one for one in CANDIDATES if one.effect == "linear_drag")
-SECONDS = 30.0
+SECONDS = 15.0
 
 
 def diagnosed(*drags: float) -> tuple[Cause, np.ndarray]:
