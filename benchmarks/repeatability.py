@@ -376,7 +376,7 @@ def list_together(lines: Sequence[Line]) -> str:
                 for parameter, of_flights in cause["by_flight"].items()
             )
             rows.append([line["craft"], f"`{name}`", values, f"{cause['spread']:.2g}"])
-    return table("flights | cause | values by flight | interval wider by", rows)
+    return table("flights | cause | values by flight | spread", rows)
 
 
 def is_in_class(line: Line) -> bool:

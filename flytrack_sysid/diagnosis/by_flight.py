@@ -3,8 +3,8 @@
 A value is of the craft only if its other flights give it too. A flight's own estimate is one step
 of Gauss-Newton from the common one, on its own blocks of the linearization: nothing is replayed.
 Where the estimates differ by more than chance (Q of W. Cochran, Biometrics 10, 1954), the interval
-of the common value is wider by the Birge ratio sqrt(Q / degrees of freedom), as those of the
-Particle Data Group are.
+of the common value is at least that of their mean, wider by the Birge ratio sqrt(Q / degrees of
+freedom), as those of the Particle Data Group are.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from flytrack_sysid.diagnosis.model_selection import Marginal
-from flytrack_sysid.diagnosis.result import Cause, Estimated
+from flytrack_sysid.diagnosis.result import TWO_SIDED_95, Cause, Estimated
 from flytrack_sysid.diagnosis.summary import LOOSE, mean_thrust
 from flytrack_sysid.inference.chunks import CHUNK_S, Chunks, count_lead_in
 from flytrack_sysid.inference.parameters import THRUST_COEFFS
@@ -46,7 +46,7 @@ class OfFlights(NamedTuple):
     Attributes:
         steps: (flights, parameters).
         marginals: what each flight tells of the parameters.
-        spread: by which the common interval is too narrow; 1 where the flights differ by chance.
+        spread: the Birge ratio of all parameters; 1 where the flights differ by chance.
     """
 
     steps: np.ndarray
@@ -129,14 +129,22 @@ def _with_flights(
         for name, one in cause.parameters.items()
         if name in weights
     }
-    parameters = {name: _widened(one, compared.spread) for name, one in cause.parameters.items()}
+    parameters = dict(cause.parameters)
+    if compared.spread > 1.0:
+        parameters |= {name: _covering(parameters[name], of) for name, of in by_flight.items()}
     return replace(cause, parameters=parameters, by_flight=by_flight, spread=compared.spread)
 
 
-def _widened(value: Estimated, times: float) -> Estimated:
-    low, high = value.ci95
-    ends = value.value - times * (value.value - low), value.value + times * (high - value.value)
-    return replace(value, ci95=ends)
+def _covering(common: Estimated, flights: Sequence[Estimated]) -> Estimated:
+    """Return a value with an interval at least as wide as flights that differ ask for."""
+    values, halves = np.array([(one.value, one.half_width) for one in flights]).T
+    weights = halves**-2.0
+    changes = values - np.average(values, weights=weights)
+    q = TWO_SIDED_95**2 * float(weights @ changes**2)
+    half = np.sqrt(max(q / (len(values) - 1), 1.0) / weights.sum())
+    if half <= common.half_width:
+        return common
+    return Estimated.around(common.value, float(half), common.unit)
 
 
 def notes_on_flights(causes: Sequence[Cause]) -> list[str]:
@@ -151,7 +159,6 @@ def notes_on_flights(causes: Sequence[Cause]) -> list[str]:
             )
             notes.append(
                 f"{cause.effect} differs between the flights by more than chance "
-                f"({', '.join(ranges)}): its values are means, with intervals {cause.spread:.2g} "
-                "times as wide"
+                f"({', '.join(ranges)}): its values are means, and their intervals cover that"
             )
     return notes
