@@ -227,7 +227,7 @@ def measure_together(trial: TogetherTrial) -> Line:
         "verdict": diagnosis.verdict,
         "causes": {
             cause.effect: {
-                "spread": cause.spread,
+                "birge_ratio": cause.birge_ratio,
                 "by_flight": {
                     name: [value.value for value in values]
                     for name, values in cause.by_flight.items()
@@ -375,8 +375,8 @@ def list_together(lines: Sequence[Line]) -> str:
                 f"{parameter} {', '.join(f'{value:.3g}' for value in of_flights)}"
                 for parameter, of_flights in cause["by_flight"].items()
             )
-            rows.append([line["craft"], f"`{name}`", values, f"{cause['spread']:.2g}"])
-    return table("flights | cause | values by flight | spread", rows)
+            rows.append([line["craft"], f"`{name}`", values, f"{cause['birge_ratio']:.2g}"])
+    return table("flights | cause | values by flight | Birge ratio", rows)
 
 
 def is_in_class(line: Line) -> bool:
@@ -394,7 +394,7 @@ def write_page() -> None:
     lines = good_lines(lines_of_commit(LINES))
     changes, together = lines_of_commit(CHANGE_LINES), good_lines(lines_of_commit(TOGETHER_LINES))
     of_plants = [line for line in together if line["craft"].startswith(PLANT)]
-    spreads = [cause["spread"] for line in of_plants for cause in line["causes"].values()]
+    ratios = [cause["birge_ratio"] for line in of_plants for cause in line["causes"].values()]
     by_craft = {craft: select(lines, craft=craft) for craft in CRAFT}
     apart = Counter(
         name
@@ -415,8 +415,8 @@ def write_page() -> None:
         "repeatability",
         changes=list_changes(changes),
         together=list_together([line for line in together if line not in of_plants]),
-        agreeing=spreads.count(1.0),
-        compared=len(spreads),
+        agreeing=ratios.count(1.0),
+        compared=len(ratios),
         commit_together=together[-1]["commit"],
         crafts=table(header, [[craft, *compare(of)] for craft, of in by_craft.items() if of]),
         names=", ".join(f"`{name}` {count}" for name, count in names.most_common()),

@@ -46,12 +46,12 @@ class OfFlights(NamedTuple):
     Attributes:
         steps: (flights, parameters).
         marginals: what each flight tells of the parameters.
-        spread: the Birge ratio of all parameters; 1 where the flights differ by chance.
+        birge_ratio: the Birge ratio of all parameters; 1 where the flights differ by chance.
     """
 
     steps: np.ndarray
     marginals: Sequence[Marginal]
-    spread: float
+    birge_ratio: float
 
 
 def compare_flights(
@@ -66,18 +66,18 @@ def compare_flights(
         flights: the number of each block's flight, (blocks,).
     """
     indices = list(model.indices)
-    own = [indices.index(index) for index in linearization.problem.parameter_indices(fields)]
+    columns = [indices.index(index) for index in linearization.problem.parameter_indices(fields)]
     fitted = [
         linearization.of_blocks(flights == number).stepped(indices)
         for number in range(int(flights.max()) + 1)
     ]
-    steps = np.stack([step[own] for step, _ in fitted])
+    steps = np.stack([step[columns] for step, _ in fitted])
     marginals = [Marginal(part, model, fields) for _, part in fitted]
     weights = np.stack([one.information / one.inflation for one in marginals])
     common = solve(weights.sum(axis=0), np.einsum("fpq,fq->p", weights, steps))
     changes = steps - common
     q = float(np.einsum("fp,fpq,fq->", changes, weights, changes))
-    freedom = (len(steps) - 1) * len(own)
+    freedom = (len(steps) - 1) * len(columns)
     is_chance = stats.chi2.sf(q, freedom) > FALSE_POSITIVE_RATE
     return OfFlights(steps, marginals, 1.0 if is_chance else float(np.sqrt(q / freedom)))
 
@@ -87,13 +87,17 @@ def with_flights(
 ) -> tuple[Cause, ...]:
     """Return causes with the values of each flight, and intervals that cover how these differ.
 
+    Those of one flight are returned as they are.
+
     Args:
-        causes: of several flights.
+        causes: of a log.
         linearization: of the model that single steps select.
         model: that model.
-        log: of the flights, one after the other.
+        log: of flights, one after the other.
     """
     flights = flight_of_blocks(linearization.problem.chunks, log)
+    if not flights.any():
+        return tuple(causes)
     return tuple(_with_flights(cause, linearization, model, flights) for cause in causes)
 
 
@@ -129,10 +133,14 @@ def _with_flights(
         for name, one in cause.parameters.items()
         if name in weights
     }
+    if not by_flight:
+        return cause
     parameters = dict(cause.parameters)
-    if compared.spread > 1.0:
+    if compared.birge_ratio > 1.0:
         parameters |= {name: _covering(parameters[name], of) for name, of in by_flight.items()}
-    return replace(cause, parameters=parameters, by_flight=by_flight, spread=compared.spread)
+    return replace(
+        cause, parameters=parameters, by_flight=by_flight, birge_ratio=compared.birge_ratio
+    )
 
 
 def _covering(common: Estimated, flights: Sequence[Estimated]) -> Estimated:
@@ -151,7 +159,7 @@ def notes_on_flights(causes: Sequence[Cause]) -> list[str]:
     """Return a note on each cause whose value differs between flights by more than chance."""
     notes = []
     for cause in causes:
-        if cause.spread > 1.0:
+        if cause.birge_ratio > 1.0:
             ranges = (
                 f"{name} {min(values):.3g} to {max(values):.3g}"
                 for name, flights in cause.by_flight.items()

@@ -33,7 +33,6 @@ from flytrack_sysid.diagnosis.onset import (
     describe_changes,
     find_spans,
     first_row_as_at_end,
-    is_one_flight,
     with_changes,
 )
 from flytrack_sysid.diagnosis.outliers import find_outliers, outlier_notes
@@ -409,8 +408,7 @@ def name_causes(vetted: VettedModel, parts: Split) -> NamedModel:
     neutral = tuple(cause.effect for cause in before if cause.effect not in names)
     spans = find_spans(selection, test, parts.log)
     causes = tuple(replace(named, **spans.get(named.effect, {})) for named in causes)
-    if not is_one_flight(parts.log):
-        causes = with_flights(causes, linearization, model, parts.log)
+    causes = with_flights(causes, linearization, model, parts.log)
 
     def without(cause: Cause) -> np.ndarray:
         if fit is None:

@@ -75,7 +75,7 @@ class Cause:
         family: other laws of the same response, while something in it is unexplained: the log
             shows that the response differs, and not for certain which of its laws.
         by_flight: of several flights the values of each, by parameter; empty for one flight.
-        spread: how many times as far the flights differ as chance has it; 1 if by no more.
+        birge_ratio: how many times as far the flights differ as chance has it; 1 if by no more.
         onset_s: when it began, in the log's time (s); None if it acts from the log's first row.
         end_s: when it ended, in the log's time (s); None if it acts until the log's last row.
     """
@@ -92,7 +92,7 @@ class Cause:
     beyond: str = ""
     family: tuple[str, ...] = ()
     by_flight: Mapping[str, tuple[Estimated, ...]] = field(default_factory=dict)
-    spread: float = 1.0
+    birge_ratio: float = 1.0
     onset_s: Estimated | None = None
     end_s: Estimated | None = None
 

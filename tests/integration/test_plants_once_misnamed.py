@@ -70,9 +70,9 @@ def test_drawn_plants(trial: Trial, names: set[str], is_explained: bool) -> None
 def test_a_drag_that_single_steps_show_beside_rates_that_nothing_explains() -> None:
     # What disturbs the rates made all flights uncertain, and these had refused the drag.
     flight = simulated(Flown("plant 5", "1"))
-    found = diagnose(flight.log, flight.model)
-    assert [cause.effect for cause in found.causes] == ["linear_drag"]
-    assert set(found.unexplained.shares) == {"rate: heading"}
+    diagnosis = diagnose(flight.log, flight.model)
+    assert [cause.effect for cause in diagnosis.causes] == ["linear_drag"]
+    assert set(diagnosis.unexplained.shares) == {"rate: heading"}
 
 
 def test_a_wind_that_begins_and_ends_does_not_stand_in_for_a_thermal() -> None:

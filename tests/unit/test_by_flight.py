@@ -48,7 +48,7 @@ def diagnosed(*drags: float) -> tuple[Cause, np.ndarray]:
 
 def test_flights_of_one_craft_agree() -> None:
     cause, common = diagnosed(0.3, 0.3)
-    assert cause.spread == 1.0 and notes_on_flights((cause,)) == []
+    assert cause.birge_ratio == 1.0 and notes_on_flights((cause,)) == []
     assert cause.parameters["d_x"].half_width == pytest.approx(0.01)
     for of_flight in cause.by_flight["d_x"]:
         assert of_flight.ci95[0] < 0.3 < of_flight.ci95[1]
@@ -60,7 +60,7 @@ def test_flights_of_craft_that_differ_are_told_with_the_values_of_each() -> None
     for of_flight, drag in zip(cause.by_flight["d_x"], (0.2, 0.4, 0.2), strict=True):
         assert of_flight.value == pytest.approx(drag, abs=0.04)
         assert of_flight.half_width < 0.05
-    assert cause.spread > 2.0
+    assert cause.birge_ratio > 2.0
     assert cause.parameters["d_x"].half_width == pytest.approx(0.1, abs=0.06)
     assert cause.parameters["d_z"].half_width < 0.03
     (note,) = notes_on_flights((cause,))
