@@ -65,3 +65,8 @@ def test_flights_of_craft_that_differ_are_told_with_the_values_of_each() -> None
     assert cause.parameters["d_z"].half_width < 0.03
     (note,) = notes_on_flights((cause,))
     assert note.startswith("linear_drag differs between the flights by more than chance (d_x 0.")
+
+
+def test_one_flight_has_no_values_by_flight() -> None:
+    cause, _ = diagnosed(0.3)
+    assert cause.by_flight == {} and cause.birge_ratio == 1.0
